@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pinhole cameras and the rig they stand in.
+
+OpenCV axes (x right, y down, z forward), ``viewmat`` maps world to camera, ``K`` is in pixels with the centre of the
+top-left pixel at (0.5, 0.5). See ``docs/conventions.md``.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.errors import CalibrationError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Args:
+        viewmat: ``[4, 4]`` float64, world to camera.
+        K: ``[3, 3]`` float64, pixels.
+        width: image width, pixels.
+        height: image height, pixels.
+        near: distance along z under which nothing is drawn, in the units of the scene.
+
+    Raises:
+        CalibrationError: numbers that are not finite, a matrix that is not a rigid motion, or a focal length that is
+            not positive.
+    """
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "viewmat", torch.as_tensor(self.viewmat, dtype=torch.float64).cpu())
+        object.__setattr__(self, "K", torch.as_tensor(self.K, dtype=torch.float64).cpu())
+        if self.viewmat.shape != (4, 4) or self.K.shape != (3, 3):
+            raise CalibrationError(
+                f"A camera needs a 4x4 view matrix and 3x3 intrinsics, "
+                f"got {tuple(self.viewmat.shape)} and {tuple(self.K.shape)}."
+            )
+        if not (torch.isfinite(self.viewmat).all() and torch.isfinite(self.K).all()):
+            raise CalibrationError("The calibration holds a number that is not finite (NaN or infinity).")
+        rotation = self.viewmat[:3, :3]
+        if (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3 or rotation.det() < 0:
+            raise CalibrationError(
+                "The rotation of the view matrix is not orthonormal with determinant +1; expected a rigid "
+                "world-to-camera matrix (OpenCV axes) without scale or mirror."
+            )
+        if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or self.width <= 0 or self.height <= 0:
+            raise CalibrationError(
+                f"Focal lengths and image size must be positive, got fx={self.K[0, 0]:g}, fy={self.K[1, 1]:g}, "
+                f"{self.width}x{self.height}."
+            )
+
+    @property
+    def center(self) -> Tensor:
+        """Position of the camera in the world, ``[3]`` float64."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera with its picture resampled to ``width x height`` pixels.
+
+        The intrinsics scale with the picture; because a pixel's centre sits at +0.5 no half-pixel shift appears.
+        """
+        factors = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=torch.float64)
+        return replace(self, K=self.K * factors, width=width, height=height)
+
+
+@dataclass(frozen=True)
+class CameraRig:
+    """Named cameras, fixed for the length of a stream, and which of them are held out from training.
+
+    The order of ``cameras`` is the order of everything that is stored per camera.
+    """
+
+    cameras: Mapping[str, Camera]
+    held_out: frozenset[str] = field(default_factory=frozenset)
+
+    def __post_init__(self) -> None:
+        unknown = sorted(self.held_out - set(self.cameras))
+        if unknown:
+            raise CalibrationError(
+                f"Held-out cameras {unknown} are not in the rig; it has {', '.join(sorted(self.cameras))}."
+            )
+        if len(self.training) < 2:
+            raise CalibrationError(
+                f"A reconstruction needs at least two training cameras, got {len(self.training)} "
+                f"({len(self.cameras)} in the capture, {len(self.held_out)} held out)."
+            )
+
+    def __getitem__(self, name: str) -> Camera:
+        return self.cameras[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.cameras)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    @property
+    def training(self) -> tuple[str, ...]:
+        """Names of the cameras that training may see, in rig order."""
+        return tuple(name for name in self.cameras if name not in self.held_out)
+
+    @property
+    def testing(self) -> tuple[str, ...]:
+        """Names of the held-out cameras, in rig order."""
+        return tuple(name for name in self.cameras if name in self.held_out)
+
+    @property
+    def centers(self) -> Tensor:
+        """Camera positions, ``[V, 3]`` float64, in rig order."""
+        return torch.stack([camera.center for camera in self.cameras.values()])
+
+    def with_held_out(self, names: frozenset[str]) -> "CameraRig":
+        """The same cameras with another held-out set."""
+        return replace(self, held_out=names)
+
+    def mapped(self, cameras: Mapping[str, Camera]) -> "CameraRig":
+        """The same names and held-out set with other cameras (resized, normalised)."""
+        return replace(self, cameras=dict(cameras))

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every capture looks like to the rest of the program."""
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import CameraRig
+from structgstream.frames import MultiViewFrame
+
+
+class FrameSource(Protocol):
+    """A capture: a calibrated rig and its frames, in order.
+
+    ``frames(start)`` may be called again, each time from the given stream index; it opens its own decoders, and every
+    frame it yields has all cameras of the rig at the size the rig states. Problems are raised as ``CaptureError``.
+    """
+
+    @property
+    def rig(self) -> CameraRig: ...
+
+    @property
+    def fps(self) -> float: ...
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def points(self) -> NDArray[np.float64] | None:
+        """Points ``[P, 3]`` that the capture brings (a COLMAP model), in its own units; None when it has none."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of frames that every camera has."""
+        ...
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]: ...

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Renderable Gaussians: what a scene looks like from one camera, ready for a rasteriser."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Post-activation Gaussians for one camera.
+
+    Args:
+        means: ``[N, 3]`` in scene units.
+        quats: ``[N, 4]`` wxyz, not necessarily unit length.
+        scales: ``[N, 3]`` standard deviations in scene units.
+        opacities: ``[N]`` in (0, 1).
+        colors: ``[N, 3]`` sRGB.
+        ids: ``[N]`` int64, the stable slot in the scene. See Note [Ids].
+
+    Note [Ids]
+    ~~~~~~~~~~
+    Structured Gaussian ``j`` of anchor ``i`` has id ``i * K + j``; free Gaussian in slot ``f`` has ``M * K + f``.
+    The opacity mask and any culling drop rows *together with their ids*, so that statistics, spawning and pruning
+    index by id and need no chain of masks.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    ids: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
+    """Both sets in one, ``first`` before ``second``."""
+    return Gaussians(
+        means=torch.cat([first.means, second.means]),
+        quats=torch.cat([first.quats, second.quats]),
+        scales=torch.cat([first.scales, second.scales]),
+        opacities=torch.cat([first.opacities, second.opacities]),
+        colors=torch.cat([first.colors, second.colors]),
+        ids=torch.cat([first.ids, second.ids]),
+    )
