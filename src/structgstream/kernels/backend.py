@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A compute back-end is a value: a name and the functions that do the work.
+
+``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` is gsplat behind the same
+functions. A back-end that lacks an operation of its own names another's, visibly, where the value is built.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from structgstream.errors import BackendError
+from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.kernels.raster_types import RasterOutput
+
+BackendName = Literal["auto", "cpu", "cuda", "reference"]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The operations that a scene and a trainer need.
+
+    Args:
+        name: ``reference``, ``cpu`` or ``cuda``.
+        device: where its tensors live.
+        rasterize: see ``kernels.reference_raster.rasterize``.
+        l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
+        generate_structured: see ``kernels.reference_anchors.generate_structured``.
+        adam_step: see ``kernels.reference_adam.adam_step``.
+    """
+
+    name: str
+    device: torch.device
+    rasterize: Callable[..., RasterOutput]
+    l1_ssim: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    generate_structured: Callable[..., StructuredGaussians]
+    adam_step: Callable[..., None]
+
+
+def reference_backend() -> Backend:
+    """Pure torch on the CPU: slow, exact, always there."""
+    from structgstream.kernels import reference_adam, reference_anchors, reference_raster, reference_ssim
+
+    return Backend(
+        name="reference",
+        device=torch.device("cpu"),
+        rasterize=reference_raster.rasterize,
+        l1_ssim=reference_ssim.l1_ssim,
+        generate_structured=reference_anchors.generate_structured,
+        adam_step=reference_adam.adam_step,
+    )
+
+
+def cpu_backend() -> Backend:
+    """This package's C++ on the CPU.
+
+    Raises:
+        BackendError: the native library was not built or cannot be loaded.
+    """
+    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_raster, cpu_ssim
+    from structgstream.kernels._load import native_library
+
+    native_library()
+    return Backend(
+        name="cpu",
+        device=torch.device("cpu"),
+        rasterize=cpu_raster.rasterize,
+        l1_ssim=cpu_ssim.l1_ssim,
+        generate_structured=cpu_anchors.generate_structured,
+        adam_step=cpu_adam.adam_step,
+    )
+
+
+def cuda_backend() -> Backend:
+    """gsplat's rasteriser on an NVIDIA GPU, torch for the rest.
+
+    Raises:
+        BackendError: no GPU, or gsplat is not installed or does not load.
+    """
+    from structgstream.kernels import reference_adam, reference_anchors, reference_ssim
+    from structgstream.kernels.cuda import cuda_reason, rasterize
+
+    reason = cuda_reason()
+    if reason is not None:
+        raise BackendError(reason)
+    return Backend(
+        name="cuda",
+        device=torch.device("cuda"),
+        rasterize=rasterize,
+        l1_ssim=reference_ssim.l1_ssim,
+        generate_structured=reference_anchors.generate_structured,
+        adam_step=reference_adam.adam_step,
+    )
+
+
+def backend_reasons() -> dict[str, str | None]:
+    """Each back-end's name and why it is missing here (None: it is there)."""
+    from structgstream.kernels._load import native_reason
+    from structgstream.kernels.cuda import cuda_reason
+
+    return {"cuda": cuda_reason(), "cpu": native_reason(), "reference": None}
+
+
+def select_backend(name: BackendName) -> Backend:
+    """The back-end of that name; ``auto`` takes the first of cuda, cpu, reference that this machine has.
+
+    Raises:
+        BackendError: the named one is not available, with the reason and the way to get it.
+    """
+    builders = {"cuda": cuda_backend, "cpu": cpu_backend, "reference": reference_backend}
+    if name != "auto":
+        return builders[name]()
+    reasons = backend_reasons()
+    return next(builders[candidate]() for candidate in builders if reasons[candidate] is None)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Free Gaussians: what the anchors cannot express (paper, section Global Free 3DGs Patching Strategy)."""
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class FreeGaussians:
+    """``F`` Gaussians with attributes of their own, before activation.
+
+    Args:
+        means: ``[F, 3]`` scene units.
+        log_scales: ``[F, 3]``.
+        quats: ``[F, 4]`` wxyz, normalised when drawn.
+        logit_opacities: ``[F]``.
+        colors: ``[F, 3]`` sRGB, the same from every side.
+        births: ``[F]`` int64, ascending and never used twice in a stream: the identity of a Gaussian over time.
+    """
+
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    logit_opacities: Tensor
+    colors: Tensor
+    births: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @classmethod
+    def empty(cls, like: Tensor | None = None) -> "FreeGaussians":
+        """No free Gaussians, with the dtype and device of ``like``."""
+        like = torch.zeros(0) if like is None else like
+        return cls(
+            means=like.new_zeros(0, 3),
+            log_scales=like.new_zeros(0, 3),
+            quats=like.new_zeros(0, 4),
+            logit_opacities=like.new_zeros(0),
+            colors=like.new_zeros(0, 3),
+            births=torch.zeros(0, dtype=torch.int64, device=like.device),
+        )
+
+    def select(self, rows: Tensor) -> "FreeGaussians":
+        """The rows that a mask ``[F]`` or an index ``[f]`` names."""
+        return FreeGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def append(self, other: "FreeGaussians") -> "FreeGaussians":
+        """These and then ``other``."""
+        return FreeGaussians(
+            **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
+        )

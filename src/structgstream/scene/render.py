@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene and a camera give a picture."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What one rendering gave.
+
+    Args:
+        image: ``[H, W, 3]`` sRGB, not clamped.
+        alpha: ``[H, W]`` coverage.
+        radii: ``[N]`` extent on the picture in pixels, 0 for Gaussians that were not drawn.
+        gaussians: the drawn set, ``N`` rows.
+        screen_offsets: ``[N, 2]`` zeros; after ``backward`` its gradient is the view-space positional gradient in
+            pixels (None when it was not asked for).
+    """
+
+    image: Tensor
+    alpha: Tensor
+    radii: Tensor
+    gaussians: Gaussians
+    screen_offsets: Tensor | None
+
+
+def draw(gaussians: Gaussians, camera: Camera, backend: Backend, *, track_screen: bool = False) -> Rendering:
+    """Rasterise a set of Gaussians.
+
+    Args:
+        gaussians: the drawable set, in the units of the camera.
+        camera: where from.
+        backend: what computes.
+        track_screen: keep the view-space positional gradient (see :class:`Rendering`).
+    """
+    means = gaussians.means
+    offsets = torch.zeros_like(means[:, :2], requires_grad=True) if track_screen else None
+    output = backend.rasterize(
+        means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.colors,
+        camera.viewmat.to(means),
+        camera.K.to(means),
+        width=camera.width,
+        height=camera.height,
+        near=camera.near,
+        screen_offsets=offsets,
+    )
+    return Rendering(output.image, output.alpha, output.radii, gaussians, offsets)
+
+
+def render(scene: Scene, camera: Camera, backend: Backend) -> Rendering:
+    """Draw ``scene`` as ``camera`` (in the scene's units) sees it, with the mean colour correction: the identity."""
+    with torch.no_grad():
+        return draw(scene.gaussians(camera, backend), camera, backend)

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene at one instant. It knows no loss, no file and no optimiser."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import Gaussians, concatenate
+from structgstream.kernels.anchor_types import MLPWeights, StructuredGaussians
+from structgstream.kernels.backend import Backend
+from structgstream.scene.anchors import AnchorCloud, visible_anchors
+from structgstream.scene.color import CameraColor
+from structgstream.scene.free import FreeGaussians
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Anchors, the three MLPs that dress them, free Gaussians, and the rig's colour correction.
+
+    Args:
+        anchors: the structured part.
+        mlps: F_alpha, F_c and F_Sigma.
+        free: the free part.
+        camera_color: one row for each training camera of the rig, in rig order.
+        distance_input: whether the MLPs see the distance to the camera (the paper: yes; Scaffold-GS: no).
+    """
+
+    anchors: AnchorCloud
+    mlps: MLPWeights
+    free: FreeGaussians
+    camera_color: CameraColor
+    distance_input: bool = True
+
+    def structured(self, camera: Camera, backend: Backend) -> tuple[StructuredGaussians, Tensor]:
+        """The structured Gaussians that ``camera`` may see, and the visible anchors ``[m]`` they belong to."""
+        visible = visible_anchors(self.anchors, camera)
+        anchors = self.anchors
+        generated = backend.generate_structured(
+            anchors.positions,
+            anchors.log_offset_scales,
+            anchors.log_base_scales,
+            anchors.offsets,
+            anchors.features,
+            self.mlps,
+            camera.center.to(anchors.positions),
+            visible,
+            distance_input=self.distance_input,
+        )
+        return generated, visible
+
+    def free_gaussians(self) -> Gaussians:
+        """The free Gaussians after activation, with their ids (Note [Ids])."""
+        free = self.free
+        first = self.anchors.offsets.shape[0] * self.anchors.offsets_per_anchor
+        return Gaussians(
+            means=free.means,
+            quats=free.quats,
+            scales=free.log_scales.exp(),
+            opacities=free.logit_opacities.sigmoid(),
+            colors=free.colors,
+            ids=torch.arange(first, first + len(free), device=free.means.device),
+        )
+
+    def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
+        """Everything that can be drawn for ``camera``: structured Gaussians, then free ones."""
+        generated, _ = self.structured(camera, backend)
+        return self.dressed(generated)
+
+    def dressed(self, generated: StructuredGaussians) -> Gaussians:
+        """``generated`` and the free Gaussians as one drawable set."""
+        structured = Gaussians(
+            means=generated.means,
+            quats=generated.quats,
+            scales=generated.scales,
+            opacities=generated.opacities,
+            colors=generated.colors,
+            ids=generated.ids,
+        )
+        return concatenate(structured, self.free_gaussians()) if len(self.free) else structured
+
+    def without_free(self) -> "Scene":
+        """The same scene with no free Gaussians."""
+        return replace(self, free=FreeGaussians.empty(self.anchors.positions))
