@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nouns of a stream: its header, its packets, and where packets go."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from structgstream.cameras import CameraRig
+from structgstream.scene.state import FieldName
+from structgstream.similarity import Similarity
+
+
+@dataclass(frozen=True)
+class StreamHeader:
+    """What a receiver knows before the first frame: the init record.
+
+    Args:
+        rig: every camera of the capture, in the capture's own units, with the held-out set of the training run.
+        similarity: from the capture's units to the scene's.
+        fps: frames per second of the media.
+        codec: how fields are coded; version 1 of the format knows ``raw``.
+        dynamic: the fields that packets carry; all others are in ``static``.
+        static: the fields that hold for the whole stream, exactly as the decoder uses them.
+        distance_input: whether the MLPs see the distance.
+        config: the resolved configuration of the run, as plain JSON values.
+        metadata: capture name, creator, start frame and the like, as plain JSON values.
+    """
+
+    rig: CameraRig
+    similarity: Similarity
+    fps: float
+    codec: str
+    dynamic: frozenset[FieldName]
+    static: Mapping[FieldName, Tensor]
+    distance_input: bool
+    config: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+
+
+class PacketKind(IntEnum):
+    """A key packet stands alone beside the header; a delta packet needs the packet before it."""
+
+    KEY = 1
+    DELTA = 2
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One frame on the wire.
+
+    Args:
+        kind: key or delta.
+        index: frame number in the stream, from 0, without gaps.
+        pts_seconds: presentation time.
+        payload: the coded fields.
+        field_bytes: length of each field's part of the payload.
+    """
+
+    kind: PacketKind
+    index: int
+    pts_seconds: float
+    payload: bytes
+    field_bytes: Mapping[FieldName, int]
+
+    def __repr__(self) -> str:
+        return f"Packet({self.kind.name}, index={self.index}, {len(self.payload)} bytes)"
+
+
+class PacketSink(Protocol):
+    """Where a stream goes. ``write`` returns the number of bytes that the packet took in the sink."""
+
+    def open(self, header: StreamHeader) -> int: ...
+
+    def write(self, packet: Packet) -> int: ...
+
+    def close(self) -> None: ...

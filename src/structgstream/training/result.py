@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What fitting one frame gives back, and what it says while it works."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from structgstream.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Step:
+    """Progress within one frame's optimisation, for a progress bar."""
+
+    iteration: int
+    iterations: int
+    loss: float
+    anchors: int
+    free: int
+
+
+StepListener = Callable[[Step], None]
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted frame.
+
+    Args:
+        scene: the scene after optimisation, detached, in normalised units.
+        iterations: optimisation steps done.
+        train_psnr: mean over training cameras of the PSNR of the last rendering of each during optimisation, dB.
+        spawned: free Gaussians added in this frame.
+        pruned: free Gaussians removed in this frame.
+        seconds: wall-clock seconds by stage (``render``, ``loss``, ``backward``, ``optimise``, ``patch``, ...).
+        losses: mean of each loss term over the last pass through the cameras.
+    """
+
+    scene: Scene
+    iterations: int
+    train_psnr: float
+    spawned: int = 0
+    pruned: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    losses: Mapping[str, float] = field(default_factory=dict)
