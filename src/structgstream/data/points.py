@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial points from the first frame with known poses, for captures that bring none.
+
+Points from nothing but chance overfit: the scene they grow into has floaters that held-out cameras see. Matched
+keypoints are precise but sparse, the plane sweep covers floors, walls and people; both are kept only where further
+views agree.
+"""
+
+import logging
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.matching import (
+    Features,
+    Floats,
+    back_project,
+    guided_matches,
+    inside,
+    neighbour_views,
+    project,
+    sift_features,
+    triangulate,
+    unique_pairs,
+    viewing_distance,
+)
+from structgstream.data.plane_sweep import SweepConfig, sweep_points
+from structgstream.frames import MultiViewFrame
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PointsConfig:
+    """How initial points are found.
+
+    Args:
+        max_points: most points returned; a random subset beyond.
+        min_points: fewer found points than this are replaced by random ones.
+        random_points: how many random ones.
+        features: SIFT keypoints per picture.
+        neighbours: cameras that each camera is matched with.
+        line_pixels: largest distance of a match to its epipolar line.
+        ratio: largest ratio of the best to the second-best descriptor distance along the line.
+        confirm_pixels: largest reprojection error in a third view.
+        near_share: near limit of matching and sweep, as a share of the viewing distance.
+        far_share: far limit of matching, as a multiple of the viewing distance.
+        isolation_share: side of the cells, as a share of the viewing distance, in which a point needs company.
+        sweep: the plane sweep; None leaves it out.
+    """
+
+    max_points: int = 100_000
+    min_points: int = 300
+    random_points: int = 20_000
+    features: int = 3000
+    neighbours: int = 4
+    line_pixels: float = 1.5
+    ratio: float = 0.85
+    confirm_pixels: float = 2.0
+    near_share: float = 0.1
+    far_share: float = 8.0
+    isolation_share: float = 0.02
+    sweep: SweepConfig | None = field(default_factory=SweepConfig)
+
+
+@dataclass(frozen=True)
+class InitialPoints:
+    """Points to start the first frame from.
+
+    Args:
+        positions: ``[P, 3]`` float64, in the capture's units.
+        colors: ``[P, 3]`` uint8 sRGB.
+        counts: how many came from ``"sift"``, ``"sweep"`` or ``"random"``.
+    """
+
+    positions: Floats
+    colors: NDArray[np.uint8]
+    counts: Mapping[str, int]
+
+    @property
+    def random(self) -> bool:
+        """Whether too little was found and the points only fill the volume that the cameras see."""
+        return self.counts.get("random", 0) > 0
+
+
+def initial_points(
+    frame: MultiViewFrame, rig: CameraRig, *, config: PointsConfig = PointsConfig(), seed: int = 0
+) -> InitialPoints:
+    """Points of one frame from the training cameras' pictures and poses; held-out pictures are never read.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    rng = np.random.default_rng(seed)
+    cameras = {name: rig[name] for name in rig.training}
+    images = {name: frame.images[name] for name in rig.training}
+    distance = viewing_distance(cameras)
+    neighbours = neighbour_views(cameras, count=config.neighbours, distance=distance)
+    workers = max(1, min(len(cameras), os.cpu_count() or 1))
+    positions, colors = _sift_points(cameras, images, neighbours, distance=distance, workers=workers, config=config)
+    sources = np.zeros(len(positions), np.uint8)
+    if config.sweep is not None:
+        ranges = {name: _depth_range(cameras[name], positions, distance, config) for name in cameras}
+        swept, swept_colors = sweep_points(
+            cameras, images, neighbours=neighbours, depth_ranges=ranges, workers=workers, config=config.sweep
+        )
+        positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
+        sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
+    kept = np.flatnonzero(_has_company(positions, cell=config.isolation_share * distance))
+    if len(kept) > config.max_points:
+        kept = np.sort(rng.choice(kept, config.max_points, replace=False))
+    if len(kept) < config.min_points:
+        _log.warning(
+            "Only %d initial points could be triangulated from frame %d (too little texture or overlap); starting from "
+            "%d random points in the volume that the cameras see instead, expect a worse reconstruction.",
+            len(kept),
+            frame.index,
+            config.random_points,
+        )
+        positions, colors = _random_points(cameras, images, distance=distance, rng=rng, config=config)
+        return InitialPoints(positions, colors, {"random": len(positions)})
+    counts = {"sift": int((sources[kept] == 0).sum()), "sweep": int((sources[kept] == 1).sum())}
+    return InitialPoints(positions[kept], colors[kept], counts)
+
+
+def _sift_points(
+    cameras: Mapping[str, Camera],
+    images: Mapping[str, NDArray[np.uint8]],
+    neighbours: Mapping[str, tuple[str, ...]],
+    *,
+    distance: float,
+    workers: int,
+    config: PointsConfig,
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Triangulated keypoints that a third view confirms."""
+    pairs = unique_pairs(neighbours)
+    with ThreadPoolExecutor(workers) as pool:
+        found = pool.map(lambda name: sift_features(images[name], count=config.features), cameras)
+        features = dict(zip(cameras, found, strict=True))
+
+        def match(pair: tuple[str, str]) -> NDArray[np.intp]:
+            first, second = pair
+            return guided_matches(
+                features[first],
+                features[second],
+                (cameras[first], cameras[second]),
+                line_pixels=config.line_pixels,
+                depth_range=(config.near_share * distance, config.far_share * distance),
+                ratio=config.ratio,
+            )
+
+        matches = dict(zip(pairs, pool.map(match, pairs), strict=True))
+    positions, names, pixels = _confirmed(cameras, features, matches, tolerance=config.confirm_pixels)
+    colors = np.empty((len(positions), 3), np.uint8)
+    for index, name in enumerate(cameras):
+        own = names == index
+        column, row = pixels[own].astype(np.intp).T
+        colors[own] = images[name][row, column]
+    return positions, colors
+
+
+def _confirmed(
+    cameras: Mapping[str, Camera],
+    features: Mapping[str, Features],
+    matches: Mapping[tuple[str, str], NDArray[np.intp]],
+    *,
+    tolerance: float,
+) -> tuple[Floats, NDArray[np.intp], Floats]:
+    """Points that two matches of one keypoint, in two other views, agree on.
+
+    Returns the points ``[P, 3]``, and the camera (index) and pixel ``[P, 2]`` of their keypoint.
+    """
+    order = {name: index for index, name in enumerate(cameras)}
+    records: list[Floats] = []  # camera, keypoint, other camera, depth, position, pixel in the other camera
+    for (first, second), match in matches.items():
+        pixels1, pixels2 = features[first].pixels[match[:, 0]], features[second].pixels[match[:, 1]]
+        points, depths = triangulate(cameras[first], cameras[second], pixels1, pixels2)
+        for side, (own, other, seen) in enumerate(((first, second, pixels2), (second, first, pixels1))):
+            head = np.tile([order[own], 0.0, order[other]], (len(match), 1))
+            head[:, 1] = match[:, side]
+            records.append(np.concatenate([head, depths[:, side : side + 1], points, seen], 1))
+    table = np.concatenate(records)
+    table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
+    # Two matches of one keypoint that agree in depth are neighbours after the sort.
+    one, two = table[:-1], table[1:]
+    agree = (one[:, :2] == two[:, :2]).all(1) & (one[:, 2] != two[:, 2])
+    for name, index in order.items():
+        for here, there in ((one, two), (two, one)):
+            rows = np.flatnonzero(agree & (here[:, 2] == index))
+            seen, depths = project(cameras[name], there[rows, 4:7])
+            agree[rows] = (depths > 0) & (np.linalg.norm(seen - here[rows, 7:9], axis=1) < tolerance)
+    one, two = one[agree], two[agree]
+    _, single = np.unique(one[:, :2], axis=0, return_index=True)
+    own = one[single, 0].astype(np.intp)
+    pixels = np.empty((len(single), 2))
+    for name, index in order.items():
+        pixels[own == index] = features[name].pixels[one[single[own == index], 1].astype(np.intp)]
+    return (one[single, 4:7] + two[single, 4:7]) / 2, own, pixels
+
+
+def _depth_range(camera: Camera, points: Floats, distance: float, config: PointsConfig) -> tuple[float, float]:
+    """Nearest and farthest depth to sweep: what the points in the picture span and some room around it."""
+    near = max(config.near_share * distance, camera.near)
+    pixels, depths = project(camera, points)
+    depths = depths[inside(camera, pixels, depths, near=near)]
+    if len(depths) < 30:
+        return near, 3 * distance
+    low, high = np.percentile(depths, [1, 99])
+    return max(near, 0.6 * float(low)), max(1.3 * float(high), 2 * near)
+
+
+def _has_company(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.bool_]:
+    """Which points ``[P]`` have at least ``least`` others in the 27 cells around them."""
+    if len(points) == 0:
+        return np.zeros(0, bool)
+    cells = np.floor((points - points.min(0)) / cell).astype(np.int64) + 1
+    strides = np.array([1, cells[:, 0].max() + 2, (cells[:, 0].max() + 2) * (cells[:, 1].max() + 2)])
+    keys = cells @ strides
+    occupied, counts = np.unique(keys, return_counts=True)
+    total = np.zeros(len(points), np.int64)
+    for offset in np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3) @ strides:
+        at = np.minimum(np.searchsorted(occupied, keys + offset), len(occupied) - 1)
+        total += np.where(occupied[at] == keys + offset, counts[at], 0)
+    return total > least
+
+
+def _random_points(
+    cameras: Mapping[str, Camera],
+    images: Mapping[str, NDArray[np.uint8]],
+    *,
+    distance: float,
+    rng: np.random.Generator,
+    config: PointsConfig,
+) -> tuple[Floats, NDArray[np.uint8]]:
+    """Points spread over the cameras' views, even in inverse depth, each with the colour its camera sees there."""
+    positions: list[Floats] = []
+    colors: list[NDArray[np.uint8]] = []
+    each = -(-config.random_points // len(cameras))
+    for name, camera in cameras.items():
+        near = max(config.near_share * distance, camera.near)
+        pixels = rng.random((each, 2)) * (camera.width, camera.height)
+        inverse = rng.uniform(1 / (3 * distance), 1 / near, each)
+        column, row = pixels.astype(np.intp).T
+        positions.append(back_project(camera, pixels, 1 / inverse))
+        colors.append(images[name][row, column])
+    return np.concatenate(positions), np.concatenate(colors)
