@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations and covariances."""
+
+import torch
+from torch import Tensor
+
+
+def quaternion_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices ``[..., 3, 3]`` of quaternions ``[..., 4]`` wxyz of any positive length."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(rows, dim=-1).reshape(*quats.shape[:-1], 3, 3)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configurations as values. Paper mode is a preset, not a fork; the paper's ablations are edits of one."""
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from structgstream.data.points import PointsConfig
+from structgstream.training.growth import GrowthConfig
+from structgstream.training.initial import InitialConfig, InitialRates
+from structgstream.training.losses import LossWeights
+from structgstream.training.online import OnlineConfig
+from structgstream.training.optim import Rate
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """Everything that decides what a reconstruction gives, apart from the capture and the machine."""
+
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    online: OnlineConfig = field(default_factory=OnlineConfig)
+    points: PointsConfig = field(default_factory=PointsConfig)
+    """How initial points are made from frame 0 when the capture brings none."""
+    normalised_radius: float = 1.0
+    """Largest distance of a training camera to their mean after normalisation; rates and voxel sizes refer to it."""
+    key_interval_seconds: float = 1.0
+    """A key packet, from which a viewer can start, comes this often in media time."""
+    seed: int = 0
+
+
+def to_json(config: StreamConfig) -> dict[str, Any]:
+    """The resolved configuration as plain JSON values: what a stream's header stores."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        if isinstance(value, frozenset | set):
+            return sorted(value)
+        if isinstance(value, list | tuple):
+            return [plain(item) for item in value]
+        return value
+
+    return plain(asdict(config))
+
+
+def decayed(rates: InitialRates, share: float) -> InitialRates:
+    """The same first rates, every one of them falling to ``share`` of itself over the schedule."""
+    return InitialRates(
+        **{
+            name: Rate(rate.initial, rate.initial * share)
+            for name, rate in vars(rates).items()
+        }
+    )
+
+
+PAPER = StreamConfig()
+"""The paper's constants with the readings of docs/method.md, for rigs of equal exposure."""
+
+RIG = StreamConfig(
+    initial=InitialConfig(
+        iterations=4000,
+        schedule_iterations=4000,
+        camera_color=True,
+        coarse_iterations=2500,
+        rates=decayed(InitialRates(), 0.05),
+        growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=60_000),
+        losses=LossWeights(offset_distance=0.005),
+    ),
+)
+"""The paper's online method on any rig: exposures are equalised, frame 0 is annealed and starts on small pictures."""
+
+FAST = replace(
+    RIG,
+    initial=replace(
+        RIG.initial,
+        iterations=1200,
+        schedule_iterations=1200,
+        coarse_iterations=700,
+        growth=GrowthConfig(collect_from=200, start=300, stop=1000, interval=100, eligible_count=20, prune_visits=40,
+                            max_anchors=40_000),
+    ),
+    online=replace(RIG.online, iterations=60, patching=replace(RIG.online.patching, iteration=30)),
+)
+"""A try in minutes on a laptop."""
+
+TINY = replace(
+    FAST,
+    initial=replace(
+        FAST.initial,
+        iterations=60,
+        schedule_iterations=60,
+        coarse_iterations=30,
+        feature_width=8,
+        hidden_width=8,
+        growth=GrowthConfig(collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4),
+    ),
+    online=replace(FAST.online, iterations=10, patching=replace(FAST.online.patching, iteration=5)),
+)
+"""Seconds, for tests: the same code, results of no quality."""
+
+PRESETS: dict[str, StreamConfig] = {
+    "paper-n3dv": PAPER,
+    "paper-meetroom": PAPER,
+    "paper-immersive": PAPER,
+    "rig": RIG,
+    "fast": FAST,
+    "tiny": TINY,
+}
+DEFAULT_PRESET = "rig"
+DEMO_PRESET = "fast"

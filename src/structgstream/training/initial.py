@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame 0: a static reconstruction whose anchors are fit to move later (paper, section Structured 3DGs)."""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import CameraRig
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.training.densify import Densifier
+from structgstream.training.growth import GrowthConfig
+from structgstream.training.losses import LossWeights
+from structgstream.training.optim import Adam, Rate, constant
+from structgstream.training.parameters import ParameterName, Parameters, detached
+from structgstream.training.result import FitResult, Step, StepListener
+from structgstream.training.seeding import seeded_scene
+from structgstream.training.step import LastPass, gradients_of, view_loss
+from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.views import reduced, shuffled_views, training_views
+
+
+@dataclass(frozen=True)
+class InitialRates:
+    """Learning rates of frame 0 (Scaffold-GS), scheduled over ``schedule_iterations``."""
+
+    positions: Rate = constant(0.0)
+    """Anchors do not move in frame 0."""
+    offsets: Rate = Rate(0.01, 1e-4)
+    """Times 1.1 rig radii, as the reference code scales it with the extent of the cameras."""
+    features: Rate = constant(0.0075)
+    scales: Rate = constant(0.007)
+    """Both scales of an anchor."""
+    opacity_mlp: Rate = Rate(0.002, 2e-5)
+    covariance_mlp: Rate = constant(0.004)
+    color_mlp: Rate = Rate(0.008, 5e-5)
+    camera_color: Rate = Rate(0.002, 1e-4)
+    """Gains and biases; unused when ``camera_color`` is off."""
+
+
+@dataclass(frozen=True)
+class InitialConfig:
+    """How frame 0 is fitted."""
+
+    iterations: int = 4000
+    """Paper: 4000."""
+    voxel_size: float = 0.005
+    """The paper's eps, in units of the normalised scene."""
+    offsets_per_anchor: int = 5
+    """The paper's k."""
+    feature_width: int = 32
+    hidden_width: int = 32
+    distance_input: bool = True
+    """Whether the MLPs see the distance to the camera (paper: yes; Scaffold-GS: no)."""
+    camera_color: bool = False
+    """Learn a gain and a bias for each training camera (Note [Colour gauge]); for rigs whose exposures differ."""
+    coarse_iterations: int = 0
+    """The first iterations look at pictures reduced by ``coarse_scale``, which cost less."""
+    coarse_scale: float = 0.5
+    schedule_iterations: int = 30_000
+    """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
+    losses: LossWeights = LossWeights(offset_distance=0.005)
+    rates: InitialRates = field(default_factory=InitialRates)
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+
+
+def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[ParameterName, float]:
+    """Learning rate of every parameter after ``iteration`` steps; ``extent`` is 1.1 rig radii in scene units."""
+    share = iteration / config.schedule_iterations
+    r = config.rates
+    return {
+        "anchor_positions": r.positions.at(share),
+        "anchor_offsets": r.offsets.at(share) * extent,
+        "anchor_features": r.features.at(share),
+        "offset_scales": r.scales.at(share),
+        "base_scales": r.scales.at(share),
+        "opacity_mlp": r.opacity_mlp.at(share),
+        "covariance_mlp": r.covariance_mlp.at(share),
+        "color_mlp": r.color_mlp.at(share),
+        "camera_gains": r.camera_color.at(share),
+        "camera_biases": r.camera_color.at(share),
+    }
+
+
+def rig_extent(rig: CameraRig) -> float:
+    """1.1 times the largest distance of a camera to the mean camera: the unit of Scaffold-GS's offset rate."""
+    centers = torch.stack([rig[name].center for name in rig.training])
+    return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+
+
+def fit_first_frame(
+    frame: MultiViewFrame,
+    rig: CameraRig,
+    points: Tensor,
+    *,
+    config: InitialConfig,
+    backend: Backend,
+    seed: int,
+    on_step: StepListener | None = None,
+) -> FitResult:
+    """Reconstruct frame 0 from its training views.
+
+    Args:
+        frame: the pictures; only those of ``rig.training`` are read.
+        rig: cameras in normalised units.
+        points: ``[P, 3]`` initial points in normalised units.
+        config: the schedule.
+        backend: what computes.
+        seed: all randomness comes from it.
+        on_step: called after every iteration.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    watch = Stopwatch(backend.device)
+    views = training_views(frame, rig, backend.device)
+    template = seeded_scene(
+        points,
+        cameras=len(views),
+        voxel_size=config.voxel_size,
+        offsets_per_anchor=config.offsets_per_anchor,
+        feature_width=config.feature_width,
+        hidden_width=config.hidden_width,
+        distance_input=config.distance_input,
+        device=backend.device,
+        generator=generator,
+    )
+    trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
+    if not config.camera_color:
+        trained -= {"camera_gains", "camera_biases"}
+    parameters = Parameters.of(template, trained=frozenset(trained))
+    adam = Adam(backend)
+    densifier = Densifier.of(template, config=config.growth, voxel_size=config.voxel_size)
+    extent = rig_extent(rig)
+    coarse = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
+    order = shuffled_views(coarse, generator)
+    last_pass = LastPass()
+    for iteration in range(1, config.iterations + 1):
+        if iteration == config.coarse_iterations + 1:
+            order = shuffled_views(views, generator)
+        view = next(order)
+        scene = parameters.scene(template)
+        collects = densifier.collects(iteration)
+        loss = view_loss(
+            scene,
+            view,
+            backend=backend,
+            weights=config.losses,
+            voxel_size=config.voxel_size,
+            track_screen=collects,
+            watch=watch,
+        )
+        gradients, screen_gradient = gradients_of(loss, parameters, watch)
+        if iteration > config.iterations - len(views):
+            last_pass.add(loss, view)
+        with watch.stage("optimise"):
+            adam.step(parameters, gradients, rates_at(iteration, config, extent=extent))
+        if screen_gradient is not None:
+            with watch.stage("densify"), torch.no_grad():
+                densifier.gradients.add(loss.rendering, screen_gradient)
+                densifier.opacities.add(loss.structured, loss.visible)
+                if densifier.due(iteration):
+                    densifier.apply(scene, parameters, adam, generator)
+        if on_step is not None:
+            anchors = parameters.values["anchor_positions"].shape[0]
+            on_step(Step(iteration, config.iterations, float(loss.total.detach()), anchors, 0))
+    return FitResult(
+        scene=detached(parameters.scene(template)),
+        iterations=config.iterations,
+        train_psnr=last_pass.psnr,
+        seconds=watch.seconds,
+        losses=last_pass.terms,
+    )

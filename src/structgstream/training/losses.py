@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The terms of the training loss (paper, equations for L, L_vol, L_init and L_dist)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from structgstream.scene.anchors import AnchorCloud
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the loss terms; a weight of zero is not computed."""
+
+    l1: float = 1.0
+    """The paper writes 1; Scaffold-GS uses 0.8."""
+    ssim: float = 0.2
+    """Paper: lambda_SSIM, on 1 - SSIM."""
+    volume: float = 0.01
+    """Paper: lambda_vol, on the product of each drawn Gaussian's scales."""
+    volume_reduction: Literal["mean", "sum"] = "mean"
+    """The paper's equation is a sum, Scaffold-GS takes the mean (docs/method.md has both measured)."""
+    offset_distance: float = 0.0
+    """Paper: lambda_dist = 0.005 at frame 0, absent afterwards."""
+    offset_distance_reduction: Literal["mean", "sum"] = "mean"
+    """The paper's equation is a sum over anchors and offsets."""
+    offset_distance_reading: Literal["scaled", "raw", "norm"] = "scaled"
+    """What is compared with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the length of O * l_v."""
+
+
+def volume(scales: Tensor, *, reduction: Literal["mean", "sum"]) -> Tensor:
+    """L_vol: the product of the three scales of every drawn Gaussian, ``scales`` ``[N, 3]``."""
+    if scales.shape[0] == 0:
+        return scales.sum()
+    products = scales[:, 0] * scales[:, 1] * scales[:, 2]
+    return products.mean() if reduction == "mean" else products.sum()
+
+
+def offset_distance(anchors: AnchorCloud, *, voxel_size: float, weights: LossWeights) -> Tensor:
+    """L_dist: how far Gaussians stray from their anchors beyond two voxels.
+
+    theta(x) x is a hinge: only the part above ``2 * voxel_size`` (the paper's eps) counts.
+    """
+    if weights.offset_distance_reading == "raw":
+        length = anchors.offsets.abs()
+    else:
+        length = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
+        length = length.norm(dim=-1) if weights.offset_distance_reading == "norm" else length.abs()
+    excess = torch.relu(length - 2.0 * voxel_size)
+    return excess.mean() if weights.offset_distance_reduction == "mean" else excess.sum()

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene taken apart into the tensors that an optimiser moves, and put together again."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from structgstream.scene.color import CameraColor
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import FieldName, flatten_head, unflatten_head
+
+ParameterName = Literal[
+    "anchor_positions",
+    "offset_scales",
+    "base_scales",
+    "anchor_offsets",
+    "anchor_features",
+    "opacity_mlp",
+    "color_mlp",
+    "covariance_mlp",
+    "free_means",
+    "free_log_scales",
+    "free_quats",
+    "free_logit_opacities",
+    "free_colors",
+    "camera_gains",
+    "camera_biases",
+]
+
+ANCHOR_ROWS: tuple[ParameterName, ...] = (
+    "anchor_positions",
+    "offset_scales",
+    "base_scales",
+    "anchor_offsets",
+    "anchor_features",
+)
+FREE_ROWS: tuple[ParameterName, ...] = (
+    "free_means",
+    "free_log_scales",
+    "free_quats",
+    "free_logit_opacities",
+    "free_colors",
+)
+_OF_FIELD: dict[FieldName, tuple[ParameterName, ...]] = {
+    "free": FREE_ROWS,
+    "camera_color": ("camera_gains", "camera_biases"),
+}
+
+
+def parameters_of_fields(names: Iterable[FieldName]) -> frozenset[ParameterName]:
+    """The parameters behind rows of the state table (``free_births`` is an identity, not a parameter)."""
+    found: set[ParameterName] = set()
+    for name in names:
+        if name in _OF_FIELD:
+            found.update(_OF_FIELD[name])
+        elif name != "free_births":
+            found.add(name)  # type: ignore[arg-type]
+    return frozenset(found)
+
+
+@dataclass
+class Parameters:
+    """Leaf tensors by name. The one mutable thing of a fit; it never leaves it.
+
+    ``values[name].requires_grad`` says whether the name is trained.
+    """
+
+    values: dict[ParameterName, Tensor]
+    births: Tensor
+    distance_input: bool
+
+    @classmethod
+    def of(cls, scene: Scene, *, trained: frozenset[ParameterName]) -> "Parameters":
+        """Copies of a scene's tensors; those in ``trained`` collect gradients."""
+        free = scene.free
+        values: dict[ParameterName, Tensor] = {
+            "anchor_positions": scene.anchors.positions,
+            "offset_scales": scene.anchors.log_offset_scales,
+            "base_scales": scene.anchors.log_base_scales,
+            "anchor_offsets": scene.anchors.offsets,
+            "anchor_features": scene.anchors.features,
+            "opacity_mlp": flatten_head(scene.mlps.opacity),
+            "color_mlp": flatten_head(scene.mlps.color),
+            "covariance_mlp": flatten_head(scene.mlps.covariance),
+            "free_means": free.means,
+            "free_log_scales": free.log_scales,
+            "free_quats": free.quats,
+            "free_logit_opacities": free.logit_opacities,
+            "free_colors": free.colors,
+            "camera_gains": scene.camera_color.gains,
+            "camera_biases": scene.camera_color.biases,
+        }
+        copies = {
+            name: value.detach().clone().contiguous().requires_grad_(name in trained) for name, value in values.items()
+        }
+        return cls(values=copies, births=free.births.clone(), distance_input=scene.distance_input)
+
+    @property
+    def trained(self) -> list[ParameterName]:
+        """Names that collect gradients, in a fixed order, without those that are empty."""
+        return [name for name, value in self.values.items() if value.requires_grad and value.numel()]
+
+    def replace_rows(self, names: Iterable[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor]) -> None:
+        """Keep the rows ``keep`` (mask) of each name and append ``added[name]``."""
+        for name in names:
+            old = self.values[name]
+            rows = torch.cat([old.detach()[keep], added[name]])
+            self.values[name] = rows.contiguous().requires_grad_(old.requires_grad)
+
+    def scene(self, template: Scene) -> Scene:
+        """The scene these parameters stand for; differentiable. ``template`` gives the MLPs' widths."""
+        v = self.values
+
+        def head(name: Literal["opacity", "color", "covariance"], vector: Tensor):
+            like = getattr(template.mlps, name)
+            return unflatten_head(vector, like.w1.shape[1], like.w2.shape[0], like.w1.shape[0])
+
+        color = CameraColor(v["camera_gains"], v["camera_biases"])
+        return replace(
+            template,
+            anchors=replace(
+                template.anchors,
+                positions=v["anchor_positions"],
+                log_offset_scales=v["offset_scales"],
+                log_base_scales=v["base_scales"],
+                offsets=v["anchor_offsets"],
+                features=v["anchor_features"],
+            ),
+            mlps=template.mlps._replace(
+                opacity=head("opacity", v["opacity_mlp"]),
+                color=head("color", v["color_mlp"]),
+                covariance=head("covariance", v["covariance_mlp"]),
+            ),
+            free=FreeGaussians(
+                v["free_means"],
+                v["free_log_scales"],
+                v["free_quats"],
+                v["free_logit_opacities"],
+                v["free_colors"],
+                self.births,
+            ),
+            camera_color=color.gauged() if v["camera_gains"].requires_grad else color,
+        )
+
+
+def detached(scene: Scene) -> Scene:
+    """The same scene without a gradient graph."""
+
+    def plain(value: object) -> object:
+        if isinstance(value, Tensor):
+            return value.detach().contiguous()
+        if isinstance(value, tuple):
+            return type(value)(*(plain(item) for item in value))
+        if hasattr(value, "__dataclass_fields__"):
+            return replace(value, **{f.name: plain(getattr(value, f.name)) for f in fields(value)})  # type: ignore[type-var]
+        return value
+
+    return plain(scene)  # type: ignore[return-value]

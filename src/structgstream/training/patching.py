@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Global patching with free Gaussians (paper, section Global Free 3DGs Patching Strategy)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from structgstream.gaussians import Gaussians
+from structgstream.geometry import quaternion_matrices
+from structgstream.kernels.backend import Backend
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.training.views import View
+
+BIRTHS_PER_FRAME = 1 << 32  # Birth ids are frame * 2^32 + n, so they never repeat and need no state between frames.
+
+
+@dataclass(frozen=True)
+class PatchingConfig:
+    """When free Gaussians are born and die."""
+
+    spawn: Literal["gradient", "random", "off"] = "gradient"
+    """``gradient`` is the paper's rule, ``random`` its ablation (as many parents, drawn at random)."""
+    iteration: int = 50
+    """Patching happens once a frame, after this iteration (paper: 50 of 100)."""
+    grad_threshold: float = 1e-3
+    """The paper's tau_grad, on the mean view-space gradient, NDC (Note [View-space units])."""
+    collect_from: int = 0
+    """Gradients are collected after this iteration of the frame."""
+    covariance_factor: float = 2.0
+    """A child is drawn from N(mu, factor * Sigma) (paper: 2)."""
+    opacity: float = 0.1
+    """Opacity at birth."""
+    prune_opacity: float | None = 0.005
+    """Free Gaussians with less opacity are removed before spawning; None keeps all ("w/o quantity control")."""
+    lifetime: Literal["stream", "frame"] = "stream"
+    """``stream``: inherited by the next frame (global patching); ``frame``: dropped at its start (I1 to I3)."""
+    max_free: int = 1_000_000
+    """No Gaussian is born beyond this number; those with the largest gradients come first."""
+
+
+def surviving(free: FreeGaussians, config: PatchingConfig) -> Tensor:
+    """Mask ``[F]`` of the free Gaussians that are not pruned."""
+    if config.prune_opacity is None:
+        return torch.ones(len(free), dtype=torch.bool, device=free.means.device)
+    return free.logit_opacities.sigmoid() >= config.prune_opacity
+
+
+def parents_of(
+    mean_gradient: Tensor, count: Tensor, *, room: int, config: PatchingConfig, generator: torch.Generator
+) -> Tensor:
+    """Ids ``[P]`` that get a child, ascending.
+
+    Args:
+        mean_gradient: ``[slots]`` NDC.
+        count: ``[slots]`` how often each Gaussian was drawn.
+        room: at most this many.
+        config: the rule.
+        generator: for the random rule.
+    """
+    if config.spawn == "off" or room <= 0:
+        return torch.zeros(0, dtype=torch.int64, device=count.device)
+    chosen = ((mean_gradient > config.grad_threshold) & (count > 0)).nonzero()[:, 0]
+    if config.spawn == "random":
+        drawn = (count > 0).nonzero()[:, 0]
+        pick = torch.randperm(drawn.numel(), generator=generator)[: chosen.numel()].to(drawn.device)
+        chosen = drawn[pick]
+    if chosen.numel() > room:
+        chosen = chosen[mean_gradient[chosen].argsort(descending=True, stable=True)[:room]]
+    return chosen.sort().values
+
+
+def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: Backend) -> Gaussians:
+    """The Gaussians ``ids``, ascending, as the first of ``views`` that generates each of them sees it.
+
+    Structured Gaussians exist only for a camera; a child copies colour and scale from a view in which its parent is
+    drawn. An id that no view generates (its opacity has fallen to zero) is left out.
+    """
+    found: list[Gaussians] = [_empty_like(scene)]
+    missing = ids
+    for view in views:
+        if missing.numel() == 0:
+            break
+        seen = scene.gaussians(view.camera, backend)
+        rows = torch.isin(seen.ids, missing).nonzero()[:, 0]
+        found.append(
+            Gaussians(
+                means=seen.means[rows],
+                quats=seen.quats[rows],
+                scales=seen.scales[rows],
+                opacities=seen.opacities[rows],
+                colors=seen.colors[rows],
+                ids=seen.ids[rows],
+            )
+        )
+        missing = missing[~torch.isin(missing, seen.ids)]
+    columns = {name: torch.cat([getattr(g, name) for g in found]) for name in Gaussians.__dataclass_fields__}
+    order = columns["ids"].argsort()
+    return Gaussians(**{name: column[order] for name, column in columns.items()})
+
+
+def _empty_like(scene: Scene) -> Gaussians:
+    none = scene.anchors.positions[:0]
+    ids = torch.zeros(0, dtype=torch.int64, device=none.device)
+    return Gaussians(none, none.new_zeros(0, 4), none, none.new_zeros(0), none, ids)
+
+
+def children_of(parents: Gaussians, *, frame_index: int, config: PatchingConfig, generator: torch.Generator) -> FreeGaussians:
+    """One free Gaussian for each parent, drawn from N(mu, factor * Sigma).
+
+    With Sigma = R S S^T R^T a draw is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
+    parent's, the rotation is the unit quaternion, the opacity ``config.opacity``.
+    """
+    count = len(parents)
+    z = torch.randn(count, 3, generator=generator).to(parents.means)
+    local = (config.covariance_factor**0.5) * parents.scales * z
+    rotations = quaternion_matrices(parents.quats)
+    unit = parents.means.new_tensor([1.0, 0.0, 0.0, 0.0])
+    opacity = torch.tensor(config.opacity)
+    return FreeGaussians(
+        means=parents.means + (rotations @ local[:, :, None])[:, :, 0],
+        log_scales=parents.scales.clamp(min=1e-9).log(),
+        quats=unit.expand(count, 4).clone(),
+        logit_opacities=torch.logit(opacity).to(parents.means).expand(count).clone(),
+        colors=parents.colors.clone(),
+        births=frame_index * BIRTHS_PER_FRAME + torch.arange(count, device=parents.means.device),
+    )

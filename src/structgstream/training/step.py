@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One view's loss: what both kinds of frame do in every iteration."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.kernels.backend import Backend
+from structgstream.scene.render import Rendering, draw
+from structgstream.scene.scene import Scene
+from structgstream.training.losses import LossWeights, offset_distance, volume
+from structgstream.training.parameters import ParameterName, Parameters
+from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.views import View
+
+
+@dataclass(frozen=True)
+class ViewLoss:
+    """The loss of one view and what it was computed from."""
+
+    total: Tensor
+    terms: dict[str, Tensor]
+    rendering: Rendering
+    image: Tensor
+    structured: StructuredGaussians
+    visible: Tensor
+
+    def squared_error(self, view: View) -> float:
+        """Mean squared error of the clamped rendering against the picture."""
+        with torch.no_grad():
+            return float((self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square().mean())
+
+
+def view_loss(
+    scene: Scene,
+    view: View,
+    *,
+    backend: Backend,
+    weights: LossWeights,
+    voxel_size: float,
+    track_screen: bool,
+    watch: Stopwatch,
+) -> ViewLoss:
+    """Render ``view`` and compare it with its picture (paper, equations for L and L_init)."""
+    with watch.stage("generate"):
+        structured, visible = scene.structured(view.camera, backend)
+        gaussians = scene.dressed(structured)
+    with watch.stage("rasterise"):
+        rendering = draw(gaussians, view.camera, backend, track_screen=track_screen)
+        image = scene.camera_color.apply(rendering.image, view.index)
+    with watch.stage("loss"):
+        l1, ssim = backend.l1_ssim(image, view.image)
+        terms = {"l1": l1, "ssim": 1.0 - ssim}
+        total = weights.l1 * l1 + weights.ssim * terms["ssim"]
+        if weights.volume:
+            terms["volume"] = volume(gaussians.scales, reduction=weights.volume_reduction)
+            total = total + weights.volume * terms["volume"]
+        if weights.offset_distance:
+            terms["offset_distance"] = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights)
+            total = total + weights.offset_distance * terms["offset_distance"]
+    return ViewLoss(total, terms, rendering, image, structured, visible)
+
+
+def gradients_of(
+    loss: ViewLoss, parameters: Parameters, watch: Stopwatch
+) -> tuple[dict[ParameterName, Tensor], Tensor | None]:
+    """Gradients of the trained parameters, and of the screen positions ``[N, 2]`` in pixels when they were tracked.
+
+    A parameter that the view did not touch has no entry.
+    """
+    names = parameters.trained
+    inputs = [parameters.values[name] for name in names]
+    screen = loss.rendering.screen_offsets
+    with watch.stage("backward"):
+        found = torch.autograd.grad(
+            loss.total, [*inputs, screen] if screen is not None else inputs, allow_unused=True
+        )
+    by_name = {name: grad for name, grad in zip(names, found, strict=False) if grad is not None}
+    return by_name, found[-1] if screen is not None else None
+
+
+class LastPass:
+    """Mean loss terms and PSNR over the last pass through the cameras."""
+
+    def __init__(self) -> None:
+        self._terms: dict[str, list[float]] = {}
+        self._squared_errors: list[float] = []
+
+    def add(self, loss: ViewLoss, view: View) -> None:
+        """Note one view's result."""
+        self._squared_errors.append(loss.squared_error(view))
+        for name, value in loss.terms.items():
+            self._terms.setdefault(name, []).append(float(value.detach()))
+
+    @property
+    def psnr(self) -> float:
+        """Mean over views of the PSNR in dB, NaN before any view."""
+        values = [-10.0 * math.log10(max(error, 1e-10)) for error in self._squared_errors]
+        return sum(values) / len(values) if values else math.nan
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Mean of each loss term."""
+        return {name: sum(values) / len(values) for name, values in self._terms.items()}
