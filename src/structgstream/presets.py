@@ -89,8 +89,6 @@ TINY = replace(
         iterations=60,
         schedule_iterations=60,
         coarse_iterations=30,
-        feature_width=8,
-        hidden_width=8,
         growth=GrowthConfig(collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4),
     ),
     online=replace(FAST.online, iterations=10, patching=replace(FAST.online.patching, iteration=5)),

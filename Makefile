@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+# `make demo` and `make test` set up everything they need from a fresh clone, with plain venv and pip.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test check clean
+
+demo: $(VENV)/.demo-ready
+	$(BIN)/structgstream demo --output demo
+
+test: $(VENV)/.test-ready
+	scripts/check $(BIN)
+	scripts/test $(BIN)
+
+check: $(VENV)/.test-ready
+	scripts/check $(BIN)
+
+# A plain (not editable) install: what is tested is what a user gets. Sources are listed so that a change reinstalls.
+SOURCES := pyproject.toml CMakeLists.txt $(shell find csrc src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo-ready: $(SOURCES) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[all]'
+	touch $@
+
+$(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]'
+	touch $@ $(VENV)/.demo-ready
+
+clean:
+	rm -rf $(VENV) build dist demo
