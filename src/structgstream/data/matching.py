@@ -97,6 +97,20 @@ def viewing_distance(cameras: Mapping[str, Camera]) -> float:
     return max(distance if meets else 5 * radius, 1e-9)
 
 
+def level_normal(cameras: Mapping[str, Camera]) -> Floats:
+    """The unit normal ``[3]`` of level planes, pointing up: square to the cameras' horizontal axes.
+
+    Holds for cameras that are not rolled. Where their horizontal axes are all parallel, the mean up of the pictures
+    decides among the directions square to them.
+    """
+    axes = np.stack([camera.viewmat.numpy()[0, :3] for camera in cameras.values()])
+    upwards = -np.mean([camera.viewmat.numpy()[1, :3] for camera in cameras.values()], axis=0)
+    values, vectors = np.linalg.eigh(axes.T @ axes / len(axes))
+    flat = vectors[:, values < max(1.5 * values[0], 1e-3)]
+    normal = flat @ (flat.T @ upwards)
+    return normal / max(float(np.linalg.norm(normal)), 1e-12)
+
+
 def neighbour_views(cameras: Mapping[str, Camera], *, count: int, distance: float) -> dict[str, tuple[str, ...]]:
     """For each camera the ``count`` others that see most of its volume under a useful parallax, best first.
 

@@ -37,6 +37,7 @@ class SweepConfig:
         min_margin: least lead of the best plane over any other that is not its neighbour.
         agreement: largest disagreement with another view's depth, in planes or as a share of depth (the larger one).
         views: further views that must agree.
+        level_planes: also sweep level planes, for floors and tables seen at a slant.
     """
 
     width: int = 240
@@ -47,6 +48,30 @@ class SweepConfig:
     min_margin: float = 0.04
     agreement: tuple[float, float] = (1.0, 0.01)
     views: int = 2
+    level_planes: bool = False
+
+
+# Fine windows for texture and outlines; then wide ones, of pictures so reduced that their noise is averaged away,
+# for what is nearly plain.
+DEFAULT_LEVELS = (
+    SweepConfig(),
+    SweepConfig(width=96, window=7, noise=0.001, min_margin=0.03, level_planes=True),
+)
+
+
+@dataclass(frozen=True)
+class SweepBounds:
+    """Where one camera looks for depth.
+
+    Args:
+        depth_range: nearest and farthest depth along z.
+        up: unit normal ``[3]`` of the level planes (floor, table) in the world; None sweeps no level planes.
+        heights: lowest and highest level plane, along ``up``.
+    """
+
+    depth_range: tuple[float, float]
+    up: Floats | None = None
+    heights: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -86,51 +111,47 @@ def sweep_view(camera: Camera, image: NDArray[np.uint8], *, width: int) -> Sweep
 
 
 def sweep_depth(
-    reference: SweepView, neighbours: Sequence[SweepView], *, depth_range: tuple[float, float], config: SweepConfig
+    reference: SweepView, neighbours: Sequence[SweepView], *, bounds: SweepBounds, config: SweepConfig
 ) -> DepthMap:
-    """The best plane of every pixel of ``reference``, refined by a parabola through the scores around it."""
-    near, far = depth_range
-    planes = _plane_count(reference.camera, [view.camera for view in neighbours], depth_range, config.planes)
-    inverse = np.linspace(1 / far, 1 / near, planes)
-    scores = np.stack([_plane_score(reference, neighbours, 1 / value, config) for value in inverse])
-    best = scores.argmax(0)
-    index = np.arange(planes)[:, None, None]
-    peak = np.take_along_axis(scores, best[None], 0)[0]
-    rival = np.where(np.abs(index - best) > 2, scores, -1.0).max(0)
-    before = np.take_along_axis(scores, np.maximum(best - 1, 0)[None], 0)[0]
-    after = np.take_along_axis(scores, np.minimum(best + 1, planes - 1)[None], 0)[0]
-    interior = (best > 0) & (best < planes - 1) & (before > -1) & (after > -1)
-    bend = np.maximum(2 * peak - before - after, 1e-6)
-    shift = np.where(interior, np.clip((after - before) / (2 * bend), -0.5, 0.5), 0.0)
-    step = (inverse[-1] - inverse[0]) / (planes - 1)
-    believed = interior & (peak > config.min_score) & (peak - rival > config.min_margin)
-    return DepthMap(reference.camera, inverse[0] + (best + shift) * step, step, believed)
+    """The best plane of every pixel of ``reference``, over all families of planes."""
+    cameras = [view.camera for view in neighbours]
+    near, far = bounds.depth_range
+    limits = (1 / far, 1 / near)
+    families = _families(reference.camera, cameras, bounds, config)
+    searches = [_search(reference, neighbours, family, limits, config) for family in families]
+    step = (limits[1] - limits[0]) / (len(families[0].inverse_offsets) - 1)
+    inverse, peak, lead = searches[0]
+    for other_inverse, other_peak, other_lead in searches[1:]:
+        # Two families that find different depths are each other's rivals; the same depth twice is no rivalry.
+        apart = np.abs(other_inverse - inverse) > 2 * step
+        better = other_peak > peak
+        gap = np.where(apart, np.abs(other_peak - peak), np.inf)
+        lead = np.minimum(np.where(better, other_lead, lead), gap)
+        inverse, peak = np.where(better, other_inverse, inverse), np.maximum(other_peak, peak)
+    believed = (peak > config.min_score) & (lead > config.min_margin)
+    return DepthMap(reference.camera, inverse, step, believed)
 
 
-def consistent_points(
-    maps: Mapping[str, DepthMap], views: Mapping[str, SweepView], *, config: SweepConfig
-) -> tuple[Floats, NDArray[np.uint8]]:
-    """Points ``[P, 3]`` and colours ``[P, 3]`` of the believed pixels on whose depth enough further views agree.
+def consistent_pixels(
+    depth_map: DepthMap, others: Sequence[DepthMap], *, config: SweepConfig
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """The points ``[P, 3]`` of the believed pixels on whose depth enough of the other maps agree, and those pixels.
 
-    A point is the mean of its own estimate and of those of the views that agree.
+    A point is the mean of its own estimate and of those of the views that agree. The mask is ``[H, W]`` and names the
+    points' pixels in row order.
     """
-    positions: list[Floats] = []
-    colors: list[NDArray[np.uint8]] = []
-    for name, depth_map in maps.items():
-        row, column = np.nonzero(depth_map.believed)
-        pixels = np.stack([column, row], 1) + 0.5
-        points = back_project(depth_map.camera, pixels, 1 / depth_map.inverse_depth[row, column])
-        total, agreeing = points.copy(), np.zeros(len(points), np.intp)
-        for other_name, other in maps.items():
-            if other_name == name:
-                continue
-            seen, estimate = _agreement(points, depth_map, pixels, other, config)
-            agreeing[seen] += 1
-            total[seen] += estimate
-        kept = agreeing >= config.views
-        positions.append(total[kept] / (agreeing[kept, None] + 1))
-        colors.append(views[name].colors[row[kept], column[kept]])
-    return np.concatenate(positions), np.concatenate(colors)
+    row, column = np.nonzero(depth_map.believed)
+    pixels = np.stack([column, row], 1) + 0.5
+    points = back_project(depth_map.camera, pixels, 1 / depth_map.inverse_depth[row, column])
+    total, agreeing = points.copy(), np.zeros(len(points), np.intp)
+    for other in others:
+        seen, estimate = _agreement(points, depth_map, pixels, other, config)
+        agreeing[seen] += 1
+        total[seen] += estimate
+    kept = agreeing >= config.views
+    mask = np.zeros(depth_map.believed.shape, bool)
+    mask[row[kept], column[kept]] = True
+    return total[kept] / (agreeing[kept, None] + 1), mask
 
 
 def sweep_points(
@@ -138,27 +159,42 @@ def sweep_points(
     images: Mapping[str, NDArray[np.uint8]],
     *,
     neighbours: Mapping[str, tuple[str, ...]],
-    depth_ranges: Mapping[str, tuple[float, float]],
+    bounds: Mapping[str, SweepBounds],
     workers: int,
-    config: SweepConfig = SweepConfig(),
+    levels: Sequence[SweepConfig] = DEFAULT_LEVELS,
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Consistent points and their colours from depth maps of all ``cameras``; ``images`` as ``[H, W, 3]`` uint8.
+
+    A later level adds only what the earlier ones left blank around its pixels: wide windows grow over outlines.
 
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    views = {name: sweep_view(camera, images[name], width=config.width) for name, camera in cameras.items()}
-
-    def depth_map(name: str) -> DepthMap:
-        others = [views[other] for other in neighbours[name]]
-        return sweep_depth(views[name], others, depth_range=depth_ranges[name], config=config)
-
+    cv2 = _cv2()
     names = [name for name in cameras if neighbours[name]]
+    positions: list[Floats] = [np.empty((0, 3))]
+    colors: list[NDArray[np.uint8]] = [np.empty((0, 3), np.uint8)]
+    covered: dict[str, FloatImage] = {}
     with ThreadPoolExecutor(workers) as pool:
-        maps = dict(zip(names, pool.map(depth_map, names), strict=True))
-    if not maps:
-        return np.empty((0, 3)), np.empty((0, 3), np.uint8)
-    return consistent_points(maps, views, config=config)
+        for config in levels:
+            views = {name: sweep_view(camera, images[name], width=config.width) for name, camera in cameras.items()}
+
+            def depth_map(name: str, views: Mapping[str, SweepView] = views, config: SweepConfig = config) -> DepthMap:
+                others = [views[other] for other in neighbours[name]]
+                return sweep_depth(views[name], others, bounds=bounds[name], config=config)
+
+            maps = dict(zip(names, pool.map(depth_map, names), strict=True))
+            for name in names:
+                others = [other for other_name, other in maps.items() if other_name != name]
+                points, mask = consistent_pixels(maps[name], others, config=config)
+                height, width = mask.shape
+                before = cv2.resize(covered.get(name, mask * 0.0), (width, height), interpolation=cv2.INTER_AREA)
+                reach = config.window // 2 | 1
+                blank = cv2.boxFilter(before, -1, (reach, reach)) < 0.02
+                positions.append(points[blank[mask]])
+                colors.append(views[name].colors[mask & blank])
+                covered[name] = np.maximum(before, mask)
+    return np.concatenate(positions), np.concatenate(colors)
 
 
 def _agreement(
@@ -180,32 +216,98 @@ def _agreement(
     return seen[near_pixel], estimate[near_pixel]
 
 
-def _plane_count(
-    camera: Camera, others: Sequence[Camera], depth_range: tuple[float, float], limits: tuple[int, int]
-) -> int:
-    """Planes that a pixel in the middle of the picture needs to move by one pixel from one to the next."""
-    middle = np.array([[camera.width / 2, camera.height / 2]])
-    focal = float(camera.K[0, 0])
-    inverse = 1 / depth_range[0] - 1 / depth_range[1]
-    ray = back_project(camera, middle, np.ones(1))[0] - camera.center.numpy()
-    ray /= np.linalg.norm(ray)
+@dataclass(frozen=True)
+class _Family:
+    """Parallel planes ``normal . x = offset`` in the reference camera's axes, even in ``1 / offset``."""
+
+    normal: Floats
+    inverse_offsets: Floats
+
+
+def _families(
+    camera: Camera, others: Sequence[Camera], bounds: SweepBounds, config: SweepConfig
+) -> list[_Family]:
+    """Planes parallel to the picture, then level planes under and over the camera (Gallup et al., CVPR 2007).
+
+    Floors and tables are seen at a slant: on planes parallel to the picture a large window does not match there.
+    """
+    near, far = bounds.depth_range
+    pixels_per_inverse = float(camera.K[0, 0]) * _base_across(camera, others)
+    count = int(np.clip(math.ceil(pixels_per_inverse * (1 / near - 1 / far)), *config.planes))
+    families = [_Family(np.array([0.0, 0.0, 1.0]), np.linspace(1 / far, 1 / near, count))]
+    if bounds.up is None or not config.level_planes:
+        return families
+    normal = camera.viewmat.numpy()[:3, :3] @ bounds.up
+    slant = np.abs(_rays_of_pixels(camera) @ normal).max()
+    for height in bounds.heights:
+        offset = height - float(bounds.up @ camera.center.numpy())
+        # A plane near the lens' own height is seen edge on.
+        close = math.copysign(0.1 * far, offset)
+        if abs(offset) > 1.5 * abs(close):
+            inverse = (1 / offset, 1 / close)
+            count = int(np.clip(math.ceil(pixels_per_inverse * slant * abs(inverse[1] - inverse[0])), 8, config.planes[1]))
+            families.append(_Family(normal, np.linspace(*inverse, count)))
+    return families
+
+
+def _base_across(camera: Camera, others: Sequence[Camera]) -> float:
+    """Median distance of the other cameras from the optical axis."""
+    axis = camera.viewmat.numpy()[2, :3]
     bases = [other.center.numpy() - camera.center.numpy() for other in others]
-    across = float(np.median([np.linalg.norm(base - (base @ ray) * ray) for base in bases]))
-    return int(np.clip(math.ceil(focal * across * inverse), *limits))
+    return float(np.median([np.linalg.norm(base - (base @ axis) * axis) for base in bases]))
 
 
-def _plane_score(reference: SweepView, neighbours: Sequence[SweepView], depth: float, config: SweepConfig) -> FloatImage:
+def _search(
+    reference: SweepView,
+    neighbours: Sequence[SweepView],
+    family: _Family,
+    limits: tuple[float, float],
+    config: SweepConfig,
+) -> tuple[Floats, FloatImage, FloatImage]:
+    """Inverse depth, score and lead over the best rival ``[H, W]`` of one family; a lead of -1 where there is no peak.
+
+    The plane is refined by a parabola through the scores around it.
+    """
+    offsets = family.inverse_offsets
+    tilt = _rays_of_pixels(reference.camera) @ family.normal
+    scores = np.stack([_plane_score(reference, neighbours, family.normal * inverse, config) for inverse in offsets])
+    inverse_depths = tilt * offsets[:, None, None]
+    margin = 0.01 * limits[1]
+    scores[(inverse_depths < limits[0] - margin) | (inverse_depths > limits[1] + margin)] = -1
+    last = len(offsets) - 1
+    best = scores.argmax(0)
+    peak = np.take_along_axis(scores, best[None], 0)[0]
+    rival = np.where(np.abs(np.arange(last + 1)[:, None, None] - best) > 2, scores, -1.0).max(0)
+    before = np.take_along_axis(scores, np.maximum(best - 1, 0)[None], 0)[0]
+    after = np.take_along_axis(scores, np.minimum(best + 1, last)[None], 0)[0]
+    interior = (best > 0) & (best < last) & (before > -1) & (after > -1)
+    bend = np.maximum(2 * peak - before - after, 1e-6)
+    shift = np.where(interior, np.clip((after - before) / (2 * bend), -0.5, 0.5), 0.0)
+    step = (offsets[-1] - offsets[0]) / last
+    inverse = np.maximum(tilt * (offsets[0] + (best + shift) * step), 1e-12)
+    return inverse, peak, np.where(interior, peak - rival, -1)
+
+
+def _rays_of_pixels(camera: Camera) -> Floats:
+    """Directions ``[H, W, 3]`` through the pixel centres in the camera's own axes, of length one along z."""
+    column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([column, row, np.ones_like(column)], -1) @ np.linalg.inv(camera.K.numpy()).T
+
+
+def _plane_score(
+    reference: SweepView, neighbours: Sequence[SweepView], plane: Floats, config: SweepConfig
+) -> FloatImage:
     """Mean correlation ``[H, W]`` of the better half of the neighbours on one plane; -1 where none sees it."""
-    scores = np.stack([_correlation(reference, view, depth, config) for view in neighbours])
+    scores = np.stack([_correlation(reference, view, plane, config) for view in neighbours])
     half = max(1, (len(neighbours) + 1) // 2)
     return np.partition(scores, len(scores) - half, axis=0)[-half:].mean(0)
 
 
-def _correlation(reference: SweepView, other: SweepView, depth: float, config: SweepConfig) -> FloatImage:
-    """Correlation ``[H, W]`` of the reference with another picture seen through the plane; -1 outside it."""
+def _correlation(reference: SweepView, other: SweepView, plane: Floats, config: SweepConfig) -> FloatImage:
+    """Correlation ``[H, W]`` of the reference with another picture seen through ``plane . x = 1``; -1 outside it."""
     cv2 = _cv2()
     height, width = reference.grey.shape
-    homography, facing = _plane_homography(reference.camera, other.camera, depth)
+    homography, facing = _plane_homography(reference.camera, other.camera, plane)
     if not facing.any():
         return np.full((height, width), -1, np.float32)
     warped = cv2.warpPerspective(
@@ -233,14 +335,13 @@ def _correlation(reference: SweepView, other: SweepView, depth: float, config: S
     return score
 
 
-def _plane_homography(reference: Camera, other: Camera, depth: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """From the reference's pixel indices to the other's on the plane at ``depth``; which pixels it lies before."""
+def _plane_homography(reference: Camera, other: Camera, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """From the reference's pixel indices to the other's by ``plane . x = 1``; which pixels meet it before the other."""
     relative = other.viewmat.numpy() @ np.linalg.inv(reference.viewmat.numpy())
-    plane = relative[:3, :3].copy()
-    plane[:, 2] += relative[:3, 3] / depth
+    induced = relative[:3, :3] + relative[:3, 3:] * plane
     # cv2 puts the first pixel's centre at 0, the cameras at 0.5.
     centred = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    homography = np.linalg.inv(centred) @ other.K.numpy() @ plane @ np.linalg.inv(reference.K.numpy()) @ centred
+    homography = np.linalg.inv(centred) @ other.K.numpy() @ induced @ np.linalg.inv(reference.K.numpy()) @ centred
     row, column = np.mgrid[: reference.height, : reference.width]
     return homography, homography[2, 0] * column + homography[2, 1] * row + homography[2, 2] > 1e-6
 

@@ -10,7 +10,7 @@ import logging
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from structgstream.data.matching import (
     back_project,
     guided_matches,
     inside,
+    level_normal,
     neighbour_views,
     project,
     sift_features,
@@ -29,7 +30,7 @@ from structgstream.data.matching import (
     unique_pairs,
     viewing_distance,
 )
-from structgstream.data.plane_sweep import SweepConfig, sweep_points
+from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepBounds, SweepConfig, sweep_points
 from structgstream.frames import MultiViewFrame
 
 _log = logging.getLogger(__name__)
@@ -40,7 +41,7 @@ class PointsConfig:
     """How initial points are found.
 
     Args:
-        max_points: most points returned; a random subset beyond.
+        max_points: most points returned.
         min_points: fewer found points than this are replaced by random ones.
         random_points: how many random ones.
         features: SIFT keypoints per picture.
@@ -50,11 +51,13 @@ class PointsConfig:
         confirm_pixels: largest reprojection error in a third view.
         near_share: near limit of matching and sweep, as a share of the viewing distance.
         far_share: far limit of matching, as a multiple of the viewing distance.
+        cell_share: side of the cells, as a share of the viewing distance, that keep one point each
+            (grown where that leaves more than ``max_points``).
         isolation_share: side of the cells, as a share of the viewing distance, in which a point needs company.
-        sweep: the plane sweep; None leaves it out.
+        sweep_levels: the plane sweeps, fine to coarse; none leaves the sweep out.
     """
 
-    max_points: int = 100_000
+    max_points: int = 60_000
     min_points: int = 300
     random_points: int = 20_000
     features: int = 3000
@@ -64,8 +67,9 @@ class PointsConfig:
     confirm_pixels: float = 2.0
     near_share: float = 0.1
     far_share: float = 8.0
+    cell_share: float = 0.004
     isolation_share: float = 0.02
-    sweep: SweepConfig | None = field(default_factory=SweepConfig)
+    sweep_levels: tuple[SweepConfig, ...] = DEFAULT_LEVELS
 
 
 @dataclass(frozen=True)
@@ -104,16 +108,15 @@ def initial_points(
     workers = max(1, min(len(cameras), os.cpu_count() or 1))
     positions, colors = _sift_points(cameras, images, neighbours, distance=distance, workers=workers, config=config)
     sources = np.zeros(len(positions), np.uint8)
-    if config.sweep is not None:
-        ranges = {name: _depth_range(cameras[name], positions, distance, config) for name in cameras}
+    if config.sweep_levels:
+        bounds = _sweep_bounds(cameras, positions, distance=distance, config=config)
         swept, swept_colors = sweep_points(
-            cameras, images, neighbours=neighbours, depth_ranges=ranges, workers=workers, config=config.sweep
+            cameras, images, neighbours=neighbours, bounds=bounds, workers=workers, levels=config.sweep_levels
         )
         positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
         sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
     kept = np.flatnonzero(_has_company(positions, cell=config.isolation_share * distance))
-    if len(kept) > config.max_points:
-        kept = np.sort(rng.choice(kept, config.max_points, replace=False))
+    kept = kept[_thinned(positions[kept], cell=config.cell_share * distance, count=config.max_points)]
     if len(kept) < config.min_points:
         _log.warning(
             "Only %d initial points could be triangulated from frame %d (too little texture or overlap); starting from "
@@ -203,6 +206,23 @@ def _confirmed(
     return (one[single, 4:7] + two[single, 4:7]) / 2, own, pixels
 
 
+def _sweep_bounds(
+    cameras: Mapping[str, Camera], points: Floats, *, distance: float, config: PointsConfig
+) -> dict[str, SweepBounds]:
+    """Depths and heights that the points span, with some room around them."""
+    up = level_normal(cameras)
+    low, high = np.percentile(points @ up, [1, 99]) if len(points) >= 30 else (0.0, 0.0)
+    room = 0.1 * distance
+    return {
+        name: SweepBounds(
+            _depth_range(camera, points, distance, config),
+            up if low < high else None,
+            (float(low) - room, float(high) + room),
+        )
+        for name, camera in cameras.items()
+    }
+
+
 def _depth_range(camera: Camera, points: Floats, distance: float, config: PointsConfig) -> tuple[float, float]:
     """Nearest and farthest depth to sweep: what the points in the picture span and some room around it."""
     near = max(config.near_share * distance, camera.near)
@@ -218,15 +238,36 @@ def _has_company(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.b
     """Which points ``[P]`` have at least ``least`` others in the 27 cells around them."""
     if len(points) == 0:
         return np.zeros(0, bool)
-    cells = np.floor((points - points.min(0)) / cell).astype(np.int64) + 1
-    strides = np.array([1, cells[:, 0].max() + 2, (cells[:, 0].max() + 2) * (cells[:, 1].max() + 2)])
-    keys = cells @ strides
+    keys, strides = _cells(points, cell)
     occupied, counts = np.unique(keys, return_counts=True)
     total = np.zeros(len(points), np.int64)
     for offset in np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3) @ strides:
         at = np.minimum(np.searchsorted(occupied, keys + offset), len(occupied) - 1)
         total += np.where(occupied[at] == keys + offset, counts[at], 0)
     return total > least
+
+
+def _thinned(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:
+    """Indices of one point per cell, of cells grown until at most ``count`` points remain.
+
+    Cells rather than a random subset: plain places, where points are few, keep theirs. The earlier point of a cell
+    stays, so a keypoint before a fine window and a fine window before a wide one.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.intp)
+    while True:
+        _, firsts = np.unique(_cells(points, cell)[0], return_index=True)
+        if len(firsts) <= count:
+            return np.sort(firsts)
+        cell *= 1.1
+
+
+def _cells(points: Floats, cell: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A number ``[P]`` for the cubic cell of each point, and what a step along each axis adds to it."""
+    cells = np.floor((points - points.min(0)) / cell).astype(np.int64) + 1
+    width, depth = int(cells[:, 0].max()) + 2, int(cells[:, 1].max()) + 2
+    strides = np.array([1, width, width * depth])
+    return cells @ strides, strides
 
 
 def _random_points(
