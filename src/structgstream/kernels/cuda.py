@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""gsplat's CUDA rasteriser behind this package's contract.
+
+gsplat is imported only when a GPU is there: without one its import prints warnings and its functions fail late.
+"""
+
+import importlib.util
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.raster_types import RasterOutput
+
+TILE_PIXELS = 16
+
+
+def cuda_reason() -> str | None:
+    """Why the back-end is not available on this machine, with the way to get it; None when it is."""
+    if not torch.cuda.is_available():
+        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+        return f"torch sees no NVIDIA GPU (torch {torch.__version__}, {built}); install a driver and a CUDA build of torch."
+    if importlib.util.find_spec("gsplat") is None:
+        return "gsplat is not installed; install it with: pip install 'structgstream[cuda]'"
+    return None
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    background: Tensor | None = None,
+    screen_offsets: Tensor | None = None,
+) -> RasterOutput:
+    """The contract of ``kernels.reference_raster.rasterize`` on a GPU.
+
+    The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient means the
+    same on every back-end.
+    """
+    from gsplat.cuda._wrapper import (  # pyright: ignore[reportMissingImports]
+        fully_fused_projection,
+        isect_offset_encode,
+        isect_tiles,
+        rasterize_to_pixels,
+    )
+
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        viewmat[None],
+        K[None],
+        width,
+        height,
+        eps2d=0.3,
+        near_plane=near,
+        packed=False,
+        opacities=opacities,
+    )  # [1, N, 2], [1, N, 2], [1, N], [1, N, 3]
+    if screen_offsets is not None:
+        means2d = means2d + screen_offsets[None]
+    tiles_x = (width + TILE_PIXELS - 1) // TILE_PIXELS
+    tiles_y = (height + TILE_PIXELS - 1) // TILE_PIXELS
+    _, pair_ids, flat_ids = isect_tiles(
+        means2d, radii, depths, TILE_PIXELS, tiles_x, tiles_y, packed=False, n_images=1
+    )
+    tile_starts = isect_offset_encode(pair_ids, 1, tiles_x, tiles_y).reshape(1, tiles_y, tiles_x)
+    image, alpha = rasterize_to_pixels(
+        means2d,
+        conics,
+        colors[None],
+        opacities[None],
+        width,
+        height,
+        TILE_PIXELS,
+        tile_starts,
+        flat_ids,
+        backgrounds=None if background is None else background[None],
+        packed=False,
+    )
+    return RasterOutput(image=image[0], alpha=alpha[0, :, :, 0], radii=radii[0].amax(-1).float())

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The architecture is a test: layers, size caps, exports, docstrings, and what an import may pull in."""
+
+import ast
+import importlib
+import pkgutil
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+import structgstream
+
+ROOT = Path(__file__).parents[2]
+SOURCES = sorted((ROOT / "src" / "structgstream").rglob("*.py"))
+
+
+def test_layers() -> None:
+    """The contracts of pyproject.toml (import-linter)."""
+    program = Path(sys.executable).with_name("lint-imports")
+    result = subprocess.run([program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+def test_modules_stay_small() -> None:
+    lengths = {path: len(path.read_text().splitlines()) for path in SOURCES}
+    assert not {path.name: n for path, n in lengths.items() if n > (700 if "kernels" in path.parts else 400)}
+    assert statistics.median(n for n in lengths.values() if n > 1) <= 160
+
+
+def test_public_names_are_sorted_and_importable() -> None:
+    assert list(structgstream.__all__) == sorted(structgstream.__all__)
+    for name in structgstream.__all__:
+        assert hasattr(structgstream, name), name
+
+
+def test_everything_public_says_what_it_is() -> None:
+    silent = []
+    for path in SOURCES:
+        tree = ast.parse(path.read_text())
+        for node in [tree, *tree.body]:
+            documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            if documented and not getattr(node, "name", "public").startswith("_") and not ast.get_docstring(node):
+                silent.append(f"{path.name}:{getattr(node, 'name', 'module')}")
+    assert not [entry for entry in silent if entry != "__init__.py:module"]
+
+
+def test_every_source_states_its_licence() -> None:
+    texts = {path: path.read_text() for path in SOURCES}
+    assert not [path.name for path, text in texts.items() if text and "SPDX-License-Identifier: Apache-2.0" not in text]
+
+
+def test_architecture_names_every_package() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    packages = [m.name for m in pkgutil.iter_modules(structgstream.__path__) if not m.name.startswith("_")]
+    assert not [name for name in packages if f"`{name}" not in text]
+
+
+def test_importing_the_package_is_light() -> None:
+    code = (
+        "import sys, structgstream, structgstream.cli; "
+        "print([m for m in ('torch', 'av', 'cv2', 'matplotlib', 'tyro', 'gsplat') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_the_player_path_needs_no_optional_package() -> None:
+    code = (
+        "import sys, structgstream.codec.reader, structgstream.scene.render, structgstream.kernels.backend; "
+        "print([m for m in ('av', 'cv2', 'scipy', 'matplotlib', 'tyro', 'rich') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_every_module_imports() -> None:
+    for module in pkgutil.walk_packages(structgstream.__path__, "structgstream."):
+        if module.name != "structgstream.__main__":
+            importlib.import_module(module.name)

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import pytest
+import torch
+from rigs import arc_rig
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.errors import CalibrationError
+
+
+def test_center_is_where_the_camera_stands() -> None:
+    rig = arc_rig(3, radius=3.0)
+    assert torch.allclose(rig["cam01"].center, torch.tensor([0.0, -0.3, -3.0], dtype=torch.float64))
+
+
+def test_resizing_keeps_rays() -> None:
+    camera = arc_rig()["cam01"]
+    small = camera.resized(24, 8)
+    point = torch.tensor([0.2, 0.1, 2.0], dtype=torch.float64)
+    large_pixel, small_pixel = camera.K @ point, small.K @ point
+    ratio = torch.tensor([24 / 48, 8 / 32], dtype=torch.float64)
+    assert torch.allclose(small_pixel[:2] / small_pixel[2], large_pixel[:2] / large_pixel[2] * ratio)
+    assert (small.width, small.height) == (24, 8)
+
+
+def test_numbers_that_are_not_finite_are_refused() -> None:
+    camera = arc_rig()["cam01"]
+    K = camera.K.clone()
+    K[0, 2] = math.nan
+    with pytest.raises(CalibrationError, match="not finite"):
+        Camera(camera.viewmat, K, 48, 32)
+
+
+@pytest.mark.parametrize("factor", [2.0, -1.0])
+def test_view_matrices_that_are_not_rigid_are_refused(factor: float) -> None:
+    camera = arc_rig()["cam01"]
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, :3] *= factor
+    with pytest.raises(CalibrationError, match="orthonormal"):
+        Camera(viewmat, camera.K, 48, 32)
+
+
+def test_intrinsics_without_focal_length_are_refused() -> None:
+    camera = arc_rig()["cam01"]
+    with pytest.raises(CalibrationError, match="positive"):
+        Camera(camera.viewmat, torch.diag(torch.tensor([0.0, 1.0, 1.0])), 48, 32)
+
+
+def test_rig_order_and_held_out_sets() -> None:
+    rig = arc_rig(4)
+    assert rig.training == ("cam01", "cam02", "cam03")
+    assert rig.testing == ("cam00",)
+    assert rig.with_held_out(frozenset({"cam02"})).training == ("cam00", "cam01", "cam03")
+    with pytest.raises(CalibrationError, match="cam99"):
+        rig.with_held_out(frozenset({"cam99"}))
+
+
+def test_one_training_camera_is_not_enough() -> None:
+    rig = arc_rig(2)
+    with pytest.raises(CalibrationError, match="at least two training cameras"):
+        CameraRig(rig.cameras, held_out=frozenset({"cam00"}))

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import torch
+from rigs import random_scene
+
+from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
+
+VOXEL = 0.01
+
+
+def grown(anchors, gradient, count, *, config=GrowthConfig(), seed=0):
+    return grow(
+        anchors,
+        mean_gradient=gradient,
+        count=count,
+        voxel_size=VOXEL,
+        config=config,
+        generator=torch.Generator().manual_seed(seed),
+    )
+
+
+def slots(anchors) -> int:
+    return len(anchors) * anchors.offsets_per_anchor
+
+
+def test_nothing_grows_without_gradient_or_without_evidence() -> None:
+    anchors = random_scene().anchors
+    n = slots(anchors)
+    assert len(grown(anchors, torch.zeros(n), torch.full((n,), 100.0))) == 0
+    assert len(grown(anchors, torch.ones(n), torch.full((n,), 40.0))) == 0  # 40 is not more than 40
+
+
+def test_new_anchors_sit_on_cells_that_were_empty() -> None:
+    anchors = random_scene(60).anchors
+    n = slots(anchors)
+    new = grown(anchors, torch.ones(n), torch.full((n,), 100.0))
+    assert len(new) > 0
+    for cell in (16 * VOXEL, 4 * VOXEL, VOXEL):
+        mine = new.positions[(new.cell_sizes - cell).abs() < 1e-6]
+        cells = (mine / cell).round()
+        assert torch.allclose(cells * cell, mine, atol=1e-5)
+        assert len(cells.unique(dim=0)) == len(cells)
+        old = {tuple(row) for row in (anchors.positions / cell).round().int().tolist()}
+        assert not any(tuple(row) in old for row in cells.int().tolist())
+
+
+def test_finer_levels_wait_for_a_coarser_one() -> None:
+    anchors = random_scene(60).anchors
+    n = slots(anchors)
+    # One candidate at one place: the coarse cell around it is occupied by its own anchor, so nothing follows.
+    tight = replace(anchors, offsets=anchors.offsets * 1e-6)
+    assert len(grown(tight, torch.ones(n), torch.full((n,), 100.0))) == 0
+
+
+def test_features_are_the_largest_of_the_parents() -> None:
+    anchors = random_scene(200).anchors
+    n = slots(anchors)
+    new = grown(anchors, torch.ones(n), torch.full((n,), 100.0))
+    assert (new.features.amax(0) <= anchors.features.amax(0)).all()
+    assert torch.isfinite(new.features).all()
+    parents = anchors.features.repeat_interleave(anchors.offsets_per_anchor, 0)
+    for row in new.features[:20]:
+        assert all((parents[:, d] == row[d]).any() for d in range(row.shape[0]))
+
+
+def test_the_cap_holds() -> None:
+    anchors = random_scene(60).anchors
+    n = slots(anchors)
+    config = GrowthConfig(max_anchors=63)
+    assert len(grown(anchors, torch.ones(n), torch.full((n,), 100.0), config=config)) == 3
+
+
+def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
+    statistics = OpacityStatistics(3, torch.device("cpu"))
+    none = torch.zeros(0)
+    raw = torch.tensor([[0.001, -1.0], [0.4, -1.0], [0.001, 0.0]])
+    for step in range(81):
+        visible = torch.tensor([0, 1, 2]) if step else torch.tensor([0, 1])
+        structured = StructuredGaussians(none, none, none, none, none, none, raw[: len(visible)])
+        statistics.add(structured, visible)
+    assert prunable(statistics, GrowthConfig()).tolist() == [True, False, False]  # The last was seen 80 times only.

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each term beside the paper's equation in plain NumPy."""
+
+import numpy as np
+import pytest
+import torch
+from rigs import random_scene
+
+from structgstream.training.losses import LossWeights, offset_distance, volume
+
+
+def test_volume_is_the_product_of_scales() -> None:
+    scales = np.random.default_rng(0).uniform(0.1, 2.0, (11, 3))
+    assert volume(torch.from_numpy(scales), reduction="sum").item() == pytest.approx(scales.prod(1).sum())
+    assert volume(torch.from_numpy(scales), reduction="mean").item() == pytest.approx(scales.prod(1).mean())
+
+
+def test_volume_of_nothing_is_zero_and_differentiable() -> None:
+    scales = torch.zeros(0, 3, requires_grad=True)
+    volume(scales, reduction="mean").backward()
+    assert scales.grad is not None
+
+
+@pytest.mark.parametrize("reading", ["scaled", "raw", "norm"])
+def test_offset_distance_counts_what_is_beyond_two_voxels(reading: str) -> None:
+    anchors = random_scene().anchors
+    offsets = anchors.offsets.double().numpy()
+    scaled = offsets * np.exp(anchors.log_offset_scales.double().numpy())[:, None]
+    length = {"raw": np.abs(offsets), "scaled": np.abs(scaled), "norm": np.linalg.norm(scaled, axis=-1)}[reading]
+    eps = 0.03
+    expected = np.where(length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0).sum()  # theta(O - 2 eps) ||O - 2 eps||
+    weights = LossWeights(offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum")
+    assert offset_distance(anchors, voxel_size=eps, weights=weights).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_offsets_within_two_voxels_cost_nothing() -> None:
+    anchors = random_scene().anchors
+    assert offset_distance(anchors, voxel_size=10.0, weights=LossWeights(offset_distance=1.0)).item() == 0.0
