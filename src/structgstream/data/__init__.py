@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures: readers of the usual layouts behind one protocol, resizing, prefetch."""
+
+from structgstream.data.clip import bundled_clip
+from structgstream.data.open import open_capture
+from structgstream.data.source import FrameSource
+
+__all__ = ["FrameSource", "bundled_clip", "open_capture"]

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a file's numbers to a rig, with errors that name the camera and the file."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from torch import from_numpy
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.errors import CalibrationError, CaptureError
+from structgstream.similarity import rig_radius
+
+NEAR_IN_RIG_RADII = 0.12  # cameras of a dome stand in the wall that the others see: nothing is drawn this close
+
+
+def calibrated_camera(
+    name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, where: Path
+) -> Camera:
+    """One camera of the calibration file ``where``.
+
+    Args:
+        name: the camera's name, for messages.
+        viewmat: ``[4, 4]`` or ``[3, 4]``, world to camera, OpenCV axes.
+        K: ``[3, 3]`` intrinsics, pixels.
+        width: picture width that ``K`` belongs to, pixels.
+        height: picture height that ``K`` belongs to, pixels.
+        where: the file that the numbers come from.
+
+    Raises:
+        CalibrationError: broken numbers (see :class:`Camera`), or a principal point that belongs to a picture of
+            another size.
+    """
+    try:
+        extrinsics = np.array(viewmat, dtype=np.float64)
+        intrinsics = np.array(K, dtype=np.float64)
+        if extrinsics.shape == (3, 4):
+            extrinsics = np.vstack([extrinsics, [0.0, 0.0, 0.0, 1.0]])
+        camera = Camera(from_numpy(extrinsics), from_numpy(intrinsics), width, height)
+    except CalibrationError as error:
+        raise CalibrationError(f"Camera {name!r} of {where}: {error}") from None
+    except (TypeError, ValueError) as error:
+        raise CalibrationError(
+            f"Camera {name!r} of {where} has a matrix that cannot be read ({error}); "
+            "expected rows of numbers, a 3x3 K and a 4x4 pose."
+        ) from None
+    across, down = intrinsics[0, 2] / width, intrinsics[1, 2] / height
+    # A wrong picture size moves both ratios the same way; a crop seldom does.
+    if not (0 < across < 1 and 0 < down < 1) or max(across, down) < 0.3 or min(across, down) > 0.7:
+        raise CalibrationError(
+            f"Camera {name!r} of {where}: the principal point ({intrinsics[0, 2]:.1f}, {intrinsics[1, 2]:.1f}) does "
+            f"not belong to a picture of {width}x{height} pixels; scale the intrinsics to the picture's size."
+        )
+    return camera
+
+
+def calibrated_rig(
+    cameras: Mapping[str, Camera], held_out: Collection[str], *, where: Path, near: float | None = None
+) -> CameraRig:
+    """The rig of a capture; ``near`` (capture units) defaults to 0.12 times the rig's radius.
+
+    Raises:
+        CalibrationError: fewer than two training cameras, or an unknown held-out one; the message names ``where``.
+    """
+    try:
+        rig = CameraRig(dict(cameras), frozenset(held_out))
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
+    return with_near(rig, NEAR_IN_RIG_RADII * rig_radius(rig) if near is None else near)
+
+
+def with_near(rig: CameraRig, near: float) -> CameraRig:
+    """The same rig with the near plane of every camera at ``near``, capture units."""
+    return rig.mapped({name: replace(rig[name], near=near) for name in rig})
+
+
+def check_names(calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path) -> None:
+    """Every calibrated camera must have pictures, and the reverse.
+
+    Raises:
+        CalibrationError: pictures of a camera without calibration.
+        CaptureError: a calibrated camera without pictures.
+    """
+    if unknown := [name for name in pictured if name not in calibrated]:
+        raise CalibrationError(
+            f"{pictures} has pictures of {listed(unknown)}, for which {calibration} has no calibration; "
+            "calibrate them, or move their pictures out of the capture."
+        )
+    if missing := [name for name in calibrated if name not in pictured]:
+        raise CaptureError(
+            f"{calibration} calibrates {listed(missing)}, but {pictures} has no pictures of them; "
+            "add the pictures, or remove the cameras from the calibration."
+        )
+
+
+def listed(names: Collection[str], most: int = 5) -> str:
+    """``camera 'a'`` or ``cameras 'a', 'b' and 3 more``, for messages."""
+    shown = ", ".join(repr(name) for name in list(names)[:most])
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"camera{'s' if len(names) > 1 else ''} {shown}{rest}"

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures whose frames are picture files: one list of files per camera."""
+
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.timeline import common_slots, natural
+from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
+from structgstream.frames import MultiViewFrame
+
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """A :class:`~structgstream.data.source.FrameSource` over picture files.
+
+    Args:
+        name: the capture's name.
+        rig: its cameras, at the size of the pictures.
+        fps: frames a second.
+        files: camera name to its pictures in order; all cameras have the same number.
+        points: ``[P, 3]`` points that came with the capture, or None.
+    """
+
+    name: str
+    rig: CameraRig
+    fps: float
+    files: Mapping[str, tuple[Path, ...]]
+    points: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        return min(len(files) for files in self.files.values())
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        """The frames from stream index ``start``; the pictures of one instant are read in parallel.
+
+        Raises:
+            CaptureError: a picture is missing, cannot be decoded, or has another size than its intrinsics.
+        """
+        cv2 = opencv()
+        with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
+            for index in range(start, len(self)):
+                paths = [self.files[camera][index] for camera in self.rig]
+                pictures = pool.map(lambda path, camera: _picture(cv2, path, camera), paths, self.rig.cameras.values())
+                yield MultiViewFrame(index, index / self.fps, dict(zip(self.rig, pictures, strict=True)))
+
+
+def opencv() -> ModuleType:
+    """The module ``cv2``, from the extra ``capture``."""
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", "capture") from None
+    return cv2
+
+
+def common_pictures(files: Mapping[str, Mapping[str, Path]], *, where: Path) -> dict[str, tuple[Path, ...]]:
+    """The pictures of the instants that all cameras have.
+
+    Args:
+        files: camera name to its pictures, by the name of the instant.
+        where: the capture, for messages.
+
+    Raises:
+        CaptureError: see :func:`~structgstream.data.timeline.common_slots`.
+    """
+    instants = sorted({instant for pictures in files.values() for instant in pictures}, key=natural)
+    slot_of = {instant: slot for slot, instant in enumerate(instants)}
+    slots = {camera: sorted(slot_of[instant] for instant in pictures) for camera, pictures in files.items()}
+    common = common_slots(slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}")
+    return {camera: tuple(pictures[instants[slot]] for slot in common) for camera, pictures in files.items()}
+
+
+def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """One picture as ``[H, W, 3]`` sRGB, checked against the size of its camera."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore the file.") from None
+    picture = None
+    # A cut JPEG decodes to a picture that is grey below the cut, so look for its end marker (byte stuffing keeps the
+    # marker out of the picture's data).
+    if data and not (data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]):
+        # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise CaptureError(
+            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore the file."
+        )
+    height, width = picture.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise CalibrationError(
+            f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
+            f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
+        )
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Folders with ``cameras.json`` and one mp4 per camera, in two dialects.
+
+The package's own, which the bundled clip uses: ``{"width", "height", "fps", "frames", "near", "held_out": [names],
+"cameras": {name: {"K": 3x3, "viewmat": 4x4 world to camera}}}`` with ``name.mp4``.
+
+The shared-intrinsics one: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4 camera to world, ...]}`` with
+``cam00.mp4``, ``cam01.mp4``, ... in the order of ``cams``; camera 0 is held out.
+
+Both in OpenCV axes.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
+from structgstream.data.timeline import natural
+from structgstream.data.video import VideoSource, scan_videos, synchronised
+from structgstream.errors import CalibrationError, CaptureError
+
+FILE = "cameras.json"
+
+
+def recognises_json_videos(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / FILE).is_file()
+
+
+def open_json_videos(path: Path) -> VideoSource:
+    """The capture at ``path``.
+
+    Raises:
+        CaptureError: ``cameras.json`` or a video cannot be read, or they do not belong together.
+        CalibrationError: broken numbers.
+    """
+    file = path / FILE
+    try:
+        content: dict[str, Any] = json.loads(file.read_text())
+        rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
+        fps = float(content["fps"]) if "fps" in content else None
+        stated_frames = int(content.get("frames", 1))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CaptureError(
+            f"{file} cannot be read ({type(error).__name__}: {error}); expected width, height and cameras with K and "
+            "viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
+        ) from None
+    videos = {video.stem: video for video in path.glob("*.mp4")}
+    check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
+    source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
+    if len(source) < stated_frames:
+        raise CaptureError(
+            f"The videos of {path} share {len(source)} frames, {FILE} states {stated_frames}; "
+            "copy the capture again or correct the number."
+        )
+    return source
+
+
+def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
+    width, height = int(content["width"]), int(content["height"])
+    cameras = {
+        name: calibrated_camera(
+            name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file
+        )
+        for name, entry in content["cameras"].items()
+    }
+    near = float(content["near"]) if "near" in content else None
+    return calibrated_rig(cameras, content.get("held_out", ()), where=file, near=near)
+
+
+def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
+    K = [[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]]
+    cameras: dict[str, Camera] = {}
+    for number, pose in enumerate(content["cams"]):
+        name = f"cam{number:02d}"
+        try:
+            viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise CalibrationError(f"Camera {name!r} of {file} has a pose that is no 4x4 matrix ({error}).") from None
+        cameras[name] = calibrated_camera(
+            name, viewmat=viewmat, K=K, width=int(content["w"]), height=int(content["h"]), where=file
+        )
+    return calibrated_rig(cameras, ("cam00",), where=file)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The door: a folder in, a capture out."""
+
+from pathlib import Path
+
+from structgstream.data.calibration import with_near
+from structgstream.data.json_videos import open_json_videos, recognises_json_videos
+from structgstream.data.panoptic import open_panoptic, recognises_panoptic
+from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import WithRig, resized, section
+from structgstream.errors import CaptureError, ConfigError
+
+LAYOUTS = """Supported layouts:
+  PanopticSports   train_meta.json, test_meta.json, ims/CAMERA/FRAME.jpg
+  videos + JSON    cameras.json, CAMERA.mp4"""
+
+FORMATS = (
+    (recognises_panoptic, open_panoptic),
+    (recognises_json_videos, open_json_videos),
+)
+
+
+def open_capture(
+    path: Path | str,
+    *,
+    held_out: tuple[str, ...] | None = None,
+    scale: float = 1.0,
+    start: int = 0,
+    frames: int | None = None,
+    near: float | None = None,
+) -> FrameSource:
+    """Opens the capture in a folder, recognising its layout.
+
+    Args:
+        path: the folder.
+        held_out: names of the cameras to keep from training; None for those that the layout holds out.
+        scale: size of the pictures relative to the stored ones, in (0, 1].
+        start: first frame to use.
+        frames: number of frames, None for all.
+        near: near plane in capture units; None for the capture's own, else 0.12 rig radii.
+
+    Raises:
+        CaptureError: the folder is missing, empty or of an unknown layout, or its content is broken.
+        ConfigError: an argument cannot work.
+    """
+    source = _recognised(Path(path))
+    rig = source.rig
+    if held_out is not None:
+        rig = rig.with_held_out(frozenset(held_out))
+    if near is not None:
+        if not near > 0:
+            raise ConfigError(f"The near plane must be positive, got {near:g}.")
+        rig = with_near(rig, near)
+    sized = resized(source, scale)
+    if rig is not source.rig:
+        rig = rig.mapped({name: rig[name].resized(sized.rig[name].width, sized.rig[name].height) for name in rig})
+        sized = WithRig(sized, rig)
+    return section(sized, start=start, frames=frames)
+
+
+def _recognised(path: Path) -> FrameSource:
+    if not path.exists():
+        raise CaptureError(f"The capture {path} does not exist; give the folder that holds it.")
+    if not path.is_dir():
+        raise CaptureError(f"The capture {path} is a file; give the folder that holds the capture.\n{LAYOUTS}")
+    path = path.resolve()  # a name, even for "."
+    for recognises, opens in FORMATS:
+        if recognises(path):
+            return opens(path)
+    content = sorted(entry.name for entry in path.iterdir())
+    if not content:
+        raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS}")
+    shown = ", ".join(content[:6]) + (", ..." if len(content) > 6 else "")
+    raise CaptureError(f"The folder {path} has no layout that is known here; it holds {shown}.\n{LAYOUTS}")

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The PanopticSports layout of Dynamic 3D Gaussians (Luiten et al., 3DV 2024).
+
+``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h`` and, per frame and camera, ``k``, ``w2c`` (OpenCV world to
+camera), ``fn`` (file below ``ims/``) and ``cam_id``. The cameras of ``test_meta.json`` are held out.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.cameras import Camera
+from structgstream.data.calibration import calibrated_camera, calibrated_rig
+from structgstream.data.images import ImageSource, common_pictures
+from structgstream.data.timeline import natural
+from structgstream.errors import CalibrationError, CaptureError
+
+PANOPTIC_FPS = 30000 / 1001
+TRAIN, TEST = "train_meta.json", "test_meta.json"
+
+
+def recognises_panoptic(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / TRAIN).is_file()
+
+
+def open_panoptic(path: Path) -> ImageSource:
+    """The capture at ``path``.
+
+    Raises:
+        CaptureError: a file is missing or is not what the layout asks for.
+        CalibrationError: broken numbers, or a camera that moves.
+    """
+    cameras: dict[str, Camera] = {}
+    files: dict[str, dict[str, Path]] = {}
+    held_out: list[str] = []
+    for meta in (path / TRAIN, path / TEST):
+        if not meta.is_file():
+            continue
+        found, pictures = _read_meta(meta)
+        if both := sorted(found.keys() & cameras.keys(), key=natural):
+            raise CaptureError(f"Camera {both[0]!r} is in both {TRAIN} and {TEST} of {path}; keep it in one of them.")
+        cameras |= found
+        files |= pictures
+        if meta.name == TEST:
+            held_out += found
+    names = sorted(cameras, key=natural)
+    rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
+    _check_present(files)
+    common = common_pictures({name: files[name] for name in names}, where=path)
+    return ImageSource(path.name, rig, PANOPTIC_FPS, common)
+
+
+def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
+    """Cameras of one file, and the pictures of each by the name of the instant."""
+    try:
+        content: dict[str, Any] = json.loads(meta.read_text())
+        width, height = int(content["w"]), int(content["h"])
+        rows = [
+            (str(name), K, viewmat, file)
+            for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
+            for name, K, viewmat, file in zip(*frame, strict=True)
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CaptureError(
+            f"{meta} cannot be read as PanopticSports metadata ({type(error).__name__}: {error}); "
+            "expected the keys w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras."
+        ) from None
+    first: dict[str, tuple[Any, Any]] = {}
+    files: dict[str, dict[str, Path]] = {}
+    for name, K, viewmat, file in rows:
+        known = first.setdefault(name, (K, viewmat))
+        if known != (K, viewmat) and not _same(known, (K, viewmat)):
+            raise CalibrationError(
+                f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
+            )
+        files.setdefault(name, {})[Path(file).stem] = meta.parent / "ims" / file
+    cameras = {
+        name: calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=meta)
+        for name, (K, viewmat) in first.items()
+    }
+    return cameras, files
+
+
+def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
+    """Whether two pairs of matrices agree up to rounding; NaN agrees with NaN, so that the camera check names it."""
+    try:
+        return all(
+            np.allclose(np.array(x, float), np.array(y, float), rtol=1e-6, atol=1e-9, equal_nan=True)
+            for x, y in zip(a, b)
+        )
+    except (TypeError, ValueError):
+        return False
+
+
+def _check_present(files: dict[str, dict[str, Path]]) -> None:
+    """Every listed picture exists: one directory listing per camera is cheaper than one lookup per picture."""
+    listings: dict[Path, set[str]] = {}
+    for camera, pictures in files.items():
+        for file in pictures.values():
+            if file.parent not in listings:
+                listings[file.parent] = {p.name for p in file.parent.iterdir()} if file.parent.is_dir() else set()
+            if file.name not in listings[file.parent]:
+                raise CaptureError(
+                    f"The picture {file} of camera {camera!r} is missing although the metadata lists it; "
+                    "restore the file, or remove its frame from the metadata."
+                )

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A capture seen differently: smaller, shorter, or with other cameras held out."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import CameraRig
+from structgstream.data.images import opencv
+from structgstream.data.source import FrameSource
+from structgstream.data.video import VideoSource
+from structgstream.errors import CaptureError, ConfigError
+from structgstream.frames import MultiViewFrame
+
+
+@dataclass(frozen=True)
+class Wrapped:
+    """A source that passes everything through; the base of those that change something."""
+
+    source: FrameSource
+
+    @property
+    def rig(self) -> CameraRig:
+        return self.source.rig
+
+    @property
+    def fps(self) -> float:
+        return self.source.fps
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    @property
+    def points(self) -> NDArray[np.float64] | None:
+        return self.source.points
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        return self.source.frames(start)
+
+
+@dataclass(frozen=True)
+class WithRig(Wrapped):
+    """The same frames under another rig of the same cameras: another held-out set, another near plane."""
+
+    other: CameraRig
+
+    @property
+    def rig(self) -> CameraRig:
+        return self.other
+
+
+@dataclass(frozen=True)
+class Resized(WithRig):
+    """Every picture resampled by area to the size that ``other`` states."""
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        cv2 = opencv()
+        sizes = {name: (self.rig[name].width, self.rig[name].height) for name in self.rig}
+        for frame in self.source.frames(start):
+            images = {
+                name: cv2.resize(image, sizes[name], interpolation=cv2.INTER_AREA)
+                for name, image in frame.images.items()
+            }
+            yield MultiViewFrame(frame.index, frame.pts_seconds, images)
+
+
+@dataclass(frozen=True)
+class Section(Wrapped):
+    """The frames ``first`` to ``first + length - 1`` of a capture, counted and timed from 0 again."""
+
+    first: int
+    length: int
+
+    def __len__(self) -> int:
+        return self.length
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        for frame in islice(self.source.frames(self.first + start), max(self.length - start, 0)):
+            yield MultiViewFrame(frame.index - self.first, frame.pts_seconds - self.first / self.fps, frame.images)
+
+
+def resized(source: FrameSource, scale: float) -> FrameSource:
+    """The capture with pictures of ``scale`` times the size, rounded to pixels; intrinsics follow exactly.
+
+    Raises:
+        ConfigError: ``scale`` is not in (0, 1].
+    """
+    if not 0 < scale <= 1:
+        raise ConfigError(f"The scale of a capture must lie in (0, 1], got {scale:g}.")
+    if scale == 1:
+        return source
+    cameras = source.rig.cameras
+    rig = source.rig.mapped(
+        {
+            name: camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
+            for name, camera in cameras.items()
+        }
+    )
+    return source.resized(rig) if isinstance(source, VideoSource) else Resized(source, rig)
+
+
+def section(source: FrameSource, *, start: int = 0, frames: int | None = None) -> FrameSource:
+    """``frames`` frames (None: all) of the capture from its frame ``start``.
+
+    Raises:
+        CaptureError: the capture does not have these frames.
+    """
+    available = len(source) - start
+    length = available if frames is None else frames
+    if start < 0 or length < 1 or length > available:
+        raise CaptureError(
+            f"The capture {source.name} has {len(source)} frames; got start {start} and "
+            f"{'all' if frames is None else frames} frames. Choose a range inside the capture."
+        )
+    return source if (start, length) == (0, len(source)) else Section(source, start, length)
