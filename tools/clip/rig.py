@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ten cameras of the bundled clip: a two-row arc, and camera 0 in its middle as the held-out view."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+WIDTH, HEIGHT, FPS, FRAMES = 320, 240, 30, 12
+FIELD_OF_VIEW_DEGREES = 52.0
+RADIUS_METRES = 1.5
+NEAR_METRES = 0.6
+TARGET = np.array([0.02, 0.12, 0.155])
+
+# (azimuth, elevation) in degrees about the target; azimuth 0 looks along +y
+DIRECTIONS = (
+    (0.0, 17.0),
+    (-30.0, 10.0), (-15.0, 10.0), (0.0, 9.0), (15.0, 10.0), (30.0, 10.0),
+    (-23.0, 25.0), (-8.0, 26.0), (8.0, 26.0), (23.0, 25.0),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera: eye (metres), ``K [3, 3]`` (pixels), ``viewmat [4, 4]`` (world to camera, OpenCV)."""
+
+    name: str
+    eye: NDArray[np.float64]
+    K: NDArray[np.float64]
+    viewmat: NDArray[np.float64]
+
+
+def intrinsics() -> NDArray[np.float64]:
+    """K for square pixels and a centred principal point, with the top-left pixel's centre at (0.5, 0.5)."""
+    focal = WIDTH / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEGREES) / 2)
+    return np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+
+
+def views() -> list[View]:
+    """The cameras in the order of their numbers."""
+    out = []
+    for number, (azimuth, elevation) in enumerate(np.deg2rad(DIRECTIONS)):
+        direction = [
+            math.sin(azimuth) * math.cos(elevation),
+            -math.cos(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+        ]
+        eye = TARGET + RADIUS_METRES * np.array(direction)
+        forward = (TARGET - eye) / np.linalg.norm(TARGET - eye)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = [right, np.cross(forward, right), forward]
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        out.append(View(f"cam{number:02d}", eye, intrinsics(), viewmat))
+    return out
