@@ -13,7 +13,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.similarity import rig_radius
 
-NEAR_IN_RIG_RADII = 0.12  # cameras of a dome stand in the wall that the others see: nothing is drawn this close
+NEAR_IN_RIG_RADII = 0.12  # cameras of a dome stand in the wall that the others see: it must not be drawn
 
 
 def calibrated_camera(
@@ -30,8 +30,8 @@ def calibrated_camera(
         where: the file that the numbers come from.
 
     Raises:
-        CalibrationError: broken numbers (see :class:`Camera`), or a principal point that belongs to a picture of
-            another size.
+        CalibrationError: broken numbers (see :class:`Camera`), or a principal point that belongs to a picture
+            of another size.
     """
     try:
         extrinsics = np.array(viewmat, dtype=np.float64)
@@ -50,8 +50,9 @@ def calibrated_camera(
     # A wrong picture size moves both ratios the same way; a crop seldom does.
     if not (0 < across < 1 and 0 < down < 1) or max(across, down) < 0.3 or min(across, down) > 0.7:
         raise CalibrationError(
-            f"Camera {name!r} of {where}: the principal point ({intrinsics[0, 2]:.1f}, {intrinsics[1, 2]:.1f}) does "
-            f"not belong to a picture of {width}x{height} pixels; scale the intrinsics to the picture's size."
+            f"Camera {name!r} of {where}: the principal point ({intrinsics[0, 2]:.1f}, "
+            f"{intrinsics[1, 2]:.1f}) does not belong to a picture of {width}x{height} pixels; scale the "
+            "intrinsics to the picture's size."
         )
     return camera
 
@@ -62,7 +63,7 @@ def calibrated_rig(
     """The rig of a capture; ``near`` (capture units) defaults to 0.12 times the rig's radius.
 
     Raises:
-        CalibrationError: fewer than two training cameras, or an unknown held-out one; the message names ``where``.
+        CalibrationError: fewer than two training cameras, or an unknown held-out one, naming ``where``.
     """
     try:
         rig = CameraRig(dict(cameras), frozenset(held_out))
@@ -76,7 +77,9 @@ def with_near(rig: CameraRig, near: float) -> CameraRig:
     return rig.mapped({name: replace(rig[name], near=near) for name in rig})
 
 
-def check_names(calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path) -> None:
+def check_names(
+    calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path
+) -> None:
     """Every calibrated camera must have pictures, and the reverse.
 
     Raises:

@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -50,7 +51,7 @@ class ImageSource:
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = [self.files[camera][index] for camera in self.rig]
-                pictures = pool.map(lambda path, camera: _picture(cv2, path, camera), paths, self.rig.cameras.values())
+                pictures = pool.map(partial(_picture, cv2), paths, self.rig.cameras.values())
                 yield MultiViewFrame(index, index / self.fps, dict(zip(self.rig, pictures, strict=True)))
 
 
@@ -85,16 +86,18 @@ def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore the file.") from None
+        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
     picture = None
-    # A cut JPEG decodes to a picture that is grey below the cut, so look for its end marker (byte stuffing keeps the
-    # marker out of the picture's data).
-    if data and not (data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]):
+    # A cut JPEG decodes to a picture that is grey below the cut, so look for its end marker (byte stuffing
+    # keeps the marker out of the picture's data).
+    cut = data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]
+    if data and not cut:
         # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:
         raise CaptureError(
-            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore the file."
+            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it."
         )
     height, width = picture.shape[:2]
     if (width, height) != (camera.width, camera.height):

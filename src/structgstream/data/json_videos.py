@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders with ``cameras.json`` and one mp4 per camera, in two dialects.
 
-The package's own, which the bundled clip uses: ``{"width", "height", "fps", "frames", "near", "held_out": [names],
-"cameras": {name: {"K": 3x3, "viewmat": 4x4 world to camera}}}`` with ``name.mp4``.
+The package's own, which the bundled clip uses: ``{"width", "height", "fps", "frames", "near", "held_out":
+[names], "cameras": {name: {"K": 3x3, "viewmat": 4x4 world to camera}}}`` with ``name.mp4``.
 
 The shared-intrinsics one: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4 camera to world, ...]}`` with
 ``cam00.mp4``, ``cam01.mp4``, ... in the order of ``cams``; camera 0 is held out.
@@ -45,8 +45,8 @@ def open_json_videos(path: Path) -> VideoSource:
         stated_frames = int(content.get("frames", 1))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CaptureError(
-            f"{file} cannot be read ({type(error).__name__}: {error}); expected width, height and cameras with K and "
-            "viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
+            f"{file} cannot be read ({type(error).__name__}: {error}); expected width, height and cameras "
+            "with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
         ) from None
     videos = {video.stem: video for video in path.glob("*.mp4")}
     check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
@@ -79,7 +79,9 @@ def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
         try:
             viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
         except (ValueError, np.linalg.LinAlgError) as error:
-            raise CalibrationError(f"Camera {name!r} of {file} has a pose that is no 4x4 matrix ({error}).") from None
+            raise CalibrationError(
+                f"Camera {name!r} of {file} has a pose that cannot be inverted ({error}); expected 4x4."
+            ) from None
         cameras[name] = calibrated_camera(
             name, viewmat=viewmat, K=K, width=int(content["w"]), height=int(content["h"]), where=file
         )

@@ -4,7 +4,9 @@
 from pathlib import Path
 
 from structgstream.data.calibration import with_near
+from structgstream.data.colmap_capture import open_colmap, recognises_colmap
 from structgstream.data.json_videos import open_json_videos, recognises_json_videos
+from structgstream.data.n3dv import open_n3dv, recognises_n3dv
 from structgstream.data.panoptic import open_panoptic, recognises_panoptic
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig, resized, section
@@ -12,11 +14,16 @@ from structgstream.errors import CaptureError, ConfigError
 
 LAYOUTS = """Supported layouts:
   PanopticSports   train_meta.json, test_meta.json, ims/CAMERA/FRAME.jpg
-  videos + JSON    cameras.json, CAMERA.mp4"""
+  videos + JSON    cameras.json, CAMERA.mp4
+  Neural 3D Video  poses_bounds.npy, camXX.mp4
+  COLMAP           sparse/0/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
+                   frames/FRAME/CAMERA.ext or CAMERA.mp4"""
 
 FORMATS = (
     (recognises_panoptic, open_panoptic),
     (recognises_json_videos, open_json_videos),
+    (recognises_n3dv, open_n3dv),
+    (recognises_colmap, open_colmap),
 )
 
 
@@ -53,7 +60,8 @@ def open_capture(
         rig = with_near(rig, near)
     sized = resized(source, scale)
     if rig is not source.rig:
-        rig = rig.mapped({name: rig[name].resized(sized.rig[name].width, sized.rig[name].height) for name in rig})
+        sizes = {name: (sized.rig[name].width, sized.rig[name].height) for name in rig}
+        rig = rig.mapped({name: rig[name].resized(*sizes[name]) for name in rig})
         sized = WithRig(sized, rig)
     return section(sized, start=start, frames=frames)
 
@@ -62,7 +70,7 @@ def _recognised(path: Path) -> FrameSource:
     if not path.exists():
         raise CaptureError(f"The capture {path} does not exist; give the folder that holds it.")
     if not path.is_dir():
-        raise CaptureError(f"The capture {path} is a file; give the folder that holds the capture.\n{LAYOUTS}")
+        raise CaptureError(f"The capture {path} is a file; give the folder that holds it.\n{LAYOUTS}")
     path = path.resolve()  # a name, even for "."
     for recognises, opens in FORMATS:
         if recognises(path):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The PanopticSports layout of Dynamic 3D Gaussians (Luiten et al., 3DV 2024).
 
-``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h`` and, per frame and camera, ``k``, ``w2c`` (OpenCV world to
-camera), ``fn`` (file below ``ims/``) and ``cam_id``. The cameras of ``test_meta.json`` are held out.
+``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h`` and, per frame and camera, ``k``, ``w2c`` (OpenCV
+world to camera), ``fn`` (file below ``ims/``) and ``cam_id``. The cameras of ``test_meta.json`` are held out.
 """
 
 import json
@@ -41,7 +41,7 @@ def open_panoptic(path: Path) -> ImageSource:
             continue
         found, pictures = _read_meta(meta)
         if both := sorted(found.keys() & cameras.keys(), key=natural):
-            raise CaptureError(f"Camera {both[0]!r} is in both {TRAIN} and {TEST} of {path}; keep it in one of them.")
+            raise CaptureError(f"Camera {both[0]!r} is in both {TRAIN} and {TEST} of {path}; keep it in one.")
         cameras |= found
         files |= pictures
         if meta.name == TEST:
@@ -74,7 +74,8 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         known = first.setdefault(name, (K, viewmat))
         if known != (K, viewmat) and not _same(known, (K, viewmat)):
             raise CalibrationError(
-                f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
+                f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; "
+                "expected cameras that stand still."
             )
         files.setdefault(name, {})[Path(file).stem] = meta.parent / "ims" / file
     cameras = {
@@ -85,7 +86,7 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
 
 
 def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
-    """Whether two pairs of matrices agree up to rounding; NaN agrees with NaN, so that the camera check names it."""
+    """Whether two pairs of matrices agree up to rounding; NaN agrees with NaN, which the camera refuses."""
     try:
         return all(
             np.allclose(np.array(x, float), np.array(y, float), rtol=1e-6, atol=1e-9, equal_nan=True)
@@ -96,12 +97,13 @@ def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
 
 
 def _check_present(files: dict[str, dict[str, Path]]) -> None:
-    """Every listed picture exists: one directory listing per camera is cheaper than one lookup per picture."""
+    """Every listed picture exists; one listing per folder is cheaper than one lookup per picture."""
     listings: dict[Path, set[str]] = {}
     for camera, pictures in files.items():
         for file in pictures.values():
             if file.parent not in listings:
-                listings[file.parent] = {p.name for p in file.parent.iterdir()} if file.parent.is_dir() else set()
+                entries = file.parent.iterdir() if file.parent.is_dir() else ()
+                listings[file.parent] = {entry.name for entry in entries}
             if file.name not in listings[file.parent]:
                 raise CaptureError(
                     f"The picture {file} of camera {camera!r} is missing although the metadata lists it; "

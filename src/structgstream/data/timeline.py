@@ -4,6 +4,7 @@
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 
 from structgstream.errors import CaptureError
 
@@ -12,16 +13,15 @@ log = logging.getLogger(__name__)
 
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts ``cam2`` before ``cam10``."""
-    return tuple(
-        (0, int(part), part) if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part
-    )
+    parts = [part for part in re.split(r"(\d+)", text) if part]
+    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts)
 
 
 def common_slots(slots: Mapping[str, Sequence[int]], *, where: str, label: Callable[[int], str]) -> range:
     """The range of slots that every camera has.
 
-    A camera that starts late or ends early cuts the range, with one logged warning for each end; a hole or a second
-    frame inside the range is an error.
+    A camera that starts late or ends early cuts the range, with one logged warning for each end; a hole or a
+    second frame inside the range is an error.
 
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
@@ -33,28 +33,28 @@ def common_slots(slots: Mapping[str, Sequence[int]], *, where: str, label: Calla
     """
     for camera, own in slots.items():
         if not own:
-            raise CaptureError(f"Camera {camera!r} of {where} has no frames; add its pictures or remove the camera.")
+            raise CaptureError(f"Camera {camera!r} of {where} has no frames; add them or remove the camera.")
     first = max(own[0] for own in slots.values())
     last = min(own[-1] for own in slots.values())
     if first > last:
         late = next(camera for camera, own in slots.items() if own[0] == first)
         early = next(camera for camera, own in slots.items() if own[-1] == last)
         raise CaptureError(
-            f"The cameras of {where} have no frames in common: {early!r} ends with {label(last)} and {late!r} starts "
-            f"with {label(first)}; check that all belong to the same take and share one clock."
+            f"The cameras of {where} have no frames in common: {early!r} ends with {label(last)} "
+            f"and {late!r} starts with {label(first)}; check that all belong to one take and share one clock."
         )
     for camera, own in slots.items():
         inside = [slot for slot in own if first <= slot <= last]
-        repeated = next((a for a, b in zip(inside, inside[1:]) if a == b), None)
+        repeated = next((a for a, b in pairwise(inside) if a == b), None)
         if repeated is not None:
             raise CaptureError(
-                f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per camera "
-                "and instant at one common rate. Re-encode it at the rate of the others."
+                f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per "
+                "camera and instant at one common rate. Re-encode it at the rate of the others."
             )
         if len(inside) != last - first + 1:
             hole = next(slot for slot, has in zip(range(first, last + 1), [*inside, last + 1]) if slot != has)
             raise CaptureError(
-                f"Camera {camera!r} of {where} has no frame for {label(hole)}, which lies inside the capture; "
+                f"Camera {camera!r} of {where} has no frame for {label(hole)}, inside the capture; "
                 "restore the frame, or choose a range of frames without it."
             )
     _warn_of_cuts(slots, first, last, where=where, label=label)

@@ -2,13 +2,13 @@
 """Captures with one video per camera, synchronised by time stamp. The only module that reads video."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +56,8 @@ class VideoTrack:
 class VideoSource:
     """A :class:`~structgstream.data.source.FrameSource` over one video per camera.
 
-    Made by :func:`synchronised`; ``tracks`` hold only the frames that all cameras have. Pictures are converted to the
-    size that ``rig`` states.
+    Made by :func:`synchronised`; ``tracks`` hold only the frames that all cameras have. Pictures are
+    converted to the size that ``rig`` states.
     """
 
     name: str
@@ -76,9 +76,9 @@ class VideoSource:
             CaptureError: a video cannot be decoded, or ends before its index says.
         """
         with ExitStack() as stack:
-            decoders = [
-                stack.enter_context(closing(_decoded(self.tracks[name], self.rig[name], start))) for name in self.rig
-            ]
+            decoders = [_decoded(self.tracks[name], self.rig[name], start) for name in self.rig]
+            for decoder in decoders:
+                stack.enter_context(closing(decoder))
             # Entered last, so that no thread is inside a decoder when the decoders close.
             pool = stack.enter_context(ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "videos"))
             for index in range(start, len(self)):
@@ -125,8 +125,9 @@ def synchronised(
         track, camera = tracks[name], rig[name]
         if (track.width, track.height) != (camera.width, camera.height):
             raise CalibrationError(
-                f"The video {track.path} has {track.width}x{track.height} pixels, the intrinsics of camera {name!r} "
-                f"are for {camera.width}x{camera.height}; scale the intrinsics, or use the video that was calibrated."
+                f"The video {track.path} has {track.width}x{track.height} pixels, the intrinsics of "
+                f"camera {name!r} are for {camera.width}x{camera.height}; scale the intrinsics, "
+                "or use the video that was calibrated."
             )
     rate = measured_fps(tracks) if fps is None else fps
     slots, origin_seconds = _slots(tracks, rate, where=where)
@@ -156,7 +157,9 @@ def measured_fps(tracks: Mapping[str, VideoTrack]) -> float:
     return usual if abs(usual / rate - 1) < 3e-4 else rate
 
 
-def _slots(tracks: Mapping[str, VideoTrack], fps: float, *, where: Path) -> tuple[dict[str, list[int]], float]:
+def _slots(
+    tracks: Mapping[str, VideoTrack], fps: float, *, where: Path
+) -> tuple[dict[str, list[int]], float]:
     """Each frame's place on the common timeline, and the time of place 0 in seconds."""
     positions = {name: np.array(track.stamps) * (track.tick_seconds * fps) for name, track in tracks.items()}
     origin = min(float(own[0]) for own in positions.values())
@@ -169,9 +172,9 @@ def _slots(tracks: Mapping[str, VideoTrack], fps: float, *, where: Path) -> tupl
         worst = int(off.argmax())
         if off[worst] > TOLERANCE_IN_PERIODS:
             raise CaptureError(
-                f"Camera {name!r} of {where} has a frame at {own[worst] / fps:.4f} s, {off[worst]:.2f} frame periods "
-                f"away from the common timeline of {fps:.3f} frames a second; expected synchronised cameras of one "
-                "rate."
+                f"Camera {name!r} of {where} has a frame at {own[worst] / fps:.4f} s, {off[worst]:.2f} frame "
+                f"periods off the common timeline of {fps:.3f} frames a second; expected synchronised "
+                "cameras of one rate."
             )
         slots[name] = [int(slot) for slot in nearest]
     return slots, origin / fps
@@ -211,7 +214,9 @@ def _scan(path: Path) -> VideoTrack:
         try:
             packets = [packet for packet in container.demux(stream) if packet.size]
         except av.error.FFmpegError as error:
-            raise CaptureError(f"The video {path} is damaged ({error.strerror}); copy or record it again.") from None
+            raise CaptureError(
+                f"The video {path} is damaged ({error.strerror}); copy or record it again."
+            ) from None
         if not packets or any(packet.is_corrupt for packet in packets) or len(packets) < stream.frames:
             raise CaptureError(
                 f"The video {path} is truncated: its index announces {stream.frames or 'some'} frames, "
@@ -227,7 +232,7 @@ def _scan(path: Path) -> VideoTrack:
         return VideoTrack(path, tuple(sorted(stamps)), float(stream.time_base), stream.width, stream.height)
 
 
-def _decoded(track: VideoTrack, camera: Camera, start: int) -> Iterator[NDArray[np.uint8]]:
+def _decoded(track: VideoTrack, camera: Camera, start: int) -> Generator[NDArray[np.uint8]]:
     """The pictures of a track from its frame ``start``, each ``[H, W, 3]`` sRGB at the size of ``camera``."""
     if start >= len(track.stamps):
         return
@@ -257,21 +262,24 @@ def _decoded(track: VideoTrack, camera: Camera, start: int) -> Iterator[NDArray[
 def _damage(track: VideoTrack, wanted: int, reason: str) -> str:
     seconds = track.stamps[wanted] * track.tick_seconds
     return (
-        f"The video {track.path} cannot be decoded at {seconds:.3f} s ({reason}): it is truncated or damaged; "
+        f"The video {track.path} cannot be decoded at {seconds:.3f} s ({reason}): truncated or damaged; "
         "copy or record it again."
     )
 
 
-def _srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:
+def _srgb(
+    frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int
+) -> NDArray[np.uint8]:
     """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
 
-    A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one that
-    states no range is taken as limited unless its pixel format says otherwise.
+    A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one
+    that states no range is taken as limited unless its pixel format says otherwise.
     """
     matrix = MATRICES.get(int(frame.colorspace), BT709 if frame.height >= 720 else BT601)
     source_range = int(frame.color_range)
     if source_range not in (FULL_RANGE, LIMITED_RANGE):
-        source_range = FULL_RANGE if frame.format.name.startswith(("yuvj", "rgb", "bgr", "gbr")) else LIMITED_RANGE
+        full = frame.format.name.startswith(("yuvj", "rgb", "bgr", "gbr"))
+        source_range = FULL_RANGE if full else LIMITED_RANGE
     shrinks = width < frame.width or height < frame.height
     converted = reformatter.reformat(
         frame,
@@ -285,4 +293,4 @@ def _srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, h
         interpolation=(AREA if shrinks else BICUBIC) | FULL_CHROMA | ACCURATE_ROUNDING,
         threads=1,
     )
-    return converted.to_ndarray()
+    return cast(NDArray[np.uint8], converted.to_ndarray())

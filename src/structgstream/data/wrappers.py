@@ -83,7 +83,8 @@ class Section(Wrapped):
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         for frame in islice(self.source.frames(self.first + start), max(self.length - start, 0)):
-            yield MultiViewFrame(frame.index - self.first, frame.pts_seconds - self.first / self.fps, frame.images)
+            index = frame.index - self.first
+            yield MultiViewFrame(index, index / self.fps, frame.images)
 
 
 def resized(source: FrameSource, scale: float) -> FrameSource:

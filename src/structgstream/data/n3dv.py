@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layout of Neural 3D Video (Li et al., CVPR 2022): ``camXX.mp4`` and ``poses_bounds.npy``.
+
+Each row of the file is an LLFF pose: a 3x5 matrix ``[R | t | (height, width, focal)]``, camera to world with
+the axes down, right, backward, then two depth bounds. Rows belong to the existing videos in sorted order;
+``cam00`` is held out, as in published results.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
+from structgstream.data.calibration import calibrated_camera, calibrated_rig
+from structgstream.data.timeline import natural
+from structgstream.data.video import VideoSource, VideoTrack, scan_videos, synchronised
+from structgstream.errors import CalibrationError
+
+POSES = "poses_bounds.npy"
+HELD_OUT = "cam00"
+
+
+def recognises_n3dv(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / POSES).is_file()
+
+
+def open_n3dv(path: Path) -> VideoSource:
+    """The capture at ``path``. Videos smaller than the poses say are taken as uniformly reduced.
+
+    Raises:
+        CaptureError: a video cannot be read.
+        CalibrationError: broken poses, not one pose per video, or a video of other proportions than its pose.
+    """
+    poses = _read_poses(path / POSES)
+    videos = sorted(path.glob("*.mp4"), key=lambda video: natural(video.stem))
+    if len(videos) != len(poses):
+        raise CalibrationError(
+            f"{path / POSES} has {len(poses)} poses, {path} has {len(videos)} mp4 files; expected one pose "
+            "per video, in sorted order."
+        )
+    tracks = scan_videos({video.stem: video for video in videos})
+    cameras = {name: _camera(name, pose, tracks[name], path / POSES) for name, pose in zip(tracks, poses)}
+    held_out = (HELD_OUT,) if HELD_OUT in cameras else ()
+    return synchronised(tracks, calibrated_rig(cameras, held_out, where=path), where=path)
+
+
+def _read_poses(file: Path) -> NDArray[np.float64]:
+    """``[V, 3, 5]`` matrices of the file."""
+    try:
+        rows = np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
+    except (OSError, ValueError, EOFError) as error:
+        raise CalibrationError(f"{file} cannot be read as an array of numbers ({error}).") from None
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise CalibrationError(
+            f"{file} has shape {rows.shape}; expected (cameras, 17): 3x5 poses and two bounds."
+        )
+    return rows[:, :15].reshape(-1, 3, 5)
+
+
+def _camera(name: str, pose: NDArray[np.float64], track: VideoTrack, where: Path) -> Camera:
+    if not np.isfinite(pose).all():
+        raise CalibrationError(
+            f"Camera {name!r} of {where} has a number that is not finite (NaN or infinity)."
+        )
+    down, right, backward, center, (height, width, focal) = pose.T
+    rotation = np.stack([right, down, -backward])  # rows of world to camera: x right, y down, z forward
+    camera = calibrated_camera(
+        name,
+        viewmat=np.column_stack([rotation, -rotation @ center]),
+        K=[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]],
+        width=round(width),
+        height=round(height),
+        where=where,
+    )
+    if abs(track.height - height * track.width / width) > 1:
+        raise CalibrationError(
+            f"The video {track.path} has {track.width}x{track.height} pixels, {where} is for "
+            f"{width:g}x{height:g}; expected the same proportions."
+        )
+    return camera.resized(track.width, track.height)

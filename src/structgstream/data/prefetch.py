@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decodes the next frames while the last one trains."""
+
+import queue
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from structgstream.data.wrappers import Wrapped
+from structgstream.errors import ConfigError
+from structgstream.frames import MultiViewFrame
+
+
+@dataclass(frozen=True)
+class Prefetch(Wrapped):
+    """The same frames, decoded ahead in a background thread: it changes time and memory, not results.
+
+    Args:
+        source: the capture.
+        depth: frames to hold ready, at least 1; each costs its pictures' bytes.
+    """
+
+    depth: int = 2
+
+    def __post_init__(self) -> None:
+        if self.depth < 1:
+            raise ConfigError(f"Prefetch needs a depth of at least 1, got {self.depth}.")
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        """The frames from stream index ``start``.
+
+        An error of the source is raised in place of the frame that it concerns. Closing the iterator, or an
+        exception in its consumer, ends the thread within the decoding of one frame.
+        """
+        ready: queue.SimpleQueue[MultiViewFrame | BaseException | None] = queue.SimpleQueue()
+        room = threading.Semaphore(self.depth)
+        stop = threading.Event()
+
+        def decode() -> None:
+            try:
+                room.acquire()
+                for frame in self.source.frames(start):
+                    if stop.is_set():
+                        return
+                    ready.put(frame)
+                    room.acquire()
+                    if stop.is_set():
+                        return
+                ready.put(None)
+            except BaseException as error:  # handed to the consumer, whatever it is
+                ready.put(error)
+
+        # A daemon, so that a consumer that is never closed cannot keep the program from ending.
+        thread = threading.Thread(target=decode, name="prefetch", daemon=True)
+        thread.start()
+        try:
+            while (item := ready.get()) is not None:
+                if isinstance(item, BaseException):
+                    raise item
+                room.release()
+                yield item
+        finally:
+            stop.set()
+            room.release()
+            thread.join()
