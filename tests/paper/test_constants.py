@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every constant of the paper's section Implementations, and the ablations as edits of one preset."""
+
+from dataclasses import asdict
+
+import pytest
+
+from structgstream.presets import PRESETS
+from structgstream.scene.state import PAPER_DYNAMIC
+
+PAPERS = ["paper-n3dv", "paper-meetroom", "paper-immersive"]
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_frame_0(name: str) -> None:
+    initial = PRESETS[name].initial
+    assert initial.voxel_size == 0.005
+    assert initial.offsets_per_anchor == 5
+    assert initial.feature_width == 32
+    assert initial.iterations == 4000
+    assert initial.growth.start == 1500
+    assert initial.distance_input
+    assert not initial.camera_color
+    assert initial.coarse_iterations == 0
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_loss(name: str) -> None:
+    initial, online = PRESETS[name].initial.losses, PRESETS[name].online.losses
+    assert (initial.l1, initial.ssim, initial.volume, initial.offset_distance) == (1.0, 0.2, 0.01, 0.005)
+    assert (online.l1, online.ssim, online.volume, online.offset_distance) == (1.0, 0.2, 0.01, 0.0)
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_online(name: str) -> None:
+    online = PRESETS[name].online
+    assert online.iterations == 100
+    assert online.dynamic == PAPER_DYNAMIC
+    rates = online.rates
+    assert (rates.anchor_positions, rates.offset_scales, rates.covariance_mlp) == (4e-4, 5e-3, 4e-3)
+    free = (rates.free_means, rates.free_log_scales, rates.free_quats, rates.free_logit_opacities, rates.free_colors)
+    assert free == (2e-4, 5e-3, 1e-3, 5e-2, 2.5e-3)
+    assert rates.final_share == 1.0
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_patching(name: str) -> None:
+    patching = asdict(PRESETS[name].online.patching)
+    assert patching["iteration"] == 50
+    assert patching["grad_threshold"] == 1e-3
+    assert patching["covariance_factor"] == 2.0
+    assert patching["opacity"] == 0.1
+    assert patching["prune_opacity"] == 0.005
+    assert patching["lifetime"] == "stream"
+    assert patching["spawn"] == "gradient"

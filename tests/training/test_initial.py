@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from worlds import moving_world, psnr, rendered
+
+from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.state import state_of
+from structgstream.training.growth import GrowthConfig
+from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
+
+QUICK = InitialConfig(
+    iterations=120,
+    schedule_iterations=120,
+    voxel_size=0.05,
+    growth=GrowthConfig(collect_from=20, start=40, stop=100, interval=20, eligible_count=4, prune_visits=8),
+)
+
+
+def fit(world, *, config=QUICK, frame=None, points=None):
+    points = world.scene.anchors.positions if points is None else points
+    return fit_first_frame(
+        frame or world.frames[0], world.rig, points, config=config, backend=reference_backend(), seed=0
+    )
+
+
+def test_a_held_out_camera_is_reproduced() -> None:
+    world = moving_world(1)
+    result = fit(world)
+    black = psnr(np.zeros_like(world.frames[0].images["cam00"]), world.frames[0].images["cam00"])
+    assert psnr(rendered(result.scene, world, "cam00"), world.frames[0].images["cam00"]) > black + 6.0
+    assert result.train_psnr > black + 8.0
+    assert len(result.scene.free) == 0
+
+
+def test_anchors_grow_where_points_are_missing() -> None:
+    world = moving_world(1)
+    few = world.scene.anchors.positions[:12]
+    result = fit(world, points=few, config=replace(QUICK, growth=replace(QUICK.growth, grad_threshold=5e-5)))
+    assert len(result.scene.anchors) > 12
+
+
+def test_anchors_do_not_move_in_frame_0() -> None:
+    world = moving_world(1)
+    config = replace(QUICK, iterations=30)
+    cells = fit(world, config=config).scene.anchors.positions / QUICK.voxel_size
+    assert torch.allclose(cells, cells.round(), atol=1e-3)
+
+
+def test_exposures_are_learned_with_their_gauge() -> None:
+    world = moving_world(1)
+    dark = world.rig.training[0]
+    images = dict(world.frames[0].images)
+    images[dark] = (images[dark] * 0.7).astype(np.uint8)
+    rates = replace(InitialRates(), camera_color=replace(InitialRates().camera_color, initial=0.02))
+    config = replace(QUICK, camera_color=True, rates=rates)
+    color = fit(world, frame=MultiViewFrame(0, 0.0, images), config=config).scene.camera_color
+    assert color.gains[0].mean() < color.gains[1:].mean() - 0.05
+    assert torch.allclose(color.gains.mean(0), torch.ones(3), atol=1e-5)
+    assert torch.allclose(color.biases.mean(0), torch.zeros(3), atol=1e-5)
+
+
+def test_small_pictures_first() -> None:
+    world = moving_world(1)
+    assert fit(world, config=replace(QUICK, coarse_iterations=80)).train_psnr > 15.0
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    world = moving_world(1)
+    config = replace(QUICK, iterations=50)
+    one, two = (state_of(fit(world, config=config).scene) for _ in range(2))
+    assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+def test_too_few_points_are_refused() -> None:
+    world = moving_world(1)
+    with pytest.raises(CaptureError, match="at least 4"):
+        fit(world, points=torch.zeros(50, 3))
+
+
+def test_rates_of_the_reference_schedule() -> None:
+    """Scaffold-GS at iteration 4,000 of 30,000, where the paper stops (offset rate without the extent)."""
+    rates = rates_at(4000, InitialConfig(), extent=1.0)
+    assert rates["anchor_offsets"] == pytest.approx(0.00541, rel=2e-3)
+    assert rates["opacity_mlp"] == pytest.approx(0.00108, rel=3e-3)
+    assert rates["color_mlp"] == pytest.approx(0.00406, rel=3e-3)
+    assert rates["covariance_mlp"] == 0.004
+    assert rates["anchor_positions"] == 0.0

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames after the first, in a world whose motion is known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from worlds import moving_world, psnr, rendered
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
+from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame, without_patching
+from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
+from structgstream.training.result import Step
+
+QUICK = OnlineConfig(
+    iterations=24,
+    rates=OnlineRates(anchor_positions=2e-3),
+    patching=PatchingConfig(iteration=12, grad_threshold=1e-3),
+)
+
+
+def fit(scene, world, index, *, config=QUICK, seed=0, on_step=None):
+    return fit_next_frame(
+        scene, world.frames[index], world.rig, config=config, backend=reference_backend(), seed=seed, on_step=on_step
+    )
+
+
+def test_anchors_follow_motion() -> None:
+    world = moving_world(2)
+    truth = world.frames[1].images["cam00"]  # Held out.
+    before = psnr(rendered(world.scene, world, "cam00"), truth)
+    result = fit(world.scene, world, 1, config=without_patching(QUICK))
+    after = psnr(rendered(result.scene, world, "cam00"), truth)
+    assert after > before + 3.0
+    moved = (result.scene.anchors.positions - world.scene.anchors.positions).mean(0)
+    assert moved[0] > 0.015  # The truth is 0.03.
+    assert moved[1:].abs().max() < 0.01
+
+
+def test_static_fields_keep_every_bit() -> None:
+    world = moving_world(4, emerges_at=1)
+    scene = world.scene
+    for index in (1, 2, 3):
+        scene = fit(scene, world, index).scene
+    before, after = state_of(world.scene), state_of(scene)
+    for field in STATE_TABLE:
+        if field.name not in PAPER_DYNAMIC:
+            assert torch.equal(before[field.name], after[field.name]), field.name
+    assert not torch.equal(before["covariance_mlp"], after["covariance_mlp"])
+    assert not torch.equal(before["offset_scales"], after["offset_scales"])
+
+
+def test_an_emerging_object_gains_free_gaussians() -> None:
+    world = moving_world(3, emerges_at=1, speed=0.0)
+    first = fit(world.scene, world, 1)
+    second = fit(first.scene, world, 2)
+    assert first.spawned > 0
+    assert len(second.scene.free) >= len(first.scene.free) - second.pruned
+    assert set(first.scene.free.births.tolist()) == {BIRTHS_PER_FRAME + n for n in range(first.spawned)}
+    near_ball = (second.scene.free.means - torch.tensor([0.0, 0.0, -0.6])).norm(dim=1) < 0.6
+    assert near_ball.float().mean() > 0.3
+    truth = world.frames[2].images["cam00"]
+    alone = fit(fit(world.scene, world, 1, config=without_patching(QUICK)).scene, world, 2, config=without_patching(QUICK))
+    assert psnr(rendered(second.scene, world, "cam00"), truth) > psnr(rendered(alone.scene, world, "cam00"), truth)
+
+
+def test_a_frame_can_be_repeated_alone() -> None:
+    world = moving_world(2, emerges_at=1)
+    one, two = (state_of(fit(world.scene, world, 1).scene) for _ in range(2))
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    other = state_of(fit(world.scene, world, 1, seed=1).scene)
+    assert not torch.equal(one["anchor_positions"], other["anchor_positions"])
+
+
+@pytest.mark.parametrize("field", ["offset_scales", "covariance_mlp", "anchor_positions"])
+def test_a_field_outside_the_dynamic_set_stays(field: str) -> None:
+    world = moving_world(2)
+    config = replace(without_patching(QUICK), dynamic=PAPER_DYNAMIC - {field})
+    after = state_of(fit(world.scene, world, 1, config=config).scene)
+    assert torch.equal(after[field], state_of(world.scene)[field])
+
+
+def test_a_lifetime_of_one_frame_starts_without_free_gaussians() -> None:
+    world = moving_world(3, emerges_at=1)
+    config = replace(QUICK, patching=replace(QUICK.patching, lifetime="frame"))
+    second = fit(fit(world.scene, world, 1, config=config).scene, world, 2, config=config)
+    assert (second.scene.free.births >= 2 * BIRTHS_PER_FRAME).all()
+
+
+def test_progress_is_told_after_every_iteration() -> None:
+    steps: list[Step] = []
+    world = moving_world(2)
+    result = fit(world.scene, world, 1, on_step=steps.append)
+    assert [step.iteration for step in steps] == list(range(1, 25))
+    assert result.iterations == 24
+    assert result.train_psnr > 20.0
+    assert {"generate", "rasterise", "loss", "backward", "optimise"} <= set(result.seconds)

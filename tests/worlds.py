@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small world whose pictures are renderings of a known scene, so that every motion in it is known."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from rigs import arc_rig, random_scene
+
+from structgstream.cameras import CameraRig
+from structgstream.frames import MultiViewFrame
+from structgstream.gaussians import Gaussians, concatenate
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class World:
+    """Frames, the rig that took them, and the scene that was drawn in frame 0."""
+
+    rig: CameraRig
+    scene: Scene
+    frames: list[MultiViewFrame]
+
+
+def emerging_ball(opacity: float) -> Gaussians:
+    """A bright ball in the middle of the world."""
+    return Gaussians(
+        means=torch.tensor([[0.0, 0.0, -0.6]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 0.12),
+        opacities=torch.tensor([opacity]),
+        colors=torch.tensor([[1.0, 0.1, 0.9]]),
+        ids=torch.tensor([10**6]),
+    )
+
+
+def moving_world(frames: int = 3, *, cameras: int = 5, emerges_at: int | None = None, speed: float = 0.03) -> World:
+    """Anchors drift to the right; from frame ``emerges_at`` on a ball is there that was not."""
+    rig = arc_rig(cameras)
+    scene = random_scene(60, cameras=cameras - 1, seed=4)
+    backend = reference_backend()
+    shift = torch.tensor([speed, 0.0, 0.0])
+    pictures = []
+    for t in range(frames):
+        moved = replace(scene, anchors=replace(scene.anchors, positions=scene.anchors.positions + t * shift))
+        images = {}
+        for name in rig:
+            gaussians = moved.gaussians(rig[name], backend)
+            if emerges_at is not None and t >= emerges_at:
+                gaussians = concatenate(gaussians, emerging_ball(0.95))
+            image = draw(gaussians, rig[name], backend).image.detach()
+            images[name] = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        pictures.append(MultiViewFrame(t, t / 30.0, images))
+    return World(rig, scene, pictures)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """Peak signal-to-noise ratio of two uint8 pictures, dB."""
+    return float(-10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2))
+
+
+def rendered(scene: Scene, world: World, name: str) -> np.ndarray:
+    """``scene`` as camera ``name`` of the world sees it, uint8."""
+    backend = reference_backend()
+    image = draw(scene.gaussians(world.rig[name], backend), world.rig[name], backend).image.detach()
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
