@@ -156,7 +156,13 @@ def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[ColmapI
         images.append(_image(data[offset + 64 : end].decode(), tuple(pose), cameras[camera]))
         (observations,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * observations
+    _check_end(data, offset)
     return images
+
+
+def _check_end(data: bytes, offset: int) -> None:
+    if offset > len(data):
+        raise ValueError(f"a file ends {offset - len(data)} bytes early")
 
 
 def _points(folder: Path) -> NDArray[np.float64]:
@@ -170,6 +176,7 @@ def _points(folder: Path) -> NDArray[np.float64]:
             positions.append(struct.unpack_from("<3d", data, offset + 8))
             (observations,) = struct.unpack_from("<Q", data, offset + 43)
             offset += 51 + 8 * observations
+        _check_end(data, offset)
     elif (folder / "points3D.txt").is_file():
         rows = (line.split(maxsplit=4) for line in _lines(folder / "points3D.txt"))
         positions = [tuple(float(word) for word in row[1:4]) for row in rows if row]

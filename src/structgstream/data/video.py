@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
     from av.video.reformatter import VideoReformatter
 
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".ts"})
+# Containers that store presentation times; AVI does not.
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm", ".m4v", ".ts"})
 TOLERANCE_IN_PERIODS = 0.4  # nearer to half a period one cannot say which instant a frame belongs to
 STANDARD_RATES = tuple(rate * factor for rate in (24, 25, 30, 50, 60, 120) for factor in (1.0, 1000 / 1001))
 
@@ -119,7 +120,8 @@ def synchronised(
 
     Raises:
         CalibrationError: a video's size is not the size that its camera's intrinsics are for.
-        CaptureError: a missing or duplicate frame, a time stamp between two instants, or no frames in common.
+        CaptureError: a missing or duplicate frame, a time stamp between two instants, another rate than
+            ``fps``, or no frames in common.
     """
     for name in rig:
         track, camera = tracks[name], rig[name]
@@ -129,7 +131,13 @@ def synchronised(
                 f"camera {name!r} are for {camera.width}x{camera.height}; scale the intrinsics, "
                 "or use the video that was calibrated."
             )
-    rate = measured_fps(tracks) if fps is None else fps
+    measured = measured_fps(tracks)
+    if fps is not None and measured is not None and abs(measured / fps - 1) > 0.02:
+        raise CaptureError(
+            f"{where} states {fps:g} frames a second, the time stamps of its videos say {measured:g}; "
+            "correct the number."
+        )
+    rate = fps or measured or 30.0  # one frame per camera: any rate is right
     slots, origin_seconds = _slots(tracks, rate, where=where)
     common = common_slots(
         slots, where=str(where), label=lambda slot: f"the instant {origin_seconds + slot / rate:.3f} s"
@@ -141,8 +149,8 @@ def synchronised(
     return VideoSource(where.name, rig, rate, cut, points)
 
 
-def measured_fps(tracks: Mapping[str, VideoTrack]) -> float:
-    """Frames a second by the time stamps: robust to missing frames, and exact for the usual rates."""
+def measured_fps(tracks: Mapping[str, VideoTrack]) -> float | None:
+    """Frames a second by the time stamps: robust to missing frames, exact for usual rates, None for stills."""
     rates = []
     for track in tracks.values():
         if len(track.stamps) < 2:
@@ -151,7 +159,7 @@ def measured_fps(tracks: Mapping[str, VideoTrack]) -> float:
         frames = np.rint(steps / max(float(np.median(steps)), 1.0)).sum()
         rates.append(float(frames) / ((track.stamps[-1] - track.stamps[0]) * track.tick_seconds))
     if not rates:
-        return 30.0  # one frame per camera: any rate is right
+        return None
     rate = float(np.median(rates))
     usual = min(STANDARD_RATES, key=lambda standard: abs(standard - rate))
     return usual if abs(usual / rate - 1) < 3e-4 else rate
@@ -238,25 +246,29 @@ def _decoded(track: VideoTrack, camera: Camera, start: int) -> Generator[NDArray
         return
     av = _av()
     reformatter = av.video.reformatter.VideoReformatter()
-    wanted = start
-    with _open(track.path) as container:
-        stream = container.streams.video[0]
-        stream.codec_context.thread_count = 1  # the cameras are the parallelism
-        try:
-            if start:
-                container.seek(track.stamps[start], stream=stream, backward=True)
-            for frame in container.decode(stream):
-                if frame.pts is None or frame.pts < track.stamps[wanted]:
-                    continue  # before the exact frame of a seek, or cut from the common range
-                if frame.pts > track.stamps[wanted] or frame.is_corrupt:
-                    break
-                yield _srgb(frame, reformatter, width=camera.width, height=camera.height)
-                wanted += 1
-                if wanted == len(track.stamps):
-                    return
-        except av.error.FFmpegError as error:
-            raise CaptureError(_damage(track, wanted, str(error.strerror))) from None
-    raise CaptureError(_damage(track, wanted, "a frame is missing or broken"))
+    wanted, reason = start, "a frame is missing or broken"
+    for seek in (True, False) if start else (False,):
+        with _open(track.path) as container:
+            stream = container.streams.video[0]
+            stream.codec_context.thread_count = 1  # the cameras are the parallelism
+            try:
+                if seek:
+                    container.seek(track.stamps[start], stream=stream, backward=True)
+                for frame in container.decode(stream):
+                    if frame.pts is None or frame.pts < track.stamps[wanted]:
+                        continue  # before the exact frame of a seek, or cut from the common range
+                    if frame.pts > track.stamps[wanted] or frame.is_corrupt:
+                        break
+                    yield _srgb(frame, reformatter, width=camera.width, height=camera.height)
+                    wanted += 1
+                    if wanted == len(track.stamps):
+                        return
+            except av.error.FFmpegError as error:
+                reason = str(error.strerror)
+        if wanted > start:
+            break
+        # Without an index (MPEG-TS) a seek may land after the frame; then decode from the beginning.
+    raise CaptureError(_damage(track, wanted, reason))
 
 
 def _damage(track: VideoTrack, wanted: int, reason: str) -> str:

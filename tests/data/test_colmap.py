@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import quaternion, small_rig, write_text_model
+
+from structgstream.data.colmap import find_model, read_model
+from structgstream.errors import CalibrationError
+
+POINTS = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 7.0]])
+RIG = small_rig(3)
+IMAGES = [(f"{name} left/000000.png", name) for name in reversed(list(RIG))]  # a space in every name
+
+
+def write_binary_model(folder: Path) -> None:
+    """The model of RIG, IMAGES and POINTS in the binary format; camera 2 is a SIMPLE_PINHOLE."""
+    folder.mkdir(parents=True)
+    cameras = struct.pack("<Q", len(RIG))
+    for number, camera in enumerate(RIG.cameras.values(), start=1):
+        fx, fy, cx, cy = (float(camera.K[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        params = (fx, cx, cy) if number == 2 else (fx, fy, cx, cy)
+        cameras += struct.pack(
+            f"<iiQQ{len(params)}d", number, number != 2, camera.width, camera.height, *params
+        )
+    images = struct.pack("<Q", len(IMAGES))
+    ids = {name: number for number, name in enumerate(RIG, start=1)}
+    for number, (file, name) in enumerate(IMAGES, start=1):
+        pose = (*quaternion(RIG[name]), *RIG[name].viewmat[:3, 3].tolist())
+        images += struct.pack("<i7di", number, *pose, ids[name]) + file.encode() + b"\0"
+        images += struct.pack("<Q", number) + struct.pack("<ddq", 1.5, 2.5, -1) * number
+    points = struct.pack("<Q", len(POINTS))
+    for number, point in enumerate(POINTS):
+        points += (
+            struct.pack("<Q3d3BdQ", number, *point, 9, 9, 9, 0.5, number) + struct.pack("<ii", 1, 0) * number
+        )
+    (folder / "cameras.bin").write_bytes(cameras)
+    (folder / "images.bin").write_bytes(images)
+    (folder / "points3D.bin").write_bytes(points)
+
+
+@pytest.fixture(params=["text", "binary"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    if request.param == "text":
+        write_text_model(tmp_path / "sparse", RIG, IMAGES, points=POINTS)
+    else:
+        write_binary_model(tmp_path / "sparse")
+    return tmp_path / "sparse"
+
+
+def test_both_formats_give_the_cameras_and_the_points(folder: Path) -> None:
+    model = read_model(folder)
+    assert [image.name for image in model.images] == [f"{name} left/000000.png" for name in RIG]
+    for image, camera in zip(model.images, RIG.cameras.values(), strict=True):
+        np.testing.assert_allclose(image.viewmat, camera.viewmat.numpy(), atol=1e-9)
+        np.testing.assert_allclose(image.camera.K, camera.K.numpy())
+        assert (image.camera.width, image.camera.height) == (camera.width, camera.height)
+    np.testing.assert_array_equal(model.points, POINTS)
+
+
+def test_points_are_optional(folder: Path) -> None:
+    for file in folder.glob("points3D.*"):
+        file.unlink()
+    assert read_model(folder).points.shape == (0, 3)
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+def test_a_cut_file_is_named_by_its_folder(tmp_path: Path, stem: str) -> None:
+    write_binary_model(tmp_path / "sparse")
+    file = tmp_path / "sparse" / f"{stem}.bin"
+    file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(CalibrationError, match=f"COLMAP model in {tmp_path / 'sparse'} cannot be read"):
+        read_model(tmp_path / "sparse")
+
+
+@pytest.mark.parametrize("line", ["1 PINHOLE 64", "x y z w 1 2 3 4", "1 PINHOLE 64 48 40 40 32"])
+def test_broken_text_is_named_by_its_folder(tmp_path: Path, line: str) -> None:
+    write_text_model(tmp_path, RIG, IMAGES)
+    (tmp_path / "cameras.txt").write_text(line)
+    with pytest.raises(CalibrationError, match=r"cannot be read|lens distortion"):
+        read_model(tmp_path)
+
+
+def test_distorted_models_say_how_to_undistort(tmp_path: Path) -> None:
+    write_text_model(tmp_path, RIG, IMAGES)
+    (tmp_path / "cameras.txt").write_text("1 OPENCV 64 48 40 40 32 24 0.1 0 0 0\n")
+    with pytest.raises(CalibrationError, match=r"cameras\.txt has a camera of model OPENCV.*undistort"):
+        read_model(tmp_path)
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 1, 3, 64, 48, 40, 32, 24, 0.1))
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 0))
+    with pytest.raises(CalibrationError, match=r"cameras\.bin has a camera of model RADIAL.*undistort"):
+        read_model(tmp_path)
+
+
+def test_where_a_model_is_looked_for(tmp_path: Path) -> None:
+    assert find_model(tmp_path) is None
+    for folder in (tmp_path, tmp_path / "sparse", tmp_path / "sparse" / "0"):
+        write_text_model(folder, RIG, IMAGES)
+        assert find_model(tmp_path) == folder

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from captures import all_numbers, picture, write_clip, write_shared_intrinsics, write_video
+
+from structgstream.data.json_videos import open_json_videos
+from structgstream.errors import CalibrationError, CaptureError
+from structgstream.similarity import rig_radius
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads((path / "cameras.json").read_text())
+    change(content)
+    (path / "cameras.json").write_text(json.dumps(content))
+
+
+def test_own_dialect(tmp_path: Path) -> None:
+    rig = write_clip(tmp_path / "clip", fps=24)
+    source = open_json_videos(tmp_path / "clip")
+    assert (source.name, source.fps, len(source)) == ("clip", 24.0, 6)
+    assert source.rig.testing == ("cam00",)
+    for name in rig:
+        assert torch.equal(source.rig[name].viewmat, rig[name].viewmat)
+        assert torch.equal(source.rig[name].K, rig[name].K)
+        assert source.rig[name].near == 0.2
+    assert all_numbers(source.frames(4)) == [[(camera, frame) for camera in range(4)] for frame in (4, 5)]
+
+
+def test_shared_intrinsics_dialect(tmp_path: Path) -> None:
+    rig = write_shared_intrinsics(tmp_path)
+    source = open_json_videos(tmp_path)
+    assert (source.fps, len(source), source.rig.testing) == (30.0, 4, ("cam00",))
+    for name in rig:
+        torch.testing.assert_close(source.rig[name].viewmat, rig[name].viewmat)
+        assert torch.equal(source.rig[name].K, rig[name].K)
+        assert source.rig[name].near == pytest.approx(0.12 * rig_radius(rig))
+
+
+def test_a_camera_without_calibration(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    write_video(tmp_path / "cam09.mp4", [picture(9, frame) for frame in range(6)])
+    with pytest.raises(CalibrationError, match=r"pictures of camera 'cam09', for which .*cameras\.json"):
+        open_json_videos(tmp_path)
+
+
+def test_a_calibration_without_video(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    (tmp_path / "cam02.mp4").unlink()
+    with pytest.raises(CaptureError, match=r"cameras\.json calibrates camera 'cam02', but .* no pictures"):
+        open_json_videos(tmp_path)
+
+
+def test_fewer_frames_than_stated(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    edit(tmp_path, lambda content: content.update(frames=9))
+    with pytest.raises(CaptureError, match=r"share 6 frames, cameras\.json states 9"):
+        open_json_videos(tmp_path)
+
+
+def test_another_rate_than_stated(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    edit(tmp_path, lambda content: content.update(fps=25))
+    with pytest.raises(CaptureError, match="states 25 frames a second, the time stamps of its videos say 30"):
+        open_json_videos(tmp_path)
+
+
+def test_nan_names_the_camera(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    edit(tmp_path, lambda content: content["cameras"]["cam03"]["viewmat"][1].__setitem__(3, float("nan")))
+    with pytest.raises(CalibrationError, match=r"'cam03' of .*cameras\.json: .*not finite"):
+        open_json_videos(tmp_path)
+
+
+def test_a_singular_pose_names_the_camera(tmp_path: Path) -> None:
+    write_shared_intrinsics(tmp_path)
+    edit(tmp_path, lambda content: content["cams"].__setitem__(1, [[0.0] * 4] * 4))
+    with pytest.raises(CalibrationError, match=r"'cam01' of .*cameras\.json has a pose"):
+        open_json_videos(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", "{}", '{"cameras": {"a": {}}, "width": 2, "height": 2}', '{"cameras": 3}']
+)
+def test_json_that_is_something_else(tmp_path: Path, text: str) -> None:
+    (tmp_path / "cameras.json").write_text(text)
+    with pytest.raises(CaptureError, match=r"cameras\.json cannot be read"):
+        open_json_videos(tmp_path)
+
+
+def test_one_camera_is_too_few(tmp_path: Path) -> None:
+    write_clip(tmp_path, cameras=3)
+    edit(tmp_path, lambda content: content.update(held_out=["cam00", "cam02"]))
+    with pytest.raises(CalibrationError, match=r"cameras\.json: .*at least two training cameras, got 1"):
+        open_json_videos(tmp_path)

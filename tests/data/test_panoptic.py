@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from captures import all_numbers, write_panoptic
+
+from structgstream.data.panoptic import PANOPTIC_FPS, TEST, TRAIN, open_panoptic
+from structgstream.errors import CalibrationError, CaptureError
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_cameras_poses_and_pictures(tmp_path: Path) -> None:
+    rig = write_panoptic(tmp_path / "ball", cameras=12, frames=3)
+    source = open_panoptic(tmp_path / "ball")
+    assert list(source.rig) == [str(number) for number in range(12)]
+    assert source.rig.testing == ("0",)
+    assert (source.name, source.fps, len(source), source.points) == ("ball", PANOPTIC_FPS, 3, None)
+    for number in range(12):
+        assert torch.equal(source.rig[str(number)].viewmat, rig[f"cam{number:02d}"].viewmat)
+        assert torch.equal(source.rig[str(number)].K, rig[f"cam{number:02d}"].K)
+    assert all_numbers(source.frames()) == [[(camera, frame) for camera in range(12)] for frame in range(3)]
+
+
+def test_without_test_metadata_nothing_is_held_out(tmp_path: Path) -> None:
+    write_panoptic(tmp_path)
+    (tmp_path / TEST).unlink()
+    assert open_panoptic(tmp_path).rig.held_out == frozenset()
+
+
+@pytest.mark.parametrize("key", ["k", "w2c"])
+def test_a_camera_that_moves_is_refused(tmp_path: Path, key: str) -> None:
+    write_panoptic(tmp_path)
+
+    def move(content: dict[str, Any]) -> None:
+        content[key][3][1][0][2] += 0.01
+
+    edit(tmp_path / TRAIN, move)
+    with pytest.raises(CalibrationError, match=r"'2' .*moves: its k or w2c changes at 2/000093\.jpg"):
+        open_panoptic(tmp_path)
+
+
+def test_nan_names_the_camera(tmp_path: Path) -> None:
+    write_panoptic(tmp_path)
+
+    def break_everywhere(content: dict[str, Any]) -> None:
+        for frame in content["k"]:
+            frame[0][0][0] = float("nan")
+
+    edit(tmp_path / TRAIN, break_everywhere)
+    with pytest.raises(CalibrationError, match=r"'1' .*not finite"):
+        open_panoptic(tmp_path)
+
+
+def test_a_missing_picture_in_the_middle_is_named(tmp_path: Path) -> None:
+    write_panoptic(tmp_path)
+    (tmp_path / "ims" / "2" / "000092.jpg").unlink()
+    with pytest.raises(CaptureError, match=r"2/000092\.jpg of camera '2' is missing"):
+        open_panoptic(tmp_path)
+
+
+def test_a_camera_whose_folder_is_missing_is_named(tmp_path: Path) -> None:
+    write_panoptic(tmp_path)
+    (tmp_path / "ims" / "3").rename(tmp_path / "ims" / "33")
+    with pytest.raises(CaptureError, match="of camera '3' is missing"):
+        open_panoptic(tmp_path)
+
+
+def test_size_of_the_metadata_must_be_the_pictures(tmp_path: Path) -> None:
+    write_panoptic(tmp_path)
+    for meta in (TRAIN, TEST):
+        edit(tmp_path / meta, lambda content: content.update(w=72, h=54))
+    with pytest.raises(CalibrationError, match=r"64x48 pixels, .* 72x54"):
+        next(open_panoptic(tmp_path).frames())
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"w": 64, "h": 48}'])
+def test_metadata_that_is_something_else(tmp_path: Path, text: str) -> None:
+    write_panoptic(tmp_path)
+    (tmp_path / TRAIN).write_text(text)
+    with pytest.raises(CaptureError, match=r"train_meta\.json cannot be read as PanopticSports"):
+        open_panoptic(tmp_path)
+
+
+def test_a_camera_cannot_be_trained_and_held_out(tmp_path: Path) -> None:
+    write_panoptic(tmp_path)
+    (tmp_path / TEST).write_text((tmp_path / TRAIN).read_text())
+    with pytest.raises(CaptureError, match="'1' is in both"):
+        open_panoptic(tmp_path)

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+import logging
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
+
+from structgstream.data.video import VideoSource, measured_fps, scan_videos, synchronised
+from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
+
+RIG = small_rig(3)
+
+
+def read(folder: Path, fps: float | None = None) -> VideoSource:
+    return synchronised(
+        scan_videos({name: folder / f"{name}.mp4" for name in RIG}), RIG, where=folder, fps=fps
+    )
+
+
+def rewrite(
+    folder: Path, name: str, frames: list[int], instants: list[float] | None = None, fps: float = 30
+) -> None:
+    """Another video for one camera: these frames at these times, both counted in frames."""
+    camera = list(RIG).index(name)
+    images = [picture(camera, frame) for frame in frames]
+    write_video(folder / f"{name}.mp4", images, instants=instants or frames, fps=fps)
+
+
+def test_frames_come_in_order_with_every_camera(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=10)
+    source = read(tmp_path)
+    assert (len(source), source.fps, source.name) == (10, 30.0, tmp_path.name)
+    frames = list(source.frames())
+    assert all_numbers(frames) == [[(camera, frame) for camera in range(3)] for frame in range(10)]
+    assert [frame.pts_seconds for frame in frames] == pytest.approx(np.arange(10) / 30)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+def test_seeking_is_exact_for_every_start(tmp_path: Path, suffix: str) -> None:
+    """Groups of 4 with B-frames, in containers with an index of their own and without one."""
+    for camera, name in enumerate(RIG):
+        write_video(tmp_path / f"{name}.{suffix}", [picture(camera, frame) for frame in range(11)])
+    tracks = scan_videos({name: tmp_path / f"{name}.{suffix}" for name in RIG})
+    source = synchronised(tracks, RIG, where=tmp_path)
+    for start in range(11):
+        frames = source.frames(start)
+        first = next(frames)
+        assert (first.index, numbers(first.images["cam02"])) == (start, (2, start))
+        assert [frame.index for frame in frames] == list(range(start + 1, 11))
+    assert list(source.frames(11)) == []
+
+
+def test_cameras_are_matched_by_time_not_by_count(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_videos(tmp_path, list(RIG), frames=8)
+    rewrite(tmp_path, "cam01", [2, 3, 4, 5, 6, 7, 8])
+    with caplog.at_level(logging.WARNING):
+        source = read(tmp_path)
+    assert "'cam01' starts with the instant 0.067 s; 2 earlier" in caplog.text
+    assert [[frame for _, frame in row] for row in all_numbers(source.frames())] == [
+        [n] * 3 for n in range(2, 8)
+    ]
+
+
+def test_a_shorter_video_cuts_the_range_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_videos(tmp_path, list(RIG), frames=8)
+    rewrite(tmp_path, "cam02", [0, 1, 2, 3, 4])
+    with caplog.at_level(logging.WARNING):
+        assert len(list(read(tmp_path).frames())) == 5
+    assert "'cam02' ends with the instant 0.133 s; 3 later" in caplog.text
+
+
+def test_jitter_below_half_a_period_keeps_its_place(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=6)
+    rewrite(tmp_path, "cam01", list(range(6)), [0.0, 1.25, 1.8, 3.2, 3.75, 5.1])
+    assert [row[1] for row in all_numbers(read(tmp_path).frames())] == [(1, frame) for frame in range(6)]
+
+
+def test_a_missing_frame_names_camera_and_time(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=8)
+    rewrite(tmp_path, "cam01", [0, 1, 2, 3, 5, 6, 7])
+    with pytest.raises(CaptureError, match=r"'cam01' .*no frame for the instant 0\.133 s"):
+        read(tmp_path)
+
+
+def test_a_duplicate_frame_names_camera_and_time(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=6)
+    rewrite(tmp_path, "cam01", [0, 1, 2, 2, 3, 4, 5], [0, 1, 2, 2.25, 3, 4, 5])
+    with pytest.raises(CaptureError, match=r"'cam01' .*two frames for the instant 0\.067 s"):
+        read(tmp_path)
+
+
+def test_a_camera_between_two_instants_is_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=6)
+    rewrite(tmp_path, "cam01", list(range(6)), [n + 0.45 for n in range(6)])
+    with pytest.raises(CaptureError, match=r"'cam01' .*0\.45 frame periods off the common timeline"):
+        read(tmp_path)
+
+
+def test_a_camera_of_another_rate_is_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=6)
+    rewrite(tmp_path, "cam02", list(range(8)), fps=50)
+    with pytest.raises(CaptureError, match="'cam02'"):
+        read(tmp_path)
+
+
+def test_no_frames_in_common(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=4)
+    rewrite(tmp_path, "cam01", [20, 21, 22])
+    with pytest.raises(
+        CaptureError, match=r"no frames in common: .*'cam01' starts with the instant 0\.667 s"
+    ):
+        read(tmp_path)
+
+
+def test_rate_is_measured_from_the_time_stamps(tmp_path: Path) -> None:
+    for name in RIG:
+        rewrite(tmp_path, name, [0, 1, 2, 4, 5, 6, 7, 8, 9], fps=30000 / 1001)  # every camera misses a frame
+    assert measured_fps(scan_videos({"a": tmp_path / "cam00.mp4"})) == pytest.approx(30000 / 1001, rel=1e-3)
+    with pytest.raises(CaptureError, match="no frame for"):
+        read(tmp_path)
+    rewrite(tmp_path, "cam00", [0, 1, 2, 3, 4], fps=17)
+    assert measured_fps(scan_videos({"a": tmp_path / "cam00.mp4"})) == pytest.approx(17, rel=5e-3)
+
+
+def test_a_video_of_another_size_than_its_intrinsics(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=2)
+    write_video(tmp_path / "cam01.mp4", [picture(1, frame, width=80, height=60) for frame in range(2)])
+    with pytest.raises(CalibrationError, match=r"cam01\.mp4 has 80x60 pixels.*'cam01' are for 64x48"):
+        read(tmp_path)
+
+
+def test_missing_and_foreign_files_are_named(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=2)
+    (tmp_path / "cam02.mp4").write_bytes(b"no video at all" * 20)
+    with pytest.raises(CaptureError, match=r"cam02\.mp4 cannot be opened"):
+        read(tmp_path)
+    (tmp_path / "cam02.mp4").unlink()
+    with pytest.raises(CaptureError, match=r"cam02\.mp4 is missing"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.9, 0.999])
+def test_a_truncated_video_is_found_at_once(tmp_path: Path, kept: float) -> None:
+    write_videos(tmp_path, list(RIG), frames=12)
+    data = (tmp_path / "cam01.mp4").read_bytes()
+    (tmp_path / "cam01.mp4").write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(CaptureError, match=r"cam01\.mp4 (is truncated|cannot be opened)"):
+        read(tmp_path)
+
+
+def test_a_damaged_video_names_file_and_time_after_the_good_frames(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    noise = [
+        rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(12)
+    ]  # large, so that damage hits data
+    for name in RIG:
+        write_video(tmp_path / f"{name}.mp4", noise)
+    data = bytearray((tmp_path / "cam01.mp4").read_bytes())
+    middle = int(len(data) * 0.6)
+    data[middle : middle + 4000] = bytes(4000)
+    (tmp_path / "cam01.mp4").write_bytes(data)
+    good = []
+    with pytest.raises(CaptureError, match=r"cam01\.mp4 cannot be decoded at 0\.\d+ s"):
+        good.extend(frame.index for frame in read(tmp_path).frames())
+    assert good == list(range(len(good)))
+    assert 4 <= len(good) < 9
+
+
+@pytest.mark.parametrize("pixels", ["yuv420p", "yuv444p"])
+@pytest.mark.parametrize("color_range", [LIMITED, FULL, None])
+@pytest.mark.parametrize("matrix", [1, 5, None])
+def test_colours_follow_the_matrix_and_range_of_the_file(
+    tmp_path: Path, matrix: int | None, color_range: int | None, pixels: str
+) -> None:
+    """Without a statement: BT.601 at this size, limited range."""
+    colors = np.array(
+        [(230, 40, 60), (20, 200, 90), (30, 60, 220), (250, 250, 250), (5, 5, 5), (240, 200, 30)]
+    )
+    flat = [np.broadcast_to(color, (48, 64, 3)).astype(np.uint8) for color in colors]
+    for name in RIG:
+        write_video(tmp_path / f"{name}.mp4", flat, matrix=matrix, color_range=color_range, pixels=pixels)
+    means = [frame.images["cam00"].mean(axis=(0, 1)) for frame in read(tmp_path).frames()]
+    np.testing.assert_allclose(means, colors, atol=2.5)
+
+
+def test_resized_videos_are_averaged(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    grey = np.repeat(rng.integers(0, 255, (48, 64, 1), dtype=np.uint8), 3, axis=2)
+    for name in RIG:
+        write_video(tmp_path / f"{name}.mp4", [grey, grey], color_range=FULL)
+    half = RIG.mapped({name: RIG[name].resized(32, 24) for name in RIG})
+    image = next(read(tmp_path).resized(half).frames()).images["cam00"]
+    expected = grey.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image, expected, atol=1.5)
+
+
+def test_closing_releases_the_files(tmp_path: Path) -> None:
+    write_videos(tmp_path, list(RIG), frames=6)
+
+    def open_files() -> set[str]:
+        links = (link for link in Path("/proc/self/fd").iterdir() if link.exists())
+        return {str(link.readlink()) for link in links if str(link.readlink()).startswith(str(tmp_path))}
+
+    frames = read(tmp_path).frames(1)
+    next(frames)
+    assert len(open_files()) == 3
+    frames.close()  # type: ignore[attr-defined]
+    assert not open_files()
+
+
+def test_the_extra_is_named_when_the_reader_is_absent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
+        scan_videos({"a": tmp_path / "a.mp4"})
+
+
+def test_stamps_ascend(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["cam00"], frames=9)
+    stamps = scan_videos({"cam00": tmp_path / "cam00.mp4"})["cam00"].stamps
+    assert all(a < b for a, b in pairwise(stamps))

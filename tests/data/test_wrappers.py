@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from captures import all_numbers, numbers, write_clip, write_panoptic
+
+from structgstream.data.json_videos import open_json_videos
+from structgstream.data.panoptic import open_panoptic
+from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import WithRig, resized, section
+from structgstream.errors import CaptureError, ConfigError
+
+
+@pytest.fixture(params=["pictures", "videos"])
+def source(request: pytest.FixtureRequest, tmp_path: Path) -> FrameSource:
+    if request.param == "pictures":
+        write_panoptic(tmp_path, frames=6)
+        return open_panoptic(tmp_path)
+    write_clip(tmp_path)
+    return open_json_videos(tmp_path)
+
+
+@pytest.mark.parametrize(("scale", "size"), [(0.5, (32, 24)), (0.33, (21, 16)), (0.01, (1, 1))])
+def test_pictures_and_intrinsics_shrink_together(
+    source: FrameSource, scale: float, size: tuple[int, int]
+) -> None:
+    small = resized(source, scale)
+    for name in small.rig:
+        before, after = source.rig[name], small.rig[name]
+        assert (after.width, after.height) == size
+        ratio = torch.tensor([[size[0] / 64], [size[1] / 48], [1.0]], dtype=torch.float64)
+        torch.testing.assert_close(after.K, before.K * ratio)
+        assert torch.equal(after.viewmat, before.viewmat)
+    frame = next(small.frames(2))
+    assert {image.shape for image in frame.images.values()} == {(size[1], size[0], 3)}
+    if scale > 0.1:
+        assert [numbers(image) for image in frame.images.values()] == [(camera, 2) for camera in range(4)]
+
+
+def test_shrinking_averages_areas(source: FrameSource) -> None:
+    full, half = next(source.frames()), next(resized(source, 0.5).frames())
+    for name in source.rig:
+        expected = full.images[name].reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
+        np.testing.assert_allclose(half.images[name], expected, atol=1.5)
+
+
+def test_scale_one_changes_nothing_and_others_are_refused(source: FrameSource) -> None:
+    assert resized(source, 1.0) is source
+    for scale in (0.0, -1.0, 1.5, float("nan")):
+        with pytest.raises(ConfigError, match="scale of a capture"):
+            resized(source, scale)
+
+
+def test_a_section_counts_and_times_from_zero(source: FrameSource) -> None:
+    part = section(source, start=2, frames=3)
+    assert len(part) == 3
+    frames = list(part.frames())
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert [frame.pts_seconds for frame in frames] == pytest.approx([0, 1 / part.fps, 2 / part.fps])
+    assert all_numbers(frames) == all_numbers(source.frames())[2:5]
+    assert all_numbers(part.frames(1)) == all_numbers(frames)[1:]
+    assert list(part.frames(3)) == []
+
+
+def test_a_section_must_lie_inside(source: FrameSource) -> None:
+    assert section(source) is source
+    assert len(section(source, start=5)) == 1
+    for start, frames in ((6, None), (-1, None), (0, 7), (4, 3), (0, 0)):
+        with pytest.raises(CaptureError, match="has 6 frames"):
+            section(source, start=start, frames=frames)
+
+
+def test_another_rig_keeps_the_frames(source: FrameSource) -> None:
+    names = list(source.rig)
+    other = WithRig(source, source.rig.with_held_out(frozenset(names[1:2])))
+    assert other.rig.testing == (names[1],)
+    assert all_numbers(other.frames(4)) == all_numbers(source.frames(4))
+    assert (other.name, other.fps, len(other), other.points) == (source.name, source.fps, 6, None)
