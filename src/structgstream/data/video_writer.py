@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes pictures as a video that plays everywhere: H.264 in mp4, 4:2:0, BT.709, constant quality."""
+
+from contextlib import AbstractContextManager
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.errors import MissingExtraError, StorageError
+
+BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2  # values of ISO/IEC 23091-2 and of libavutil
+BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
+
+
+class VideoWriter(AbstractContextManager["VideoWriter"]):
+    """An mp4 under construction: ``write`` takes one picture after the other, all of one size.
+
+    The file appears under its name when the block ends without an error, never half written. A size that is
+    odd is padded by one pixel, because 4:2:0 needs even ones.
+
+    Args:
+        path: the file to write; its folder is made when it is missing.
+        fps: frames a second.
+        crf: constant rate factor of x264; 18 is hard to tell from the source.
+
+    Raises:
+        MissingExtraError: PyAV is not installed.
+        StorageError: the file cannot be written, or this PyAV has no H.264 encoder.
+    """
+
+    def __init__(self, path: Path, *, fps: float, crf: int = 18) -> None:
+        try:
+            import av
+        except ImportError:
+            raise MissingExtraError("av", "capture") from None
+        self.path = path
+        self._part = path.with_name(path.name + ".part")
+        self._fps = Fraction(fps).limit_denominator(1001)
+        self._count = 0
+        self._av = av
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._container = av.open(str(self._part), "w", format="mp4", options={"movflags": "+faststart"})
+            options = {"crf": str(crf), "preset": "medium"}
+            self._stream = self._container.add_stream("libx264", rate=self._fps, options=options)
+        except (OSError, ValueError, av.error.FFmpegError) as error:
+            raise StorageError(f"The video {path} cannot be written ({error}).") from None
+        self._stream.pix_fmt = "yuv420p"
+        context = self._stream.codec_context
+        context.bit_rate = 0  # a rate left at its default would win over the constant quality
+        context.color_range, context.colorspace = LIMITED_RANGE, BT709
+        context.color_primaries, context.color_trc = BT709, BT709
+
+    def write(self, picture: NDArray[np.uint8]) -> None:
+        """Adds a picture ``[H, W, 3]`` sRGB.
+
+        Raises:
+            StorageError: the disk is full.
+        """
+        height, width = picture.shape[:2]
+        even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        if self._count == 0:
+            self._stream.height, self._stream.width = even.shape[:2]
+        frame = self._av.VideoFrame.from_ndarray(even, format="rgb24").reformat(
+            format="yuv420p",
+            src_colorspace=BT709,
+            dst_colorspace=BT709,
+            src_color_range=FULL_RANGE,
+            dst_color_range=LIMITED_RANGE,
+            interpolation=BICUBIC | ACCURATE_ROUNDING,
+        )
+        frame.pts, frame.time_base = self._count, 1 / self._fps
+        frame.color_range, frame.colorspace = LIMITED_RANGE, BT709
+        self._count += 1
+        self._mux(frame)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None and self._count:
+                self._mux(None)
+            self._container.close()
+            if kind is None and self._count:
+                self._part.replace(self.path)
+        except (OSError, self._av.error.FFmpegError) as problem:
+            raise StorageError(f"The video {self.path} cannot be written ({problem.strerror}).") from None
+        finally:
+            self._part.unlink(missing_ok=True)
+
+    def _mux(self, frame: object) -> None:
+        try:
+            self._container.mux(self._stream.encode(frame))  # pyright: ignore[reportArgumentType]
+        except (OSError, self._av.error.FFmpegError) as error:
+            raise StorageError(f"The video {self.path} cannot be written ({error.strerror}).") from None

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which machine and which versions gave a number."""
+
+import os
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import structgstream
+
+
+def environment() -> dict[str, Any]:
+    """Python, packages, processor, cores, GPU, and the commit of the sources (None when installed)."""
+    import numpy as np
+    import torch
+
+    cuda = torch.cuda.is_available()
+    return {
+        "structgstream": structgstream.__version__,
+        "commit": source_commit(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "platform": platform.platform(),
+        "cpu": processor_name(),
+        "cores": usable_cores(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if cuda else None,
+    }
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on, which containers make fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor_name() -> str:
+    """The processor as its maker calls it, where the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def source_commit() -> str | None:
+    """The commit of the working copy that this package runs from; ``-dirty`` when it has changes."""
+    folder = Path(structgstream.__file__).parent
+    git = shutil.which("git")
+    # Sources must be tracked: an environment inside some other repository would give that one's commit.
+    if git is None or _output(git, "ls-files", "--error-unmatch", "__init__.py", folder=folder) is None:
+        return None
+    return _output(git, "describe", "--always", "--dirty", "--exclude=*", folder=folder)
+
+
+def _output(*command: str, folder: Path) -> str | None:
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a result: what was there, what was rendered, and the difference."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.errors import MissingExtraError
+
+Picture = NDArray[np.uint8]
+DIFFERENCE_GAIN = 4
+GAP, MARGIN, LABEL = 4, 12, 26  # pixels
+LARGEST_TILE = 400  # pixels across
+
+
+def difference(picture: Picture, truth: Picture) -> Picture:
+    """Four times the absolute difference of two pictures ``[H, W, 3]``, clamped: black where they agree."""
+    error = np.abs(picture.astype(np.int16) - truth.astype(np.int16))
+    return np.minimum(error * DIFFERENCE_GAIN, 255).astype(np.uint8)
+
+
+def side_by_side(truth: Picture, picture: Picture) -> Picture:
+    """Truth, rendering, their difference times four, left to right with white gaps: ``[H, 3 W + 8, 3]``."""
+    gap = np.full((truth.shape[0], GAP, 3), 255, np.uint8)
+    return np.concatenate([truth, gap, picture, gap, difference(picture, truth)], axis=1)
+
+
+def thumbnail(picture: Picture, largest: int = LARGEST_TILE) -> Picture:
+    """``picture`` reduced by block means, by a whole factor, to at most ``largest`` pixels across."""
+    factor = -(-picture.shape[1] // largest)
+    height, width = picture.shape[0] // factor, picture.shape[1] // factor
+    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def sampled(count: int, columns: int) -> list[int]:
+    """At most ``columns`` frame numbers below ``count``, evenly spread, the first and the last among them."""
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(columns, count))})
+
+
+def contact_sheet(
+    path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture, Picture]]], *, title: str
+) -> None:
+    """One picture file for a whole result: columns are frames; each camera has three rows.
+
+    The rows are truths, renderings, and their differences times four.
+
+    Args:
+        path: the PNG to write.
+        pictures: camera name to frame number to ``(truth, rendering)``, each ``[H, W, 3]`` uint8.
+        title: a line above everything.
+
+    Raises:
+        MissingExtraError: matplotlib, which writes the labels, is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtraError("matplotlib", "report") from None
+    side = 110  # for the row labels
+    bands = {name: _tiles(cells) for name, cells in pictures.items()}
+    columns = sorted({index for cells in pictures.values() for index in cells})
+    heights = {name: tiles[0][0].shape[0] for name, tiles in bands.items()}
+    tile_width = max(tiles[0][0].shape[1] for tiles in bands.values())
+    width = side + len(columns) * (tile_width + GAP) + MARGIN
+    height = 2 * LABEL + MARGIN + sum(3 * (h + GAP) + LABEL // 2 for h in heights.values())
+    figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
+    FigureCanvasAgg(figure)
+
+    def label(x: float, y: float, text: str, **style: Any) -> None:
+        figure.text(x / width, 1 - y / height, text, va="center", **style)
+
+    label(MARGIN, MARGIN + 6, title, fontsize=10, weight="bold", color="#222")
+    for number, index in enumerate(columns):
+        x = side + number * (tile_width + GAP) + tile_width / 2
+        label(x, 2 * LABEL - 8, f"frame {index}", ha="center", fontsize=9, color="#444")
+    top = 2 * LABEL
+    for name, tiles in bands.items():
+        for row, caption in enumerate(
+            (f"camera {name}\ntruth", "rendering", f"difference x{DIFFERENCE_GAIN}")
+        ):
+            label(side - 6, top + heights[name] / 2, caption, ha="right", fontsize=8, color="#444")
+            for number, cell in enumerate(tiles):
+                x, y = side + number * (tile_width + GAP), height - top - cell[row].shape[0]
+                # figimage puts pixels on pixels; an axes would resample them.
+                figure.figimage(cell[row], x, y, origin="upper")
+            top += heights[name] + GAP
+        top += LABEL // 2
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def _tiles(cells: Mapping[int, tuple[Picture, Picture]]) -> Sequence[tuple[Picture, Picture, Picture]]:
+    tiles = []
+    for index in sorted(cells):
+        truth, picture = cells[index]
+        tiles.append((thumbnail(truth), thumbnail(picture), thumbnail(difference(picture, truth))))
+    return tiles

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report over time, as one picture: quality, bytes, counts, seconds."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from structgstream.errors import MissingExtraError
+from structgstream.evaluation.report import FrameScores, Report
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito's colours, which all common kinds of colour vision tell apart.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#999999")
+INK, FAINT = "#222222", "#dddddd"
+
+
+def write_plots(path: Path, report: Report, *, title: str) -> None:
+    """Panels over the frame number: PSNR by camera, bytes by field, counts, and seconds by stage.
+
+    The last one is there when the trainer's log was.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtraError("matplotlib", "report") from None
+    panels: list[Callable[[Axes, Report], None]] = [_quality, _bytes, _counts]
+    if any(_stages(frame) for frame in report.frames):
+        panels.append(_seconds)
+    figure = Figure(figsize=(10, 2.6 * len(panels) + 0.6), dpi=110, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=11, fontweight="bold", color=INK)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        panel(axis, report)
+        axis.grid(axis="y", color=FAINT, linewidth=0.8)
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(labelsize=8)
+        axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
+    axes[-1].set_xlabel("frame", fontsize=9)
+    axes[-1].xaxis.get_major_locator().set_params(integer=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def _quality(axis: "Axes", report: Report) -> None:
+    index = [frame.index for frame in report.frames]
+    for number, name in enumerate(report.cameras):
+        values = [frame.cameras[name].psnr for frame in report.frames]
+        axis.plot(
+            index,
+            values,
+            color=COLOURS[number % len(COLOURS)],
+            linewidth=1,
+            alpha=0.75,
+            label=f"camera {name}",
+        )
+    if len(report.cameras) > 1:
+        axis.plot(index, [frame.mean.psnr for frame in report.frames], color=INK, linewidth=2, label="mean")
+    changed = [
+        (frame.index, frame.mean.psnr_changed)
+        for frame in report.frames
+        if frame.mean.psnr_changed is not None
+    ]
+    if changed:
+        axis.plot(*zip(*changed), color=INK, linewidth=1, linestyle=":", label="changed pixels")
+    axis.set_ylabel("PSNR, dB", fontsize=9)
+
+
+def _bytes(axis: "Axes", report: Report) -> None:
+    fields = {name: 0 for frame in report.frames for name in frame.field_bytes}
+    values = {
+        name: np.array([frame.field_bytes.get(name, 0) / 1000 for frame in report.frames]) for name in fields
+    }
+    _stacked(axis, [frame.index for frame in report.frames], values)
+    axis.set_ylabel("kB", fontsize=9)
+
+
+def _seconds(axis: "Axes", report: Report) -> None:
+    stages = {name: 0 for frame in report.frames for name in _stages(frame)}
+    values = {name: np.array([_stages(frame).get(name, 0.0) for frame in report.frames]) for name in stages}
+    online = [sum(_stages(frame).values()) for frame in report.frames if frame.index > 0]
+    _stacked(axis, [frame.index for frame in report.frames], values)
+    first = sum(_stages(report.frames[0]).values())
+    if online and first > 3 * max(online):
+        axis.set_ylim(0, 1.3 * max(online))
+        axis.annotate(
+            f"first frame: {first:.0f} s", (report.frames[0].index, 1.2 * max(online)), xytext=(8, 0),
+            textcoords="offset points", fontsize=8, color=INK, va="center",
+        )  # fmt: skip
+    axis.set_ylabel("seconds", fontsize=9)
+
+
+def _counts(axis: "Axes", report: Report) -> None:
+    index = [frame.index for frame in report.frames]
+    axis.plot(
+        index, [frame.anchors for frame in report.frames], color=COLOURS[0], linewidth=1.5, label="anchors"
+    )
+    axis.plot(
+        index,
+        [frame.free for frame in report.frames],
+        color=COLOURS[3],
+        linewidth=1.5,
+        label="free Gaussians",
+    )
+    axis.set_ylim(bottom=0)
+    axis.set_ylabel("count", fontsize=9)
+
+
+def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None:
+    """Bars on top of each other, the largest field lowest, those below a thousandth of the whole left out."""
+    whole = sum(array.sum() for array in values.values())
+    shown = sorted(
+        (name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum()
+    )
+    base = np.zeros(len(index))
+    for number, name in enumerate(shown):
+        colour = COLOURS[number % len(COLOURS)]
+        axis.bar(index, values[name], bottom=base, width=0.85, color=colour, label=name.replace("_", " "))
+        base = base + values[name]
+
+
+def _stages(frame: FrameScores) -> dict[str, float]:
+    return frame.log.get("seconds", {})

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an evaluation found, and the JSON it becomes, whose keys ``docs/evaluation.md`` lists."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.errors import StorageError
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of one picture, or their mean over several.
+
+    Args:
+        psnr: dB, the headline.
+        ssim: see ``metrics.ssim``.
+        psnr_affine: dB after the best affine change of colour towards the truth (``affine.py``).
+        psnr_changed: dB over the pixels that changed since the camera's first picture; None where there are
+            none.
+        psnr_still: dB over the others; None where there are none.
+        changed_share: share of the pixels that changed.
+        render_seconds: wall-clock time of the rendering, the picture in main memory.
+    """
+
+    psnr: float
+    ssim: float
+    psnr_affine: float
+    psnr_changed: float | None
+    psnr_still: float | None
+    changed_share: float
+    render_seconds: float
+
+
+@dataclass(frozen=True)
+class FrameScores:
+    """One frame of the stream.
+
+    Args:
+        index: frame number in the stream.
+        pts_seconds: presentation time.
+        kind: ``key`` or ``delta``.
+        bytes: length of the packet's record in the file.
+        field_bytes: bytes by field of the state table.
+        anchors: anchors of the decoded scene.
+        free: free Gaussians of the decoded scene.
+        cameras: scores by camera name.
+        mean: their mean.
+        log: what the trainer wrote down about the frame beside the stream; empty when that file is missing.
+    """
+
+    index: int
+    pts_seconds: float
+    kind: str
+    bytes: int
+    field_bytes: Mapping[str, int]
+    anchors: int
+    free: int
+    cameras: Mapping[str, Scores]
+    mean: Scores
+    log: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Report:
+    """An evaluation.
+
+    Args:
+        frames: one entry for each frame, in order.
+        cameras: mean over frames, by camera name.
+        mean: mean over all frames and cameras.
+        stream: facts of the file, sizes and the course of PSNR over time (``stream_facts``).
+        environment: the machine that rendered.
+    """
+
+    frames: Sequence[FrameScores]
+    cameras: Mapping[str, Scores]
+    mean: Scores
+    stream: Mapping[str, Any]
+    environment: Mapping[str, Any]
+
+
+def mean_scores(scores: Iterable[Scores]) -> Scores:
+    """The mean of each score; a None is left out, and the mean of Nones is None."""
+    rows = list(scores)
+    means = {}
+    for entry in fields(Scores):
+        values = [value for row in rows if (value := getattr(row, entry.name)) is not None]
+        means[entry.name] = float(np.mean(values)) if values else None
+    return Scores(**means)
+
+
+def slope(values: Sequence[float]) -> float:
+    """Slope of the least-squares line through ``values`` over their index; 0 for fewer than two."""
+    return float(np.polyfit(np.arange(len(values)), values, 1)[0]) if len(values) > 1 else 0.0
+
+
+def course(psnrs: Sequence[float]) -> dict[str, float]:
+    """How PSNR runs over the frames: first, last, worst, slope and the largest fall from the first, in dB."""
+    return {
+        "psnr_first": psnrs[0],
+        "psnr_last": psnrs[-1],
+        "psnr_worst": min(psnrs),
+        "drift_db_per_frame": slope(psnrs),
+        "drop_from_first_db": psnrs[0] - min(psnrs),
+    }
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """The report as plain values."""
+    packets = [frame.bytes for frame in report.frames]
+    seconds = [frame.log["total_seconds"] for frame in report.frames if "total_seconds" in frame.log]
+    mean = vars(report.mean) | {
+        "bytes": float(np.mean(packets)),
+        "free": float(np.mean([frame.free for frame in report.frames])),
+        "seconds": float(np.mean(seconds)) if seconds else None,
+    }
+    frames = [
+        {key: value for key, value in vars(frame).items() if key not in ("cameras", "mean", "log")}
+        | vars(frame.mean)
+        | {"cameras": {name: vars(scores) for name, scores in frame.cameras.items()}}
+        | {"log": dict(frame.log)}
+        for frame in report.frames
+    ]
+    return {
+        "mean": mean,
+        "cameras": {name: vars(scores) for name, scores in report.cameras.items()},
+        "stream": dict(report.stream),
+        "environment": dict(report.environment),
+        "frames": frames,
+    }
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes ``content`` as JSON and makes the folder when it is missing.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written ({error.strerror}).") from None

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the trainer knows and the stream does not carry: seconds by stage, memory, PSNR on training views.
+
+One JSON object a line in ``OUT.log.jsonl`` beside ``OUT.sgs``, written after each frame, so that a crash
+loses none and a resumed run appends.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from structgstream.errors import StorageError
+
+
+def log_path(stream: Path) -> Path:
+    """Where the log of a stream lies."""
+    return stream.with_suffix(".log.jsonl")
+
+
+def begin_log(stream: Path, *, frames: int = 0) -> None:
+    """Drops everything from frame ``frames`` on: all for a new run, what was never stored for a resumed one.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    kept = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
+    _write(log_path(stream), kept, mode="w")
+
+
+def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
+    """Adds one frame; ``entry`` has an ``index`` and plain values.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    _write(log_path(stream), [entry], mode="a")
+
+
+def read_log(stream: Path) -> dict[int, dict[str, Any]]:
+    """Frame number to entry; the later of two for one frame, and nothing for a line that a crash cut."""
+    try:
+        lines = log_path(stream).read_text().splitlines()
+    except OSError:
+        return {}
+    entries = {}
+    for line in lines:
+        try:
+            entry = json.loads(line)
+            entries[int(entry["index"])] = entry
+        except (ValueError, KeyError, TypeError):
+            continue
+    return entries
+
+
+def _write(path: Path, entries: list[Mapping[str, Any]] | list[dict[str, Any]], *, mode: str) -> None:
+    try:
+        with path.open(mode) as file:
+            file.writelines(json.dumps(entry) + "\n" for entry in entries)
+    except OSError as error:
+        raise StorageError(f"The log {path} cannot be written ({error.strerror}).") from None

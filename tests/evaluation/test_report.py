@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Means, slopes, the documented keys, and the plot."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+
+from structgstream.errors import StorageError
+from structgstream.evaluation.plots import write_plots
+from structgstream.evaluation.report import (
+    FrameScores,
+    Report,
+    Scores,
+    as_json,
+    course,
+    mean_scores,
+    slope,
+    write_json,
+)
+
+GOOD = Scores(30.0, 0.9, 31.0, None, 30.0, 0.0, 0.1)
+
+
+def small_report() -> Report:
+    frames = []
+    for index in range(4):
+        cameras = {
+            "left": replace(GOOD, psnr=30.0 - index, psnr_changed=20.0 if index else None),
+            "right": replace(GOOD, psnr=28.0 - index, psnr_changed=24.0 if index else None),
+        }
+        frames.append(
+            FrameScores(
+                index=index,
+                pts_seconds=index / 30,
+                kind="delta" if index else "key",
+                bytes=1000,
+                field_bytes={"anchor_positions": 800, "free": 100 * index},
+                anchors=50,
+                free=index,
+                cameras=cameras,
+                mean=mean_scores(cameras.values()),
+                log={
+                    "index": index,
+                    "seconds": {"render": 1.0},
+                    "total_seconds": 2.0,
+                    "peak_memory_bytes": 5,
+                },
+            )
+        )
+    by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in ("left", "right")}
+    facts = course([frame.mean.psnr for frame in frames])
+    return Report(frames, by_camera, mean_scores(frame.mean for frame in frames), facts, {"python": "3"})
+
+
+def test_means_skip_what_is_not_there() -> None:
+    mean = mean_scores([GOOD, replace(GOOD, psnr=32.0, psnr_changed=20.0)])
+    assert (mean.psnr, mean.psnr_changed) == (31.0, 20.0)
+    assert mean_scores([GOOD]).psnr_changed is None
+
+
+def test_the_course_of_psnr() -> None:
+    assert course([30.0, 29.0, 28.5, 29.5])["drop_from_first_db"] == 1.5
+    assert slope([30.0, 29.0, 28.0]) == pytest.approx(-1.0)
+    assert slope([30.0]) == 0.0
+
+
+def test_json_has_the_documented_keys(tmp_path: Path) -> None:
+    write_json(tmp_path / "deep" / "report.json", as_json(small_report()))
+    content = json.loads((tmp_path / "deep" / "report.json").read_text())
+    assert set(content) == {"mean", "cameras", "stream", "environment", "frames"}
+    scores = {"psnr", "ssim", "psnr_affine", "psnr_changed", "psnr_still", "changed_share", "render_seconds"}
+    assert set(content["mean"]) == scores | {"bytes", "free", "seconds"}
+    assert content["mean"]["psnr"] == pytest.approx(27.5)
+    assert content["mean"]["psnr_changed"] == pytest.approx(22.0)
+    assert content["mean"]["bytes"] == 1000
+    assert content["mean"]["seconds"] == 2.0
+    assert len(content["frames"]) == 4
+    assert set(content["frames"][0]) == scores | {
+        "index", "pts_seconds", "kind", "bytes", "field_bytes", "anchors", "free", "cameras", "log",
+    }  # fmt: skip
+    assert content["frames"][0]["psnr_changed"] is None
+    assert set(content["cameras"]["left"]) == scores
+    assert content["stream"]["drift_db_per_frame"] == pytest.approx(-1.0)
+
+
+def test_documented_keys_are_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
+    content = as_json(small_report())
+    for section in ("mean", "stream"):
+        for key in content[section]:
+            assert f"`{key}`" in text, key
+    for key in content["frames"][0]:
+        assert f"`{key}`" in text, key
+
+
+def test_a_report_that_cannot_be_stored_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        write_json(tmp_path / "file" / "report.json", {})
+
+
+def test_plots_have_a_panel_more_with_a_log(tmp_path: Path) -> None:
+    report = small_report()
+    write_plots(tmp_path / "with.png", report, title="a result")
+    write_plots(
+        tmp_path / "without.png",
+        replace(report, frames=[replace(frame, log={}) for frame in report.frames]),
+        title="a result",
+    )
+    heights = [cv2.imread(str(tmp_path / f"{name}.png")).shape[0] for name in ("with", "without")]
+    assert heights[0] > heights[1] > 500

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trainer's log survives crashes and resumed runs."""
+
+from pathlib import Path
+
+import pytest
+
+from structgstream.errors import StorageError
+from structgstream.evaluation.run_log import append_log, begin_log, log_path, read_log
+
+
+def test_lines_come_back_by_frame(tmp_path: Path) -> None:
+    stream = tmp_path / "ball.sgs"
+    assert read_log(stream) == {}
+    begin_log(stream)
+    for index in range(3):
+        append_log(stream, {"index": index, "seconds": {"render": 0.5}})
+    assert log_path(stream).name == "ball.log.jsonl"
+    assert sorted(read_log(stream)) == [0, 1, 2]
+    assert read_log(stream)[1]["seconds"] == {"render": 0.5}
+
+
+def test_a_cut_line_is_dropped_and_a_resumed_run_goes_on_after_it(tmp_path: Path) -> None:
+    stream = tmp_path / "ball.sgs"
+    begin_log(stream)
+    for index in range(3):
+        append_log(stream, {"index": index, "run": 1})
+    with log_path(stream).open("a") as file:
+        file.write('{"index": 3, "ru')
+    begin_log(stream, frames=2)
+    append_log(stream, {"index": 2, "run": 2})
+    assert [entry["run"] for entry in read_log(stream).values()] == [1, 1, 2]
+    assert len(log_path(stream).read_text().splitlines()) == 3
+
+
+def test_a_new_run_forgets_the_old_one(tmp_path: Path) -> None:
+    stream = tmp_path / "ball.sgs"
+    append_log(stream, {"index": 7})
+    begin_log(stream)
+    assert read_log(stream) == {}
+
+
+def test_a_folder_that_is_missing_is_said(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot be written"):
+        append_log(tmp_path / "no" / "ball.sgs", {"index": 0})
