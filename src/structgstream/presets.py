@@ -45,10 +45,7 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
 def decayed(rates: InitialRates, share: float) -> InitialRates:
     """The same first rates, every one of them falling to ``share`` of itself over the schedule."""
     return InitialRates(
-        **{
-            name: Rate(rate.initial, rate.initial * share)
-            for name, rate in vars(rates).items()
-        }
+        **{name: Rate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
     )
 
 
@@ -75,8 +72,15 @@ FAST = replace(
         iterations=1200,
         schedule_iterations=1200,
         coarse_iterations=700,
-        growth=GrowthConfig(collect_from=200, start=300, stop=1000, interval=100, eligible_count=20, prune_visits=40,
-                            max_anchors=40_000),
+        growth=GrowthConfig(
+            collect_from=200,
+            start=300,
+            stop=1000,
+            interval=100,
+            eligible_count=20,
+            prune_visits=40,
+            max_anchors=40_000,
+        ),
     ),
     online=replace(RIG.online, iterations=60, patching=replace(RIG.online.patching, iteration=30)),
 )
@@ -89,7 +93,9 @@ TINY = replace(
         iterations=60,
         schedule_iterations=60,
         coarse_iterations=30,
-        growth=GrowthConfig(collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4),
+        growth=GrowthConfig(
+            collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4
+        ),
     ),
     online=replace(FAST.online, iterations=10, patching=replace(FAST.online.patching, iteration=5)),
 )

@@ -38,7 +38,13 @@ def test_online(name: str) -> None:
     assert online.dynamic == PAPER_DYNAMIC
     rates = online.rates
     assert (rates.anchor_positions, rates.offset_scales, rates.covariance_mlp) == (4e-4, 5e-3, 4e-3)
-    free = (rates.free_means, rates.free_log_scales, rates.free_quats, rates.free_logit_opacities, rates.free_colors)
+    free = (
+        rates.free_means,
+        rates.free_log_scales,
+        rates.free_quats,
+        rates.free_logit_opacities,
+        rates.free_colors,
+    )
     assert free == (2e-4, 5e-3, 1e-3, 5e-2, 2.5e-3)
     assert rates.final_share == 1.0
 

@@ -80,4 +80,8 @@ def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
         visible = torch.tensor([0, 1, 2]) if step else torch.tensor([0, 1])
         structured = StructuredGaussians(none, none, none, none, none, none, raw[: len(visible)])
         statistics.add(structured, visible)
-    assert prunable(statistics, GrowthConfig()).tolist() == [True, False, False]  # The last was seen 80 times only.
+    assert prunable(statistics, GrowthConfig()).tolist() == [
+        True,
+        False,
+        False,
+    ]  # The last was seen 80 times only.

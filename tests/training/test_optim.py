@@ -46,5 +46,7 @@ def test_rows_come_and_go_with_their_state() -> None:
 def test_a_rate_of_zero_moves_nothing() -> None:
     parameters = Parameters.of(random_scene(3), trained=frozenset({"anchor_positions"}))
     before = parameters.values["anchor_positions"].detach().clone()
-    Adam(reference_backend()).step(parameters, {"anchor_positions": torch.ones(3, 3)}, {"anchor_positions": 0.0})
+    Adam(reference_backend()).step(
+        parameters, {"anchor_positions": torch.ones(3, 3)}, {"anchor_positions": 0.0}
+    )
     assert torch.equal(parameters.values["anchor_positions"], before)

@@ -17,7 +17,12 @@ def test_taking_apart_and_putting_together_changes_no_bit() -> None:
 
 
 def test_the_dynamic_fields_name_what_is_trained() -> None:
-    assert parameters_of_fields(PAPER_DYNAMIC) == {"anchor_positions", "offset_scales", "covariance_mlp", *FREE_ROWS}
+    assert parameters_of_fields(PAPER_DYNAMIC) == {
+        "anchor_positions",
+        "offset_scales",
+        "covariance_mlp",
+        *FREE_ROWS,
+    }
 
 
 def test_parameters_are_copies() -> None:
@@ -36,7 +41,9 @@ def test_empty_sets_are_not_trained() -> None:
 def test_the_gauge_holds_while_colour_is_trained() -> None:
     color = CameraColor(gains=torch.rand(3, 3) + 1.0, biases=torch.rand(3, 3))
     scene = replace(random_scene(), camera_color=color)
-    gauged = Parameters.of(scene, trained=frozenset({"camera_gains", "camera_biases"})).scene(scene).camera_color
+    gauged = (
+        Parameters.of(scene, trained=frozenset({"camera_gains", "camera_biases"})).scene(scene).camera_color
+    )
     assert torch.allclose(gauged.gains.mean(0), torch.ones(3))
     assert torch.allclose(gauged.biases.mean(0), torch.zeros(3), atol=1e-6)
 
@@ -44,4 +51,7 @@ def test_the_gauge_holds_while_colour_is_trained() -> None:
 def test_detached_scenes_carry_no_graph() -> None:
     scene = random_scene(free=2)
     trained = parameters_of_fields(PAPER_DYNAMIC)
-    assert not any(v.requires_grad for v in state_of(detached(Parameters.of(scene, trained=trained).scene(scene))).values())
+    assert not any(
+        v.requires_grad
+        for v in state_of(detached(Parameters.of(scene, trained=trained).scene(scene))).values()
+    )

@@ -9,9 +9,16 @@ from structgstream.training.statistics import GradientStatistics
 def rendering(ids: list[int], radii: list[float], *, width: int = 20, height: int = 10) -> Rendering:
     n = len(ids)
     gaussians = Gaussians(
-        torch.zeros(n, 3), torch.zeros(n, 4), torch.zeros(n, 3), torch.zeros(n), torch.zeros(n, 3), torch.tensor(ids)
+        torch.zeros(n, 3),
+        torch.zeros(n, 4),
+        torch.zeros(n, 3),
+        torch.zeros(n),
+        torch.zeros(n, 3),
+        torch.tensor(ids),
     )
-    return Rendering(torch.zeros(height, width, 3), torch.zeros(height, width), torch.tensor(radii), gaussians, None)
+    return Rendering(
+        torch.zeros(height, width, 3), torch.zeros(height, width), torch.tensor(radii), gaussians, None
+    )
 
 
 def test_pixels_become_normalised_device_units() -> None:

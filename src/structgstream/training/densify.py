@@ -42,7 +42,9 @@ class Densifier:
         c = self.config
         return c.start < iteration <= c.stop and iteration % c.interval == 0
 
-    def apply(self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator) -> tuple[int, int]:
+    def apply(
+        self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator
+    ) -> tuple[int, int]:
         """Grow, then prune; returns how many anchors were added and removed."""
         k = self.offsets_per_anchor
         new = grow(

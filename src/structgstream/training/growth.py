@@ -91,7 +91,9 @@ def grow(
     """
     k = anchors.offsets_per_anchor
     eligible = count > config.eligible_count
-    means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(-1, 3)
+    means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(
+        -1, 3
+    )
     added: list[NewAnchors] = []
     occupied = anchors.positions
     room = config.max_anchors - len(anchors)
@@ -123,7 +125,11 @@ def grow(
         added.append(NewAnchors(positions, positions.new_full((positions.shape[0],), cell), features))
         occupied = torch.cat([occupied, positions])
     if not added:
-        return NewAnchors(means.new_zeros(0, 3), means.new_zeros(0), anchors.features.new_zeros(0, anchors.features.shape[1]))
+        return NewAnchors(
+            means.new_zeros(0, 3),
+            means.new_zeros(0),
+            anchors.features.new_zeros(0, anchors.features.shape[1]),
+        )
     return NewAnchors(
         torch.cat([new.positions for new in added]),
         torch.cat([new.cell_sizes for new in added]),

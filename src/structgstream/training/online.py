@@ -21,8 +21,20 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import FREE_ROWS, ParameterName, Parameters, detached, parameters_of_fields
-from structgstream.training.patching import PatchingConfig, children_of, gaussians_by_id, parents_of, surviving
+from structgstream.training.parameters import (
+    FREE_ROWS,
+    ParameterName,
+    Parameters,
+    detached,
+    parameters_of_fields,
+)
+from structgstream.training.patching import (
+    PatchingConfig,
+    children_of,
+    gaussians_by_id,
+    parents_of,
+    surviving,
+)
 from structgstream.training.result import FitResult, Step, StepListener
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import LastPass, gradients_of, view_loss

@@ -12,7 +12,9 @@ from structgstream.kernels.backend import Backend
 from structgstream.training.parameters import ParameterName, Parameters
 
 BETAS = (0.9, 0.999)
-EPS = 1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.
+EPS = (
+    1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,10 @@ class Adam:
     steps: dict[ParameterName, int] = field(default_factory=dict)
 
     def step(
-        self, parameters: Parameters, gradients: Mapping[ParameterName, Tensor], rates: Mapping[ParameterName, float]
+        self,
+        parameters: Parameters,
+        gradients: Mapping[ParameterName, Tensor],
+        rates: Mapping[ParameterName, float],
     ) -> None:
         """Move every parameter that has a gradient and a positive rate."""
         for name, gradient in gradients.items():

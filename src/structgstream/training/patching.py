@@ -15,7 +15,9 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.views import View
 
-BIRTHS_PER_FRAME = 1 << 32  # Birth ids are frame * 2^32 + n, so they never repeat and need no state between frames.
+BIRTHS_PER_FRAME = (
+    1 << 32
+)  # Birth ids are frame * 2^32 + n, so they never repeat and need no state between frames.
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,9 @@ def _empty_like(scene: Scene) -> Gaussians:
     return Gaussians(none, none.new_zeros(0, 4), none, none.new_zeros(0), none, ids)
 
 
-def children_of(parents: Gaussians, *, frame_index: int, config: PatchingConfig, generator: torch.Generator) -> FreeGaussians:
+def children_of(
+    parents: Gaussians, *, frame_index: int, config: PatchingConfig, generator: torch.Generator
+) -> FreeGaussians:
     """One free Gaussian for each parent, drawn from N(mu, factor * Sigma).
 
     With Sigma = R S S^T R^T a draw is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the

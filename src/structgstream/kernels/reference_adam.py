@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adam (Kingma and Ba, 2015) in pure torch: the oracle of the optimiser step."""
+
+from torch import Tensor
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    lr: float,
+    step: int,
+    betas: tuple[float, float],
+    eps: float,
+    rows: Tensor | None = None,
+) -> None:
+    """Move ``param`` in place by one step, as ``torch.optim.Adam`` does.
+
+    Args:
+        param: any shape.
+        grad: like ``param``.
+        exp_avg: first moment, updated in place.
+        exp_avg_sq: second moment, updated in place.
+        lr: learning rate.
+        step: number of this step, from 1.
+        betas: decay of the moments.
+        eps: added to the root of the corrected second moment.
+        rows: ``[r]`` int64; only these rows (first dimension) are touched. None: all.
+    """
+    if rows is not None:
+        values = [tensor[rows] for tensor in (param, grad, exp_avg, exp_avg_sq)]
+        adam_step(*values, lr=lr, step=step, betas=betas, eps=eps)
+        for tensor, value in zip((param, exp_avg, exp_avg_sq), (values[0], values[2], values[3])):
+            tensor[rows] = value
+        return
+    exp_avg.mul_(betas[0]).add_(grad, alpha=1.0 - betas[0])
+    exp_avg_sq.mul_(betas[1]).addcmul_(grad, grad, value=1.0 - betas[1])
+    denominator = (exp_avg_sq / (1.0 - betas[1] ** step)).sqrt_().add_(eps)
+    param.addcdiv_(exp_avg, denominator, value=-lr / (1.0 - betas[0] ** step))

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The oracle: EWA splatting in pure torch, differentiable by autograd, at any floating-point precision.
+
+Definition (as gsplat 1.5): perspective projection of the covariance with the point clamped to 1.3 times the field of
+view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to back
+by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.raster_types import RasterOutput
+
+LOW_PASS_PIXELS = 0.3
+MIN_ALPHA = 1.0 / 255.0
+MAX_ALPHA = 0.999
+MIN_TRANSMITTANCE = 1e-4
+TILE_PIXELS = 16
+
+
+@dataclass(frozen=True)
+class _Projected:
+    means2d: Tensor  # [n, 2]
+    conics: Tensor  # [n, 3]: xx, xy, yy
+    depths: Tensor  # [n]
+    extents: Tensor  # [n, 2] half size of the box where alpha reaches 1/255
+    rows: Tensor  # [n] index into the input
+
+
+def _rotations(quats: Tensor) -> Tensor:
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        dim=1,
+    ).reshape(-1, 3, 3)
+
+
+def _project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    screen_offsets: Tensor | None,
+) -> _Projected:
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None]], dim=1)).all(1)
+    rows = ((points[:, 2] >= near) & (opacities >= MIN_ALPHA) & finite).nonzero()[:, 0]
+    points = points[rows]
+    x, y, z = points.unbind(1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
+    clamped_x = z * (x / z).clamp(-(cx / fx + margin_x), (width - cx) / fx + margin_x)
+    clamped_y = z * (y / z).clamp(-(cy / fy + margin_y), (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [fx / z, zero, -fx * clamped_x / z**2, zero, fy / z, -fy * clamped_y / z**2], dim=1
+    ).reshape(-1, 2, 3)
+    axes = jacobian @ viewmat[:3, :3] @ (_rotations(quats[rows]) * scales[rows][:, None])  # [n, 2, 3]
+    covariances = axes @ axes.transpose(1, 2)
+    xx, xy, yy = (
+        covariances[:, 0, 0] + LOW_PASS_PIXELS,
+        covariances[:, 0, 1],
+        covariances[:, 1, 1] + LOW_PASS_PIXELS,
+    )
+    determinant = xx * yy - xy * xy
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
+    if screen_offsets is not None:
+        means2d = means2d + screen_offsets[rows]
+    reach = 2.0 * torch.log(255.0 * opacities[rows].detach()).clamp(min=0.0)
+    extents = torch.stack([(reach * xx.detach()).sqrt(), (reach * yy.detach()).sqrt()], dim=1)
+    conics = torch.stack([yy, -xy, xx], dim=1) / determinant[:, None]
+    low, high = means2d.detach() - extents, means2d.detach() + extents
+    size = means2d.new_tensor([width, height])
+    seen = (
+        (determinant.detach() > 0) & (high > 0).all(1) & (low < size).all(1) & torch.isfinite(extents).all(1)
+    )
+    kept = seen.nonzero()[:, 0]
+    kept = kept[z.detach()[kept].argsort(stable=True)]
+    return _Projected(means2d[kept], conics[kept], z[kept], extents[kept], rows[kept])
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    background: Tensor | None = None,
+    screen_offsets: Tensor | None = None,
+) -> RasterOutput:
+    """Render Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
+
+    Args:
+        means: ``[N, 3]`` scene units.
+        quats: ``[N, 4]`` wxyz, normalised here.
+        scales: ``[N, 3]`` standard deviations.
+        opacities: ``[N]`` in (0, 1).
+        colors: ``[N, 3]``.
+        viewmat: ``[4, 4]`` world to camera.
+        K: ``[3, 3]`` pixels.
+        width: pixels.
+        height: pixels.
+        near: Gaussians with a smaller z are not drawn.
+        background: ``[3]``, black when None.
+        screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
+            gradient, by the same contract on every back-end.
+    """
+    projected = _project(means, quats, scales, opacities, viewmat, K, width, height, near, screen_offsets)
+    radii = means.new_zeros(means.shape[0], dtype=torch.float32)
+    radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
+    back = means.new_zeros(3) if background is None else background
+    low = projected.means2d.detach() - projected.extents
+    high = projected.means2d.detach() + projected.extents
+    bands, bands_alpha = [], []
+    for top in range(0, height, TILE_PIXELS):
+        bottom = min(top + TILE_PIXELS, height)
+        in_band = ((low[:, 1] < bottom) & (high[:, 1] > top)).nonzero()[:, 0]
+        tiles, tiles_alpha = [], []
+        for left in range(0, width, TILE_PIXELS):
+            right = min(left + TILE_PIXELS, width)
+            here = in_band[(low[in_band, 0] < right) & (high[in_band, 0] > left)]
+            image, alpha = _tile(projected, here, opacities, colors, left, right, top, bottom)
+            tiles.append(image + (1.0 - alpha)[..., None] * back)
+            tiles_alpha.append(alpha)
+        bands.append(torch.cat(tiles, dim=1))
+        bands_alpha.append(torch.cat(tiles_alpha, dim=1))
+    return RasterOutput(torch.cat(bands), torch.cat(bands_alpha), radii)
+
+
+def _tile(
+    projected: _Projected,
+    here: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    left: int,
+    right: int,
+    top: int,
+    bottom: int,
+) -> tuple[Tensor, Tensor]:
+    """Blend the Gaussians ``here``, ordered by depth, over one tile: ``[h, w, 3]`` and coverage ``[h, w]``."""
+    like = projected.means2d
+    if here.numel() == 0:
+        return colors.new_zeros(bottom - top, right - left, 3), colors.new_zeros(bottom - top, right - left)
+    xs = torch.arange(left, right, dtype=like.dtype, device=like.device) + 0.5
+    ys = torch.arange(top, bottom, dtype=like.dtype, device=like.device) + 0.5
+    dx = (xs[None, :] - like[here, 0, None])[:, None, :]  # [n, 1, w]
+    dy = (ys[None, :] - like[here, 1, None])[:, :, None]  # [n, h, 1]
+    xx, xy, yy = (projected.conics[here, i, None, None] for i in range(3))
+    power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
+    rows = projected.rows[here]
+    alpha = opacities[rows, None, None] * power.exp()
+    alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0.0)
+    after = (1.0 - alpha).cumprod(0)
+    # Transmittance only falls, so cutting where it would reach the limit is the same as stopping there.
+    blended = after.detach() > MIN_TRANSMITTANCE
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    weights = torch.where(blended, alpha * before, 0.0)
+    return torch.einsum("nhw,nc->hwc", weights, colors[rows]), weights.sum(0)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from dataclasses import fields, is_dataclass
+
+import pytest
+
+from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PRESETS, to_json
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_plain_json(name: str) -> None:
+    config = PRESETS[name]
+    assert json.loads(json.dumps(to_json(config), allow_nan=False)) == to_json(config)
+
+
+def test_the_named_defaults_exist() -> None:
+    assert DEFAULT_PRESET in PRESETS
+    assert DEMO_PRESET in PRESETS
+
+
+def frozen(value: object) -> bool:
+    if not is_dataclass(value):
+        return True
+    return type(value).__dataclass_params__.frozen and all(
+        frozen(getattr(value, f.name)) for f in fields(value)
+    )
+
+
+def test_configurations_are_values() -> None:
+    assert all(frozen(config) for config in PRESETS.values())
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_schedules_fit_their_length(name: str) -> None:
+    initial, online = PRESETS[name].initial, PRESETS[name].online
+    assert initial.coarse_iterations < initial.iterations
+    assert initial.growth.collect_from <= initial.growth.start < initial.growth.stop
+    assert online.patching.iteration < online.iterations

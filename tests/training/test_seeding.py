@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+import torch
+
+from structgstream.errors import CaptureError
+from structgstream.training.seeding import neighbour_distances, seeded_scene, voxel_centers
+
+
+def seeded(points: torch.Tensor, **options):
+    defaults = {
+        "cameras": 3,
+        "voxel_size": 0.1,
+        "offsets_per_anchor": 5,
+        "feature_width": 32,
+        "hidden_width": 32,
+        "distance_input": True,
+        "device": torch.device("cpu"),
+        "generator": torch.Generator().manual_seed(0),
+    }
+    return seeded_scene(points, **{**defaults, **options})
+
+
+def test_one_anchor_a_voxel() -> None:
+    points = torch.tensor([[0.01, 0.0, 0.0], [0.04, -0.04, 0.02], [0.09, 0.0, 0.0]])
+    centers = voxel_centers(points, 0.1)
+    assert torch.allclose(centers.sort(0).values, torch.tensor([[0.0, 0, 0], [0.1, 0, 0]]))
+
+
+def test_scales_start_at_the_distance_to_three_neighbours() -> None:
+    points = torch.rand(50, 3)
+    squared = torch.cdist(points.double(), points.double()).square().sort(dim=1).values[:, 1:4].mean(1)
+    assert torch.allclose(neighbour_distances(points).double(), squared.sqrt(), rtol=1e-5)
+
+
+def test_the_start_is_neutral() -> None:
+    scene = seeded(torch.rand(300, 3) * 2)
+    assert (scene.anchors.offsets == 0).all()
+    assert (scene.anchors.features == 0).all()
+    assert torch.equal(scene.anchors.log_base_scales, scene.anchors.log_offset_scales)
+    assert (scene.camera_color.gains == 1).all()
+    assert scene.mlps.covariance.w2.shape == (35, 32)
+    assert scene.mlps.opacity.w1.shape == (32, 36)
+    assert seeded(torch.rand(300, 3), distance_input=False).mlps.opacity.w1.shape == (32, 35)
+
+
+def test_the_seed_decides_the_weights() -> None:
+    points = torch.rand(100, 3)
+    assert torch.equal(seeded(points).mlps.color.w1, seeded(points).mlps.color.w1)
+    other = seeded(points, generator=torch.Generator().manual_seed(1))
+    assert not torch.equal(seeded(points).mlps.color.w1, other.mlps.color.w1)
+
+
+def test_points_in_one_voxel_are_not_a_scene() -> None:
+    with pytest.raises(CaptureError, match="at least 4"):
+        seeded(torch.rand(100, 3) * 0.01)
