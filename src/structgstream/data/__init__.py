@@ -3,6 +3,7 @@
 
 from structgstream.data.clip import bundled_clip
 from structgstream.data.open import open_capture
+from structgstream.data.prefetch import Prefetch
 from structgstream.data.source import FrameSource
 
-__all__ = ["FrameSource", "bundled_clip", "open_capture"]
+__all__ = ["FrameSource", "Prefetch", "bundled_clip", "open_capture"]

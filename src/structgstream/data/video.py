@@ -150,7 +150,7 @@ def synchronised(
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack]) -> float | None:
-    """Frames a second by the time stamps: robust to missing frames, exact for usual rates, None for stills."""
+    """Frames a second by time stamp: robust to missing frames, exact for usual rates, None for one frame."""
     rates = []
     for track in tracks.values():
         if len(track.stamps) < 2:
