@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from rigs import arc_rig, random_scene
 
+from rigs import arc_rig, random_scene
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians, concatenate

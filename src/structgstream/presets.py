@@ -44,9 +44,7 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
 
 def decayed(rates: InitialRates, share: float) -> InitialRates:
     """The same first rates, every one of them falling to ``share`` of itself over the schedule."""
-    return InitialRates(
-        **{name: Rate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
-    )
+    return InitialRates(**{name: Rate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()})
 
 
 PAPER = StreamConfig()
@@ -93,9 +91,7 @@ TINY = replace(
         iterations=60,
         schedule_iterations=60,
         coarse_iterations=30,
-        growth=GrowthConfig(
-            collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4
-        ),
+        growth=GrowthConfig(collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4),
     ),
     online=replace(FAST.online, iterations=10, patching=replace(FAST.online.patching, iteration=5)),
 )

@@ -40,22 +40,14 @@ def test_everything_public_says_what_it_is() -> None:
         tree = ast.parse(path.read_text())
         for node in [tree, *tree.body]:
             documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-            if (
-                documented
-                and not getattr(node, "name", "public").startswith("_")
-                and not ast.get_docstring(node)
-            ):
+            if documented and not getattr(node, "name", "public").startswith("_") and not ast.get_docstring(node):
                 silent.append(f"{path.name}:{getattr(node, 'name', 'module')}")
     assert not [entry for entry in silent if entry != "__init__.py:module"]
 
 
 def test_every_source_states_its_licence() -> None:
     texts = {path: path.read_text() for path in SOURCES}
-    assert not [
-        path.name
-        for path, text in texts.items()
-        if text and "SPDX-License-Identifier: Apache-2.0" not in text
-    ]
+    assert not [path.name for path, text in texts.items() if text and "SPDX-License-Identifier: Apache-2.0" not in text]
 
 
 def test_architecture_names_every_package() -> None:

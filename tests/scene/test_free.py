@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
-from rigs import random_scene
 
+from rigs import random_scene
 from structgstream.scene.free import FreeGaussians
 
 

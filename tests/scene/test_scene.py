@@ -2,8 +2,8 @@
 from dataclasses import replace
 
 import torch
-from rigs import arc_rig, random_scene
 
+from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 
 

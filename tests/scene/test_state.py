@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
-from rigs import random_scene
 
+from rigs import random_scene
 from structgstream.scene.state import FREE_COLUMNS, PAPER_DYNAMIC, STATE_TABLE, scene_of, state_of
 
 
@@ -21,7 +21,7 @@ def test_codes_are_never_shared() -> None:
 
 def test_the_papers_lifetimes() -> None:
     """Section Structured 3DGs: x_v, l_v and F_Sigma change after frame 0, O_v, f_v, F_alpha and F_c do not."""
-    assert PAPER_DYNAMIC == {"anchor_positions", "offset_scales", "covariance_mlp", "free", "free_births"}
+    assert {"anchor_positions", "offset_scales", "covariance_mlp", "free", "free_births"} == PAPER_DYNAMIC
 
 
 def test_size_of_the_covariance_mlp() -> None:

@@ -2,15 +2,18 @@
 from dataclasses import replace
 
 import torch
-from rigs import random_scene
 
+from rigs import random_scene
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
 
 VOXEL = 0.01
 
 
-def grown(anchors, gradient, count, *, config=GrowthConfig(), seed=0):
+DEFAULT = GrowthConfig()
+
+
+def grown(anchors, gradient, count, *, config=DEFAULT, seed=0):
     return grow(
         anchors,
         mean_gradient=gradient,

@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from worlds import moving_world, psnr, rendered
 
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
@@ -12,6 +11,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import state_of
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
+from worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
     iterations=120,

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 import torch
-from rigs import random_scene
 
+from rigs import random_scene
 from structgstream.training.losses import LossWeights, offset_distance, volume
 
 
@@ -26,19 +26,11 @@ def test_offset_distance_counts_what_is_beyond_two_voxels(reading: str) -> None:
     anchors = random_scene().anchors
     offsets = anchors.offsets.double().numpy()
     scaled = offsets * np.exp(anchors.log_offset_scales.double().numpy())[:, None]
-    length = {"raw": np.abs(offsets), "scaled": np.abs(scaled), "norm": np.linalg.norm(scaled, axis=-1)}[
-        reading
-    ]
+    length = {"raw": np.abs(offsets), "scaled": np.abs(scaled), "norm": np.linalg.norm(scaled, axis=-1)}[reading]
     eps = 0.03
-    expected = np.where(
-        length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0
-    ).sum()  # theta(O - 2 eps) ||O - 2 eps||
-    weights = LossWeights(
-        offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum"
-    )
-    assert offset_distance(anchors, voxel_size=eps, weights=weights).item() == pytest.approx(
-        expected, rel=1e-5
-    )
+    expected = np.where(length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0).sum()  # theta(O - 2 eps) ||O - 2 eps||
+    weights = LossWeights(offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum")
+    assert offset_distance(anchors, voxel_size=eps, weights=weights).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_offsets_within_two_voxels_cost_nothing() -> None:

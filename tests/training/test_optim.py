@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 import torch
-from rigs import random_scene
 
+from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.optim import BETAS, EPS, Adam, Rate, constant
 from structgstream.training.parameters import Parameters
@@ -46,7 +46,5 @@ def test_rows_come_and_go_with_their_state() -> None:
 def test_a_rate_of_zero_moves_nothing() -> None:
     parameters = Parameters.of(random_scene(3), trained=frozenset({"anchor_positions"}))
     before = parameters.values["anchor_positions"].detach().clone()
-    Adam(reference_backend()).step(
-        parameters, {"anchor_positions": torch.ones(3, 3)}, {"anchor_positions": 0.0}
-    )
+    Adam(reference_backend()).step(parameters, {"anchor_positions": torch.ones(3, 3)}, {"anchor_positions": 0.0})
     assert torch.equal(parameters.values["anchor_positions"], before)

@@ -2,8 +2,8 @@
 from dataclasses import replace
 
 import torch
-from rigs import random_scene
 
+from rigs import random_scene
 from structgstream.scene.color import CameraColor
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields
@@ -41,9 +41,7 @@ def test_empty_sets_are_not_trained() -> None:
 def test_the_gauge_holds_while_colour_is_trained() -> None:
     color = CameraColor(gains=torch.rand(3, 3) + 1.0, biases=torch.rand(3, 3))
     scene = replace(random_scene(), camera_color=color)
-    gauged = (
-        Parameters.of(scene, trained=frozenset({"camera_gains", "camera_biases"})).scene(scene).camera_color
-    )
+    gauged = Parameters.of(scene, trained=frozenset({"camera_gains", "camera_biases"})).scene(scene).camera_color
     assert torch.allclose(gauged.gains.mean(0), torch.ones(3))
     assert torch.allclose(gauged.biases.mean(0), torch.zeros(3), atol=1e-6)
 
@@ -52,6 +50,5 @@ def test_detached_scenes_carry_no_graph() -> None:
     scene = random_scene(free=2)
     trained = parameters_of_fields(PAPER_DYNAMIC)
     assert not any(
-        v.requires_grad
-        for v in state_of(detached(Parameters.of(scene, trained=trained).scene(scene))).values()
+        v.requires_grad for v in state_of(detached(Parameters.of(scene, trained=trained).scene(scene))).values()
     )

@@ -2,8 +2,8 @@
 from dataclasses import replace
 
 import torch
-from rigs import arc_rig, random_scene
 
+from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
@@ -32,9 +32,7 @@ def parents(count: int) -> Gaussians:
         colors=torch.tensor([[0.1, 0.2, 0.3]]),
         ids=torch.tensor([0]),
     )
-    return Gaussians(
-        **{name: getattr(one, name).expand(count, *getattr(one, name).shape[1:]) for name in vars(one)}
-    )
+    return Gaussians(**{name: getattr(one, name).expand(count, *getattr(one, name).shape[1:]) for name in vars(one)})
 
 
 def test_children_are_drawn_from_two_sigma() -> None:
@@ -92,9 +90,7 @@ def test_pruning_by_opacity() -> None:
 
 def test_parents_are_found_in_the_first_view_that_draws_them() -> None:
     scene, rig, backend = random_scene(free=5), arc_rig(), reference_backend()
-    views = [
-        View(i, rig[name], torch.zeros(32, 48, 3, dtype=torch.uint8)) for i, name in enumerate(rig.training)
-    ]
+    views = [View(i, rig[name], torch.zeros(32, 48, 3, dtype=torch.uint8)) for i, name in enumerate(rig.training)]
     first = scene.gaussians(views[0].camera, backend)
     ids = torch.cat([first.ids[::7], first.ids[-2:]]).unique()
     found = gaussians_by_id(scene, views, ids, backend)

@@ -16,9 +16,7 @@ def rendering(ids: list[int], radii: list[float], *, width: int = 20, height: in
         torch.zeros(n, 3),
         torch.tensor(ids),
     )
-    return Rendering(
-        torch.zeros(height, width, 3), torch.zeros(height, width), torch.tensor(radii), gaussians, None
-    )
+    return Rendering(torch.zeros(height, width, 3), torch.zeros(height, width), torch.tensor(radii), gaussians, None)
 
 
 def test_pixels_become_normalised_device_units() -> None:

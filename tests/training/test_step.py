@@ -3,8 +3,8 @@ import math
 
 import pytest
 import torch
-from rigs import arc_rig, random_scene
 
+from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.training.losses import LossWeights

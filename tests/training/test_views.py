@@ -3,8 +3,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 import torch
-from rigs import arc_rig
 
+from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.training.views import View, reduced, shuffled_views, training_views
 

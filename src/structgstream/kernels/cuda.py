@@ -18,7 +18,7 @@ def cuda_reason() -> str | None:
     """Why the back-end is not available on this machine, with the way to get it; None when it is."""
     if not torch.cuda.is_available():
         built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
-        return f"torch sees no NVIDIA GPU (torch {torch.__version__}, {built}); install a driver and a CUDA build of torch."
+        return f"torch {torch.__version__}, {built}, sees no NVIDIA GPU; install a driver and a CUDA build of torch."
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed; install it with: pip install 'structgstream[cuda]'"
     return None
@@ -69,9 +69,7 @@ def rasterize(
         means2d = means2d + screen_offsets[None]
     tiles_x = (width + TILE_PIXELS - 1) // TILE_PIXELS
     tiles_y = (height + TILE_PIXELS - 1) // TILE_PIXELS
-    _, pair_ids, flat_ids = isect_tiles(
-        means2d, radii, depths, TILE_PIXELS, tiles_x, tiles_y, packed=False, n_images=1
-    )
+    _, pair_ids, flat_ids = isect_tiles(means2d, radii, depths, TILE_PIXELS, tiles_x, tiles_y, packed=False, n_images=1)
     tile_starts = isect_offset_encode(pair_ids, 1, tiles_x, tiles_y).reshape(1, tiles_y, tiles_x)
     image, alpha = rasterize_to_pixels(
         means2d,

@@ -2,8 +2,8 @@
 """The oracle: EWA splatting in pure torch, differentiable by autograd, at any floating-point precision.
 
 Definition (as gsplat 1.5): perspective projection of the covariance with the point clamped to 1.3 times the field of
-view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to back
-by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5.
+view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to
+back by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5.
 """
 
 from dataclasses import dataclass
@@ -69,9 +69,9 @@ def _project(
     clamped_x = z * (x / z).clamp(-(cx / fx + margin_x), (width - cx) / fx + margin_x)
     clamped_y = z * (y / z).clamp(-(cy / fy + margin_y), (height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [fx / z, zero, -fx * clamped_x / z**2, zero, fy / z, -fy * clamped_y / z**2], dim=1
-    ).reshape(-1, 2, 3)
+    jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z**2, zero, fy / z, -fy * clamped_y / z**2], dim=1).reshape(
+        -1, 2, 3
+    )
     axes = jacobian @ viewmat[:3, :3] @ (_rotations(quats[rows]) * scales[rows][:, None])  # [n, 2, 3]
     covariances = axes @ axes.transpose(1, 2)
     xx, xy, yy = (
@@ -88,9 +88,7 @@ def _project(
     conics = torch.stack([yy, -xy, xx], dim=1) / determinant[:, None]
     low, high = means2d.detach() - extents, means2d.detach() + extents
     size = means2d.new_tensor([width, height])
-    seen = (
-        (determinant.detach() > 0) & (high > 0).all(1) & (low < size).all(1) & torch.isfinite(extents).all(1)
-    )
+    seen = (determinant.detach() > 0) & (high > 0).all(1) & (low < size).all(1) & torch.isfinite(extents).all(1)
     kept = seen.nonzero()[:, 0]
     kept = kept[z.detach()[kept].argsort(stable=True)]
     return _Projected(means2d[kept], conics[kept], z[kept], extents[kept], rows[kept])

@@ -95,9 +95,7 @@ def state_of(scene: Scene) -> dict[FieldName, Tensor]:
         "opacity_mlp": flatten_head(scene.mlps.opacity),
         "color_mlp": flatten_head(scene.mlps.color),
         "covariance_mlp": flatten_head(scene.mlps.covariance),
-        "free": torch.cat(
-            [free.means, free.log_scales, free.quats, free.logit_opacities[:, None], free.colors], dim=1
-        ),
+        "free": torch.cat([free.means, free.log_scales, free.quats, free.logit_opacities[:, None], free.colors], dim=1),
         "free_births": free.births,
         "camera_color": torch.cat([color.gains, color.biases], dim=1),
     }
@@ -113,9 +111,7 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
     means, log_scales, quats, logits, colors = state["free"].split((3, 3, 4, 1, 3), dim=1)
     gains, biases = state["camera_color"].split((3, 3), dim=1)
     return Scene(
-        anchors=AnchorCloud(
-            state["anchor_positions"], state["offset_scales"], state["base_scales"], offsets, features
-        ),
+        anchors=AnchorCloud(state["anchor_positions"], state["offset_scales"], state["base_scales"], offsets, features),
         mlps=MLPWeights(
             opacity=unflatten_head(state["opacity_mlp"], inputs, k, hidden),
             color=unflatten_head(state["color_mlp"], inputs, 3 * k, hidden),

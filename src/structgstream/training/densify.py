@@ -17,7 +17,7 @@ from structgstream.training.statistics import GradientStatistics
 class Densifier:
     """Statistics of frame 0 and the surgery they ask for.
 
-    The clamp of the base scales is Scaffold-GS's: at most ``exp(0.05)`` scene units, applied whenever anchors are pruned.
+    The clamp of the base scales is Scaffold-GS's: at most ``exp(0.05)`` scene units, whenever anchors are pruned.
     """
 
     config: GrowthConfig
@@ -42,9 +42,7 @@ class Densifier:
         c = self.config
         return c.start < iteration <= c.stop and iteration % c.interval == 0
 
-    def apply(
-        self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator
-    ) -> tuple[int, int]:
+    def apply(self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator) -> tuple[int, int]:
         """Grow, then prune; returns how many anchors were added and removed."""
         k = self.offsets_per_anchor
         new = grow(

@@ -23,7 +23,7 @@ class GrowthConfig:
     interval: int = 100
     """Iterations between changes."""
     grad_threshold: float = 2e-4
-    """Mean view-space gradient (NDC) from which a Gaussian asks for an anchor at the coarsest level; doubles a level."""
+    """Mean view-space gradient (NDC) from which a Gaussian asks for a coarse anchor; doubles with each level."""
     levels: int = 3
     """Cell sizes: 16, 4 and 1 voxels."""
     eligible_count: int = 40
@@ -91,9 +91,7 @@ def grow(
     """
     k = anchors.offsets_per_anchor
     eligible = count > config.eligible_count
-    means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(
-        -1, 3
-    )
+    means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(-1, 3)
     added: list[NewAnchors] = []
     occupied = anchors.positions
     room = config.max_anchors - len(anchors)

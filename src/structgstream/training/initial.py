@@ -124,9 +124,7 @@ def fit_first_frame(
         device=backend.device,
         generator=generator,
     )
-    trained: set[ParameterName] = {
-        name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0
-    }
+    trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
     if not config.camera_color:
         trained -= {"camera_gains", "camera_biases"}
     parameters = Parameters.of(template, trained=frozenset(trained))

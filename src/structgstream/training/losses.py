@@ -27,7 +27,7 @@ class LossWeights:
     offset_distance_reduction: Literal["mean", "sum"] = "mean"
     """The paper's equation is a sum over anchors and offsets."""
     offset_distance_reading: Literal["scaled", "raw", "norm"] = "scaled"
-    """What is compared with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the length of O * l_v."""
+    """Compared with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the length of O * l_v."""
 
 
 def volume(scales: Tensor, *, reduction: Literal["mean", "sum"]) -> Tensor:

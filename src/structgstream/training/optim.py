@@ -12,9 +12,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.training.parameters import ParameterName, Parameters
 
 BETAS = (0.9, 0.999)
-EPS = (
-    1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.
-)
+EPS = 1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.
 
 
 @dataclass(frozen=True)

@@ -95,8 +95,7 @@ class Parameters:
             "camera_biases": scene.camera_color.biases,
         }
         copies = {
-            name: value.detach().clone().contiguous().requires_grad_(name in trained)
-            for name, value in values.items()
+            name: value.detach().clone().contiguous().requires_grad_(name in trained) for name, value in values.items()
         }
         return cls(values=copies, births=free.births.clone(), distance_input=scene.distance_input)
 
@@ -105,9 +104,7 @@ class Parameters:
         """Names that collect gradients, in a fixed order, without those that are empty."""
         return [name for name, value in self.values.items() if value.requires_grad and value.numel()]
 
-    def replace_rows(
-        self, names: Iterable[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor]
-    ) -> None:
+    def replace_rows(self, names: Iterable[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor]) -> None:
         """Keep the rows ``keep`` (mask) of each name and append ``added[name]``."""
         for name in names:
             old = self.values[name]

@@ -15,9 +15,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.views import View
 
-BIRTHS_PER_FRAME = (
-    1 << 32
-)  # Birth ids are frame * 2^32 + n, so they never repeat and need no state between frames.
+BIRTHS_PER_FRAME = 1 << 32  # Birth ids are frame * 2^32 + n, so they never repeat and need no state between frames.
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,7 @@ class View:
 
 def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) -> list[View]:
     """The frame's training views in rig order; held-out pictures are not touched."""
-    return [
-        View(i, rig[name], torch.from_numpy(frame.images[name]).to(device))
-        for i, name in enumerate(rig.training)
-    ]
+    return [View(i, rig[name], torch.from_numpy(frame.images[name]).to(device)) for i, name in enumerate(rig.training)]
 
 
 def reduced(view: View, scale: float) -> View:
