@@ -2,7 +2,7 @@
 """A scene taken apart into the tensors that an optimiser moves, and put together again."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, flatten_head, unflatten_head
+from structgstream.scene.state import FieldName, flatten_head, scene_of, state_of, unflatten_head
 
 ParameterName = Literal[
     "anchor_positions",
@@ -94,7 +94,7 @@ class Parameters:
             "camera_gains": scene.camera_color.gains,
             "camera_biases": scene.camera_color.biases,
         }
-        copies = {
+        copies: dict[ParameterName, Tensor] = {
             name: value.detach().clone().contiguous().requires_grad_(name in trained) for name, value in values.items()
         }
         return cls(values=copies, births=free.births.clone(), distance_input=scene.distance_input)
@@ -149,14 +149,5 @@ class Parameters:
 
 def detached(scene: Scene) -> Scene:
     """The same scene without a gradient graph."""
-
-    def plain(value: object) -> object:
-        if isinstance(value, Tensor):
-            return value.detach().contiguous()
-        if isinstance(value, tuple):
-            return type(value)(*(plain(item) for item in value))
-        if hasattr(value, "__dataclass_fields__"):
-            return replace(value, **{f.name: plain(getattr(value, f.name)) for f in fields(value)})  # type: ignore[type-var]
-        return value
-
-    return plain(scene)  # type: ignore[return-value]
+    state: dict[FieldName, Tensor] = {name: value.detach().contiguous() for name, value in state_of(scene).items()}
+    return scene_of(state, distance_input=scene.distance_input)

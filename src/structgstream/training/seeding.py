@@ -23,11 +23,11 @@ def voxel_centers(points: Tensor, voxel_size: float) -> Tensor:
 def neighbour_distances(points: Tensor) -> Tensor:
     """Root of the mean squared distance of each point to its three nearest neighbours, ``[M]``."""
     try:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
     values = points.double().numpy(force=True)
-    distances, _ = cKDTree(values).query(values, k=min(4, len(values)))
+    distances, _ = KDTree(values).query(values, k=min(4, len(values)))
     squared = np.square(np.atleast_2d(distances)[:, 1:]).mean(axis=1)
     return torch.from_numpy(np.sqrt(np.maximum(squared, 1e-7))).to(points)
 

@@ -76,7 +76,9 @@ def gradients_of(
     screen = loss.rendering.screen_offsets
     with watch.stage("backward"):
         found = torch.autograd.grad(loss.total, [*inputs, screen] if screen is not None else inputs, allow_unused=True)
-    by_name = {name: grad for name, grad in zip(names, found, strict=False) if grad is not None}
+    by_name: dict[ParameterName, Tensor] = {
+        name: grad for name, grad in zip(names, found, strict=False) if grad is not None
+    }
     return by_name, found[-1] if screen is not None else None
 
 
