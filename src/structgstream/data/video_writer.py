@@ -4,7 +4,7 @@
 from contextlib import AbstractContextManager
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
+from types import ModuleType, TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +32,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
     """
 
     def __init__(self, path: Path, *, fps: float, crf: int = 18) -> None:
-        try:
-            import av
-        except ImportError:
-            raise MissingExtraError("av", "capture") from None
+        av = _av()
         self.path = path
         self._part = path.with_name(path.name + ".part")
         self._fps = Fraction(fps).limit_denominator(1001)
@@ -96,3 +93,11 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
             self._container.mux(self._stream.encode(frame))  # pyright: ignore[reportArgumentType]
         except (OSError, self._av.error.FFmpegError) as error:
             raise StorageError(f"The video {self.path} cannot be written ({error.strerror}).") from None
+
+
+def _av() -> ModuleType:
+    try:
+        import av
+    except ImportError:
+        raise MissingExtraError("av", "capture") from None
+    return av

@@ -82,17 +82,13 @@ def evaluate(
             truth = frame.images[name]
             first.setdefault(name, truth)
             picture, seconds = rendered(scene, views[name], backend)
-            compared.append(
-                Compared(name, truth, picture, score(picture, truth, first[name], seconds=seconds))
-            )
+            compared.append(Compared(name, truth, picture, score(picture, truth, first[name], seconds=seconds)))
             if observer is not None:
                 observer(info.index, compared[-1])
         frames.append(_frame_scores(info, scene, compared, dict((log or {}).get(info.index, {}))))
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in names}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
-    facts = (
-        stream_facts(reader, names) | course([frame.mean.psnr for frame in frames]) | _training_facts(frames)
-    )
+    facts = stream_facts(reader, names) | course([frame.mean.psnr for frame in frames]) | _training_facts(frames)
     return Report(frames, by_camera, mean, facts, environment() | {"backend": backend.name})
 
 
@@ -155,10 +151,7 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
                 f"Camera {name!r} has {theirs.width}x{theirs.height} pixels in the capture {source.name} and "
                 f"{ours.width}x{ours.height} in the stream; give the --scale of the reconstruction."
             )
-        if not (
-            torch.allclose(theirs.viewmat, ours.viewmat, atol=1e-4)
-            and torch.allclose(theirs.K, ours.K, atol=0.1)
-        ):
+        if not (torch.allclose(theirs.viewmat, ours.viewmat, atol=1e-4) and torch.allclose(theirs.K, ours.K, atol=0.1)):
             raise CaptureError(
                 f"Camera {name!r} of the capture {source.name} has another calibration than in the stream; "
                 "evaluate the stream on the capture it was made from."
@@ -207,9 +200,7 @@ def compared_frames(
         yield frame.images[camera], rendered(scene, view, backend)[0]
 
 
-def _frame_scores(
-    info: PacketInfo, scene: Scene, compared: list[Compared], log: dict[str, Any]
-) -> FrameScores:
+def _frame_scores(info: PacketInfo, scene: Scene, compared: list[Compared], log: dict[str, Any]) -> FrameScores:
     scores = {entry.camera: entry.scores for entry in compared}
     return FrameScores(
         index=info.index,

@@ -41,9 +41,7 @@ def sampled(count: int, columns: int) -> list[int]:
     return sorted({round(i) for i in np.linspace(0, count - 1, min(columns, count))})
 
 
-def contact_sheet(
-    path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture, Picture]]], *, title: str
-) -> None:
+def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture, Picture]]], *, title: str) -> None:
     """One picture file for a whole result: columns are frames; each camera has three rows.
 
     The rows are truths, renderings, and their differences times four.
@@ -80,9 +78,7 @@ def contact_sheet(
         label(x, 2 * LABEL - 8, f"frame {index}", ha="center", fontsize=9, color="#444")
     top = 2 * LABEL
     for name, tiles in bands.items():
-        for row, caption in enumerate(
-            (f"camera {name}\ntruth", "rendering", f"difference x{DIFFERENCE_GAIN}")
-        ):
+        for row, caption in enumerate((f"camera {name}\ntruth", "rendering", f"difference x{DIFFERENCE_GAIN}")):
             label(side - 6, top + heights[name] / 2, caption, ha="right", fontsize=8, color="#444")
             for number, cell in enumerate(tiles):
                 x, y = side + number * (tile_width + GAP), height - top - cell[row].shape[0]

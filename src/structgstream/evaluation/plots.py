@@ -65,11 +65,7 @@ def _quality(axis: "Axes", report: Report) -> None:
         )
     if len(report.cameras) > 1:
         axis.plot(index, [frame.mean.psnr for frame in report.frames], color=INK, linewidth=2, label="mean")
-    changed = [
-        (frame.index, frame.mean.psnr_changed)
-        for frame in report.frames
-        if frame.mean.psnr_changed is not None
-    ]
+    changed = [(frame.index, frame.mean.psnr_changed) for frame in report.frames if frame.mean.psnr_changed is not None]
     if changed:
         axis.plot(*zip(*changed), color=INK, linewidth=1, linestyle=":", label="changed pixels")
     axis.set_ylabel("PSNR, dB", fontsize=9)
@@ -77,9 +73,7 @@ def _quality(axis: "Axes", report: Report) -> None:
 
 def _bytes(axis: "Axes", report: Report) -> None:
     fields = {name: 0 for frame in report.frames for name in frame.field_bytes}
-    values = {
-        name: np.array([frame.field_bytes.get(name, 0) / 1000 for frame in report.frames]) for name in fields
-    }
+    values = {name: np.array([frame.field_bytes.get(name, 0) / 1000 for frame in report.frames]) for name in fields}
     _stacked(axis, [frame.index for frame in report.frames], values)
     axis.set_ylabel("kB", fontsize=9)
 
@@ -101,9 +95,7 @@ def _seconds(axis: "Axes", report: Report) -> None:
 
 def _counts(axis: "Axes", report: Report) -> None:
     index = [frame.index for frame in report.frames]
-    axis.plot(
-        index, [frame.anchors for frame in report.frames], color=COLOURS[0], linewidth=1.5, label="anchors"
-    )
+    axis.plot(index, [frame.anchors for frame in report.frames], color=COLOURS[0], linewidth=1.5, label="anchors")
     axis.plot(
         index,
         [frame.free for frame in report.frames],
@@ -118,9 +110,7 @@ def _counts(axis: "Axes", report: Report) -> None:
 def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None:
     """Bars on top of each other, the largest field lowest, those below a thousandth of the whole left out."""
     whole = sum(array.sum() for array in values.values())
-    shown = sorted(
-        (name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum()
-    )
+    shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
     for number, name in enumerate(shown):
         colour = COLOURS[number % len(COLOURS)]

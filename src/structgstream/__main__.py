@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m structgstream`` is ``structgstream``."""
+
+import sys
+
+from structgstream.cli import main
+
+sys.exit(main())

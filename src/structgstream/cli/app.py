@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the command, runs it, and turns what goes wrong into one sentence and an exit status.
+
+Only the standard library is imported here, so that ``structgstream --help`` answers at once.
+"""
+
+import difflib
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+
+from structgstream.errors import StructGStreamError
+
+COMMANDS = {
+    "demo": "reconstruct the bundled clip and show everything there is to see",
+    "reconstruct": "turn a capture into a stream, frame by frame",
+    "evaluate": "score a stream against the cameras that training did not see",
+    "render": "render a camera or a camera path to mp4 or PNG",
+    "inspect": "show what a stream file holds",
+    "doctor": "show what this machine has, what is missing, and how to mend it",
+}
+DONE, PROBLEM, USAGE, INTERRUPTED = 0, 1, 2, 130
+
+
+class UsageError(Exception):
+    """The command line asks for something that does not exist or does not go together."""
+
+
+class Interrupted(Exception):
+    """The user pressed Ctrl-C; the message says what is stored and how to go on."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; the exit status is 0 done, 1 a problem, 2 wrong usage, 130 interrupted."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
+    if not given or given[0] in ("-h", "--help"):
+        print(overview(), file=sys.stdout if given else sys.stderr)
+        return DONE if given else USAGE
+    if given[0] == "--version":
+        from structgstream import __version__
+
+        print(__version__)
+        return DONE
+    try:
+        _run(given[0], given[1:])
+    except SystemExit as ending:  # the parser's own, after it has printed help or what is wrong
+        return ending.code if isinstance(ending.code, int) else DONE if ending.code is None else PROBLEM
+    except UsageError as error:
+        _say(f"structgstream: {error}")
+        return USAGE
+    except (KeyboardInterrupt, Interrupted) as error:
+        _say(f"\nInterrupted. {error}".rstrip())
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output left (`| head`). Python would complain again while it closes stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PROBLEM
+    except StructGStreamError as error:
+        if debug:
+            traceback.print_exc()
+        _say(f"structgstream: {error}")
+        return PROBLEM
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        _say(
+            f"structgstream: an error that should not happen, {type(error).__name__}: {error}. "
+            "Run the command again with --debug and report what it prints."
+        )
+        return PROBLEM
+    return DONE
+
+
+def overview() -> str:
+    """The text of ``structgstream --help``."""
+    commands = "\n".join(f"  {name:<12} {text}" for name, text in COMMANDS.items())
+    return f"""usage: structgstream COMMAND [options]
+
+A ring of synchronised cameras to a free-viewpoint video stream, frame by frame.
+
+commands:
+{commands}
+
+options:
+  -h, --help   this text; after a command, its options
+  --version    the version
+  --debug      with any command: show the traceback of an error
+
+examples:
+  structgstream demo
+  structgstream reconstruct basketball -o ball.sgs --held-out 0 10 15 30
+  structgstream evaluate ball.sgs basketball --report ball-report
+  structgstream render ball.sgs --path orbit -o ball.mp4"""
+
+
+def _run(command: str, arguments: list[str]) -> None:
+    if command not in COMMANDS:
+        near = difflib.get_close_matches(command, COMMANDS, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(COMMANDS)}.")
+    importlib.import_module(f"structgstream.cli.{command}").main(arguments)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream doctor``."""
+
+import importlib.metadata
+import importlib.util
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from structgstream.cli.options import JsonPath, parsed
+from structgstream.cli.tables import grid
+
+# Import name, distribution, extra, what it is for.
+OPTIONAL = (
+    ("av", "av", "capture", "read and write video"),
+    ("cv2", "opencv-python-headless", "capture", "read pictures, initial points"),
+    ("scipy", "scipy", "capture", "initial points"),
+    ("matplotlib", "matplotlib", "report", "plots, contact sheets"),
+    ("gsplat", "gsplat", "cuda", "back-end cuda"),
+)
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Shows what this machine has: back-ends, why one is missing, and the command that mends it.
+
+    Example: structgstream doctor
+    """
+
+    json: JsonPath = None
+    """Write what is found to this file."""
+
+
+def main(arguments: list[str]) -> None:
+    """Looks around and prints."""
+    options = parsed(Doctor, "doctor", arguments=arguments)
+    from structgstream.evaluation.report import write_json
+
+    found = examination()
+    if options.json is not None:
+        write_json(options.json, found)
+    console = Console()
+    machine = grid()
+    for name, value in found["environment"].items():
+        machine.add_row(name, "-" if value is None else str(value))
+    console.print(machine)
+    console.print()
+    console.print(_table(("back-end", "state", ""), [(e["name"], e["state"], e["advice"]) for e in found["backends"]]))
+    console.print()
+    rows = [(e["name"], e["version"] or "missing", f"{e['purpose']}{e['advice']}") for e in found["packages"]]
+    console.print(_table(("package", "version", ""), rows))
+
+
+def examination() -> dict[str, Any]:
+    """Machine, back-ends and optional packages as plain values: ``environment``, ``backends``,
+    ``packages``.
+    """
+    from structgstream.evaluation.environment import environment
+    from structgstream.kernels.backend import backend_reasons
+
+    reasons = backend_reasons()
+    chosen = next(name for name, reason in reasons.items() if reason is None)
+    backends = [
+        {
+            "name": name,
+            "available": reason is None,
+            "state": "missing" if reason else "chosen by --device auto" if name == chosen else "available",
+            "advice": reason or "",
+        }
+        for name, reason in reasons.items()
+    ]
+    packages = []
+    for module, distribution, extra, purpose in OPTIONAL:
+        version = importlib.metadata.version(distribution) if importlib.util.find_spec(module) else None
+        advice = "" if version else f"; get it with: pip install 'structgstream[{extra}]'"
+        packages.append({"name": module, "version": version, "extra": extra, "purpose": purpose, "advice": advice})
+    return {"environment": environment(), "backends": backends, "packages": packages}
+
+
+def _table(names: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
+    table = Table(header_style="bold", box=None, padding=(0, 2, 0, 0))
+    for name in names:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(*row)
+    return table

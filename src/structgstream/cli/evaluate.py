@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream evaluate``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, parsed
+from structgstream.cli.tables import report_tables
+
+if TYPE_CHECKING:
+    from structgstream.codec.reader import StreamReader
+    from structgstream.data.source import FrameSource
+    from structgstream.evaluation.report import Report
+    from structgstream.kernels.backend import Backend
+
+SHEET_COLUMNS = 5
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Scores a stream file against the cameras that training did not see.
+
+    Everything is decoded from the file; the trainer is not asked. Definitions: docs/evaluation.md.
+
+    Example: structgstream evaluate ball.sgs basketball --json ball.json --report ball-report
+    """
+
+    stream: tyro.conf.Positional[StreamFile]
+    """The stream file."""
+    scene: tyro.conf.Positional[Folder]
+    """The capture that it was made from."""
+    cameras: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = None
+    """Cameras to score. Default: those that were held out."""
+    json: JsonPath = None
+    """Write every number to this file (keys: docs/evaluation.md)."""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    """Write report.json, plots over time and a contact sheet into this folder."""
+    device: Device = "auto"
+    """What renders."""
+
+
+def main(arguments: list[str]) -> None:
+    """Evaluates and prints a table."""
+    options = parsed(Evaluate, "evaluate", arguments=arguments)
+    from structgstream.codec.reader import open_stream
+    from structgstream.evaluation.report import as_json, write_json
+    from structgstream.kernels.backend import select_backend
+
+    reader = open_stream(options.stream)
+    source = capture_of(reader, options.scene)
+    report = scored(
+        reader,
+        source,
+        stream=options.stream,
+        backend=select_backend(options.device),
+        cameras=options.cameras,
+        folder=options.report,
+    )
+    if options.json is not None:
+        write_json(options.json, as_json(report))
+    console = Console()
+    console.print(report_tables(report, title=options.stream.name))
+    if options.report is not None:
+        console.print(f"Report: {options.report}", highlight=False, soft_wrap=True)
+
+
+def capture_of(reader: "StreamReader", scene: Path) -> "FrameSource":
+    """The part of the capture in folder ``scene`` that the stream was made from, at the stream's sizes."""
+    from structgstream.data.open import open_capture
+
+    header = reader.header
+    start = int(header.metadata.get("start", 0))
+    frames = len(reader.packets)
+    whole = open_capture(scene, start=start)
+    shared = [name for name in header.rig if name in whole.rig.cameras]
+    scale = header.rig[shared[0]].width / whole.rig[shared[0]].width if shared else 1.0
+    return open_capture(scene, start=start, frames=min(frames, len(whole)), scale=min(scale, 1.0))
+
+
+def scored(
+    reader: "StreamReader",
+    source: "FrameSource",
+    *,
+    stream: Path,
+    backend: "Backend",
+    cameras: tuple[str, ...] | None,
+    folder: Path | None,
+) -> "Report":
+    """Evaluates with a word about the progress, and writes the report into ``folder`` (None: nowhere)."""
+    from structgstream.evaluation.evaluate import Compared, evaluate
+    from structgstream.evaluation.pictures import contact_sheet, sampled
+    from structgstream.evaluation.plots import write_plots
+    from structgstream.evaluation.report import as_json, write_json
+    from structgstream.evaluation.run_log import read_log
+
+    frames = len(reader.packets)
+    wanted = set(sampled(frames, SHEET_COLUMNS)) if frames else set()
+    kept: dict[str, dict] = {}
+    console = Console(stderr=True)
+    with console.status("evaluating") as status:
+
+        def observe(index: int, compared: Compared) -> None:
+            status.update(f"evaluating frame {index + 1} of {frames}")
+            if folder is not None and index in wanted:
+                kept.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
+
+        report = evaluate(reader, source, backend=backend, cameras=cameras, log=read_log(stream), observer=observe)
+    if folder is not None:
+        title = f"{source.name}, {stream.name}: {report.mean.psnr:.2f} dB over {frames} frames"
+        write_json(folder / "report.json", as_json(report))
+        write_plots(folder / "over_time.png", report, title=title)
+        contact_sheet(folder / "contact_sheet.png", kept, title=title)
+    return report

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several commands share, and how they are parsed."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+
+import tyro
+
+from structgstream.cli.app import UsageError
+
+if TYPE_CHECKING:
+    from structgstream.data.source import FrameSource
+    from structgstream.presets import StreamConfig
+
+Options = TypeVar("Options")
+Device = Literal["auto", "cpu", "cuda", "reference"]
+Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+StreamFile = Annotated[Path, tyro.conf.arg(metavar="STREAM")]
+JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    """Which part of a capture is used, and how."""
+
+    held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = None
+    """Cameras to keep from training. Default: those that the capture's layout holds out."""
+    scale: float = 1.0
+    """Size of the pictures relative to the stored ones, in (0, 1]."""
+    start: int = 0
+    """First frame to use."""
+    frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Number of frames. Default: all."""
+    near: float | None = None
+    """Nothing nearer to a camera is drawn, in units of the capture. Default: the capture's own."""
+
+
+def parsed(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
+    """The options of a command; prints and exits when the user asks for help or made a mistake."""
+    return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE)
+
+
+def parsed_with_rest(kind: type[Options], command: str, *, arguments: list[str]) -> tuple[Options, list[str]]:
+    """As :func:`parsed`, with the arguments that are no option of the command itself."""
+    return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True)
+
+
+def resolved_config(preset: str | None, overrides: list[str], *, command: str, seed: int | None) -> "StreamConfig":
+    """The preset with the fields that the command line sets by their path (``--online.iterations 50``).
+
+    Raises:
+        UsageError: there is no such preset.
+    """
+    from structgstream.presets import DEFAULT_PRESET, PRESETS, StreamConfig
+
+    name = DEFAULT_PRESET if preset is None else preset
+    if name not in PRESETS:
+        raise UsageError(f"there is no preset {name!r}; there are {', '.join(PRESETS)}.")
+    description = f"Fields of the configuration, with the values of the preset {name!r} as defaults."
+    config = tyro.cli(
+        StreamConfig,
+        prog=f"structgstream {command}",
+        description=description,
+        default=PRESETS[name],
+        args=overrides,
+        config=(tyro.conf.FlagConversionOff,),
+    )
+    return config if seed is None else replace(config, seed=seed)
+
+
+def opened_capture(scene: Path, options: CaptureOptions) -> "FrameSource":
+    """The part of a capture that the options name."""
+    from structgstream.data.open import open_capture
+
+    return open_capture(
+        scene,
+        held_out=options.held_out,
+        scale=options.scale,
+        start=options.start,
+        frames=options.frames,
+        near=options.near,
+    )

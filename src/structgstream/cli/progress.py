@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the user sees while frames are fitted: bars on a terminal, a line for each frame elsewhere."""
+
+import time
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from structgstream.session import FrameReport
+    from structgstream.training.result import Step
+
+QUIET_SECONDS = 15.0  # without a terminal, a word this often while one frame takes long
+
+
+class Display(AbstractContextManager["Display"], Protocol):
+    """Follows a reconstruction."""
+
+    def step(self, step: "Step") -> None:
+        """An iteration of the running frame is done."""
+        ...
+
+    def frame(self, report: "FrameReport", *, seconds: float) -> None:
+        """A frame is stored."""
+        ...
+
+
+def display(frames: int, *, done: int = 0, console: Console | None = None) -> Display:
+    """Bars when ``console`` (default: standard output) is a terminal, else plain lines.
+
+    Args:
+        frames: number of frames of the stream when it is finished.
+        done: how many of them are stored already.
+        console: where to write.
+    """
+    console = Console() if console is None else console
+    return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
+
+
+def summary(report: "FrameReport", frames: int, *, seconds: float) -> str:
+    """One frame in one line."""
+    return (
+        f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
+        f"{human_bytes(report.bytes):>9}  {seconds:6.1f} s  {report.anchors:,} anchors  {report.free:,} free"
+    )
+
+
+def human_bytes(count: float) -> str:
+    """Bytes for reading, 1 kB = 1000 bytes."""
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+class Lines:
+    """Plain lines, for files and pipes."""
+
+    def __init__(self, frames: int, done: int, *, console: Console) -> None:
+        self._frames, self._current, self._console = frames, done, console
+        self._spoken = time.monotonic()
+
+    def __enter__(self) -> "Lines":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def step(self, step: "Step") -> None:
+        """Speaks up when the frame takes long."""
+        if time.monotonic() - self._spoken > QUIET_SECONDS:
+            self._print(
+                f"frame {self._current + 1}/{self._frames}: iteration {step.iteration}/{step.iterations}, "
+                f"loss {step.loss:.4f}, {step.anchors:,} anchors"
+            )
+
+    def frame(self, report: "FrameReport", *, seconds: float) -> None:
+        """Prints the frame's line."""
+        self._current = report.index + 1
+        self._print(summary(report, self._frames, seconds=seconds))
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, highlight=False, soft_wrap=True)
+        self._console.file.flush()
+        self._spoken = time.monotonic()
+
+
+class Bars:
+    """A bar of frames, a bar of the running frame's iterations, and the last frame's numbers."""
+
+    def __init__(self, frames: int, done: int, *, console: Console) -> None:
+        self._frames = frames
+        self._progress = Progress(
+            TextColumn("{task.description:<10}"),
+            BarColumn(bar_width=32),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}", style="dim"),
+            console=console,
+        )
+        self._all = self._progress.add_task("frames", total=frames, completed=done, note="")
+        self._one = self._progress.add_task(f"frame {done + 1}", total=None, note="preparing")
+        self._last = Text("", style="dim")
+        self._live = Live(Group(self._progress, self._last), console=console, refresh_per_second=8)
+
+    def __enter__(self) -> "Bars":
+        self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.update(self._one, visible=False)
+        self._live.stop()
+
+    def step(self, step: "Step") -> None:
+        """Moves the bar of iterations."""
+        note = f"loss {step.loss:.4f}  {step.anchors:,} anchors  {step.free:,} free"
+        self._progress.update(self._one, completed=step.iteration, total=step.iterations, note=note)
+
+    def frame(self, report: "FrameReport", *, seconds: float) -> None:
+        """Moves the bar of frames and begins the next frame's."""
+        note = f"{seconds:.1f} s a frame"
+        self._progress.update(self._all, completed=report.index + 1, note=note)
+        self._progress.reset(self._one, total=None, description=f"frame {report.index + 2}", note="")
+        self._last.plain = summary(report, self._frames, seconds=seconds)

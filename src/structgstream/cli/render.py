@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream render``."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import cycle, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.app import UsageError
+from structgstream.cli.options import Device, Folder, StreamFile, parsed
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from structgstream.cameras import Camera
+    from structgstream.codec.reader import StreamReader
+    from structgstream.kernels.backend import Backend
+    from structgstream.scene.scene import Scene
+
+LEAST_PATH_SECONDS = 4.0  # a shorter stream runs to and fro while the camera moves
+
+
+@dataclass(frozen=True)
+class Render:
+    """Renders a camera of the rig, or a camera path, to a video or to pictures.
+
+    OUT.mp4 gives a video, OUT.png one picture (with --frame), any other name a folder of PNGs. With --compare
+    the capture is needed, and each picture holds truth, rendering, and their difference times four.
+
+    Example: structgstream render ball.sgs --path orbit -o ball.mp4
+
+    Example: structgstream render ball.sgs basketball --camera 10 --compare --frame 5 -o ball-10.png
+    """
+
+    stream: tyro.conf.Positional[StreamFile]
+    """The stream file."""
+    scene: tyro.conf.Positional[Folder | None] = None
+    """The capture, for --compare."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = None
+    """Where to write. Default: a video beside the stream, named after the camera or the path."""
+    camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA")] = None
+    """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
+    path: Literal["orbit", "arc"] | None = None
+    """A camera that moves: around one camera, or from one camera to another."""
+    between: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="CAMERA CAMERA")] = None
+    """Ends of the arc. Default: two cameras well apart on the same side."""
+    seconds: float | None = None
+    """Length of a path. Default: that of the stream, at least 4 s; a shorter stream runs to and fro."""
+    frame: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """This frame only; on a path, time stands still. Default: all frames."""
+    compare: bool = False
+    """Truth, rendering and difference side by side."""
+    device: Device = "auto"
+    """What renders."""
+
+
+def main(arguments: list[str]) -> None:
+    """Renders and says where the result is."""
+    options = parsed(Render, "render", arguments=arguments)
+    if options.compare and (options.scene is None or options.path is not None):
+        raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
+    if options.scene is not None and not options.compare:
+        raise UsageError("the capture's folder is only used with --compare.")
+    if options.between is not None and options.path != "arc":
+        raise UsageError("--between gives the ends of --path arc.")
+    from structgstream.codec.reader import open_stream
+    from structgstream.kernels.backend import select_backend
+
+    reader = open_stream(options.stream)
+    output = options.output or default_output(options, reader)
+    if output.suffix.lower() == ".png" and options.frame is None:
+        raise UsageError("a PNG holds one picture: choose it with --frame, or write an .mp4 or a folder.")
+    backend = select_backend(options.device)
+    if options.path is not None:
+        pictures = path_pictures(
+            reader,
+            backend,
+            path=options.path,
+            camera=options.camera,
+            between=options.between,
+            seconds=options.seconds,
+            frame=options.frame,
+        )
+    elif options.scene is not None:
+        pictures = compared_pictures(reader, options.scene, backend=backend, options=options)
+    else:
+        pictures = camera_pictures(reader, backend, camera=chosen_camera(reader, options.camera), frame=options.frame)
+    single = output.suffix.lower() == ".png"
+    write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
+    Console().print(f"Wrote {output}", highlight=False, soft_wrap=True)
+
+
+def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
+    """Pictures as a video, one PNG or a folder of PNGs, as the name of ``output`` says.
+
+    Raises:
+        StorageError: something cannot be written.
+    """
+    from structgstream.data.video_writer import VideoWriter
+    from structgstream.evaluation.png import write_png
+
+    with Console(stderr=True).status("rendering") as status:
+        if output.suffix.lower() == ".mp4":
+            with VideoWriter(output, fps=fps) as video:
+                for number, picture in enumerate(pictures):
+                    video.write(picture)
+                    status.update(f"rendering picture {number + 1}")
+            return
+        for number, picture in enumerate(pictures):
+            write_png(output if output.suffix.lower() == ".png" else output / f"{number:05d}.png", picture)
+            status.update(f"rendering picture {number + 1}")
+
+
+def camera_pictures(
+    reader: "StreamReader", backend: "Backend", *, camera: str, frame: int | None = None
+) -> "Iterator[NDArray[np.uint8]]":
+    """What a camera of the rig sees, frame by frame."""
+    from structgstream.evaluation.evaluate import rendered
+
+    view = reader.header.similarity.camera(reader.header.rig[camera])
+    for scene in scenes_of(reader, frame):
+        yield rendered(scene, view, backend)[0]
+
+
+def path_pictures(
+    reader: "StreamReader",
+    backend: "Backend",
+    *,
+    path: Literal["orbit", "arc"],
+    camera: str | None = None,
+    between: tuple[str, str] | None = None,
+    seconds: float | None = None,
+    frame: int | None = None,
+) -> "Iterator[NDArray[np.uint8]]":
+    """What a moving camera sees while time runs, to and fro when the path takes longer than the stream."""
+    from structgstream.evaluation.camera_path import arc, orbit
+    from structgstream.evaluation.evaluate import rendered
+
+    header = reader.header
+    length = max(len(reader.packets) / header.fps, LEAST_PATH_SECONDS) if seconds is None else seconds
+    count = max(round(length * header.fps), 1)
+    rig = header.rig
+    views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
+    for view, scene in zip(views, _to_and_fro(reader, frame, count=count), strict=True):
+        yield rendered(scene, header.similarity.camera(view), backend)[0]
+
+
+def compared_pictures(
+    reader: "StreamReader", scene: Path, *, backend: "Backend", options: Render
+) -> "Iterator[NDArray[np.uint8]]":
+    """Truth, rendering and difference of a camera, frame by frame."""
+    from structgstream.cli.evaluate import capture_of
+    from structgstream.evaluation.evaluate import compared_frames
+    from structgstream.evaluation.pictures import side_by_side
+
+    camera = chosen_camera(reader, options.camera)
+    _check_frame(reader, options.frame)
+    pairs = compared_frames(reader, capture_of(reader, scene), backend=backend, camera=camera)
+    for number, (truth, picture) in enumerate(pairs):
+        if options.frame is None or number == options.frame:
+            yield side_by_side(truth, picture)
+        if number == options.frame:
+            return
+
+
+def chosen_camera(reader: "StreamReader", camera: str | None) -> str:
+    """The named camera, the first held-out one, or the one in the middle of the rig.
+
+    Raises:
+        UsageError: the rig has no such camera.
+    """
+    from structgstream.evaluation.camera_path import central_camera
+
+    rig = reader.header.rig
+    if camera is None:
+        return rig.testing[0] if rig.testing else central_camera(rig)
+    if camera not in rig.cameras:
+        raise UsageError(f"the stream has no camera {camera!r}; it has {', '.join(rig)}.")
+    return camera
+
+
+def scenes_of(reader: "StreamReader", frame: int | None) -> "Iterator[Scene]":
+    """All decoded scenes, or that of one frame.
+
+    Raises:
+        UsageError: there is no such frame.
+    """
+    _check_frame(reader, frame)
+    if frame is not None:
+        yield reader.scene(frame)
+        return
+    for _, scene in reader.scenes(0):
+        yield scene
+
+
+def default_output(options: Render, reader: "StreamReader") -> Path:
+    """``ball.sgs`` gives ``ball-orbit.mp4``, ``ball-10.mp4`` or ``ball-10-compare.mp4``."""
+    name = options.path or chosen_camera(reader, options.camera)
+    ending = "-compare" if options.compare else ""
+    still = options.frame is not None and options.path is None
+    suffix = f"-{options.frame}.png" if still else ".mp4"
+    return options.stream.with_name(f"{options.stream.stem}-{name}{ending}{suffix}")
+
+
+def _to_and_fro(reader: "StreamReader", frame: int | None, *, count: int) -> "Iterator[Scene]":
+    if frame is None and len(reader.packets) >= count:
+        yield from islice(scenes_of(reader, None), count)
+        return
+    # A stream shorter than the path is short enough to keep: scenes share what does not change.
+    scenes = list(scenes_of(reader, frame))
+    yield from islice(cycle(scenes + scenes[-2:0:-1]), count)
+
+
+def _check_frame(reader: "StreamReader", frame: int | None) -> None:
+    if frame is not None and not 0 <= frame < len(reader.packets):
+        raise UsageError(f"the stream has frames 0 to {len(reader.packets) - 1}; there is no frame {frame}.")

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers as tables for a terminal."""
+
+from typing import TYPE_CHECKING
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from structgstream.cli.progress import human_bytes
+
+if TYPE_CHECKING:
+    from structgstream.evaluation.report import Report, Scores
+
+SHOWN_FRAMES = 24  # a longer stream is shown in even steps
+
+
+def report_tables(report: "Report", *, title: str) -> Group:
+    """Scores by frame and by camera, and the facts of the file."""
+    return Group(_frames(report, title), Text(), _cameras(report), Text(), _facts(report))
+
+
+def grid() -> Table:
+    """A table of names and values without lines."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column()
+    return table
+
+
+def _frames(report: "Report", title: str) -> Table:
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for name in ("frame", "PSNR", "SSIM", "affine", "changed", "still", "bytes", "anchors", "free", "seconds"):
+        table.add_column(name, justify="right")
+    frames = report.frames
+    step = -(-len(frames) // SHOWN_FRAMES)
+    for frame in frames[::step] if (len(frames) - 1) % step == 0 else [*frames[::step], frames[-1]]:
+        seconds = frame.log.get("total_seconds")
+        table.add_row(
+            str(frame.index),
+            *_scores(frame.mean),
+            human_bytes(frame.bytes),
+            f"{frame.anchors:,}",
+            f"{frame.free:,}",
+            "-" if seconds is None else f"{seconds:.1f}",
+        )
+    table.add_section()
+    mean_bytes = sum(frame.bytes for frame in frames) / len(frames)
+    table.add_row("mean", *_scores(report.mean), human_bytes(mean_bytes), "", "", "", style="bold")
+    return table
+
+
+def _cameras(report: "Report") -> Table:
+    table = Table(header_style="bold")
+    for name in ("camera", "", "PSNR", "SSIM", "affine", "changed", "still"):
+        table.add_column(name, justify="left" if name in ("camera", "") else "right")
+    for name, scores in report.cameras.items():
+        table.add_row(name, report.stream["cameras"][name], *_scores(scores))
+    return table
+
+
+def _facts(report: "Report") -> Table:
+    s = report.stream
+    table = grid()
+    table.add_row(
+        "PSNR over time",
+        f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
+        f"drift {s['drift_db_per_frame']:+.3f} dB a frame",
+    )
+    table.add_row(
+        "size",
+        f"{human_bytes(s['total_bytes'])}: header {human_bytes(s['header_bytes'])}, "
+        f"{s['frames']} packets {human_bytes(s['packet_bytes'])}",
+    )
+    table.add_row(
+        "rate",
+        f"{s['megabits_per_second']:.2f} Mbit/s at {s['fps']:g} frames a second, "
+        f"{s['megabits_per_second_with_header']:.2f} with the header",
+    )
+    fields = sorted(s["field_bytes"].items(), key=lambda item: -item[1])
+    table.add_row("bytes by field", ", ".join(f"{name} {human_bytes(size)}" for name, size in fields if size))
+    if "peak_memory_bytes" in s:
+        first = "-" if s["seconds_first"] is None else f"{s['seconds_first']:.1f} s"
+        online = "-" if s["seconds_online_mean"] is None else f"{s['seconds_online_mean']:.2f} s"
+        table.add_row(
+            "training",
+            f"first frame {first}, each further one {online}, peak memory {human_bytes(s['peak_memory_bytes'])}",
+        )
+    table.add_row("rendering", f"{1 / max(report.mean.render_seconds, 1e-9):.1f} pictures a second")
+    e = report.environment
+    machine = f"{e['gpu'] or e['cpu']}, {e['cores']} cores, back-end {e['backend']}, torch {e['torch']}"
+    table.add_row("machine", machine)
+    return table
+
+
+def _scores(scores: "Scores") -> list[str]:
+    values = (scores.psnr, scores.ssim, scores.psnr_affine, scores.psnr_changed, scores.psnr_still)
+    digits = (2, 4, 2, 2, 2)
+    return ["-" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras that move: paths that stay where the rig has looked, in the capture's own units."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.errors import ConfigError
+
+ORBIT_SHARE = 0.5  # of the distance to the nearest cameras: what lies further out was seen from one side only
+NEIGHBOURS = 3
+ARC_HALF_ANGLE = math.radians(50.0)
+
+
+def focus_point(rig: CameraRig) -> Tensor:
+    """The point ``[3]`` nearest to all optical axes: what the rig looks at.
+
+    A rig whose cameras look the same way has no such point; then it lies ahead of their mean, at the size of
+    the rig.
+    """
+    cameras = list(rig.cameras.values())
+    centers = rig.centers
+    axes = torch.stack([camera.viewmat[2, :3] for camera in cameras])  # [V, 3]
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    spread = (centers - centers.mean(0)).norm(dim=1).max()
+    if torch.linalg.eigvalsh(normal)[0] > 1e-3 * len(cameras):
+        point = torch.linalg.solve(normal, (across @ centers[:, :, None]).sum(0)[:, 0])
+        ahead = ((point - centers) * axes).sum(1)
+        if bool((ahead > 0).float().mean() > 0.5):
+            return point
+    forward = torch.nn.functional.normalize(axes.mean(0), dim=0)
+    return centers.mean(0) + forward * 2.0 * spread
+
+
+def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Camera]:
+    """A flat ellipse around a camera of the rig, always looking at what that camera has in its middle.
+
+    Args:
+        rig: the cameras.
+        frames: number of cameras on the path; the last is one step before the first.
+        around: the camera in the middle; None for the one nearest to the mean of the rig.
+
+    Raises:
+        ConfigError: an unknown camera.
+    """
+    name = central_camera(rig) if around is None else _known(rig, around)
+    camera = rig[name]
+    right, down, forward = camera.viewmat[:3, :3]
+    distances = (rig.centers - camera.center).norm(dim=1).sort().values[1 : 1 + NEIGHBOURS]
+    radius = ORBIT_SHARE * float(distances.mean())
+    depth = float((focus_point(rig) - camera.center) @ forward)
+    target = camera.center + forward * max(depth, 2.0 * radius)
+    path = []
+    for index in range(frames):
+        angle = 2.0 * math.pi * index / frames
+        eye = camera.center + radius * (math.sin(angle) * right - 0.5 * math.cos(angle) * down)
+        path.append(looking(camera, eye, target, down))
+    return path
+
+
+def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) -> list[Camera]:
+    """From one camera of the rig to another, at their distances from what the rig looks at.
+
+    Args:
+        rig: the cameras.
+        frames: number of cameras on the path.
+        between: the ends; None for the two furthest apart of those within 50 degrees of the middle camera.
+
+    Raises:
+        ConfigError: an unknown camera.
+    """
+    focus = focus_point(rig)
+    names = _ends(rig, focus) if between is None else (_known(rig, between[0]), _known(rig, between[1]))
+    first, last = (rig[name] for name in names)
+    start, end = first.center - focus, last.center - focus
+    down = torch.nn.functional.normalize(first.viewmat[1, :3] + last.viewmat[1, :3], dim=0)
+    path = []
+    for index in range(frames):
+        share = index / max(frames - 1, 1)
+        length = (1.0 - share) * start.norm() + share * end.norm()
+        path.append(looking(first, focus + length * _between(start, end, share), focus, down))
+    return path
+
+
+def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor) -> Camera:
+    """``camera`` moved to ``eye`` and turned to ``target``, upright as ``down`` says (all ``[3]``, world)."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    return replace(camera, viewmat=viewmat)
+
+
+def central_camera(rig: CameraRig) -> str:
+    """The camera nearest to the mean position of the training cameras."""
+    mean = torch.stack([rig[name].center for name in rig.training]).mean(0)
+    return min(rig, key=lambda name: float((rig[name].center - mean).norm()))
+
+
+def _between(start: Tensor, end: Tensor, share: float) -> Tensor:
+    """The unit vector ``share`` of the way from the direction of ``start`` to that of ``end``."""
+    a, b = (torch.nn.functional.normalize(v, dim=0) for v in (start, end))
+    angle = torch.arccos((a @ b).clamp(-1.0, 1.0))
+    if angle < 1e-6:
+        return a
+    return (torch.sin((1.0 - share) * angle) * a + torch.sin(share * angle) * b) / torch.sin(angle)
+
+
+def _ends(rig: CameraRig, focus: Tensor) -> tuple[str, str]:
+    middle = torch.nn.functional.normalize(rig[central_camera(rig)].center - focus, dim=0)
+    directions = {name: torch.nn.functional.normalize(rig[name].center - focus, dim=0) for name in rig.training}
+    near = [name for name, d in directions.items() if float(d @ middle) >= math.cos(ARC_HALF_ANGLE)]
+    if len(near) < 2:
+        near = sorted(directions, key=lambda name: -float(directions[name] @ middle))[:2]
+    pairs = [(a, b) for i, a in enumerate(near) for b in near[i + 1 :]]
+    return min(pairs, key=lambda pair: float(directions[pair[0]] @ directions[pair[1]]))
+
+
+def _known(rig: CameraRig, name: str) -> str:
+    if name not in rig.cameras:
+        raise ConfigError(f"There is no camera {name!r}; the rig has {', '.join(rig)}.")
+    return name
