@@ -33,11 +33,13 @@ class Evaluate:
     """The stream file."""
     scene: tyro.conf.Positional[Folder]
     """The capture that it was made from."""
-    cameras: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = None
+    cameras: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
+        None
+    )
     """Cameras to score. Default: those that were held out."""
     json: JsonPath = None
     """Write every number to this file (keys: docs/evaluation.md)."""
-    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """Write report.json, plots over time and a contact sheet into this folder."""
     device: Device = "auto"
     """What renders."""

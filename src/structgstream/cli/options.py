@@ -17,7 +17,7 @@ Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
 Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
 StreamFile = Annotated[Path, tyro.conf.arg(metavar="STREAM")]
-JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
 
 
@@ -25,15 +25,17 @@ STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.Disa
 class CaptureOptions:
     """Which part of a capture is used, and how."""
 
-    held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = None
+    held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
+        None
+    )
     """Cameras to keep from training. Default: those that the capture's layout holds out."""
     scale: float = 1.0
     """Size of the pictures relative to the stored ones, in (0, 1]."""
     start: int = 0
     """First frame to use."""
-    frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
-    near: float | None = None
+    near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Nothing nearer to a camera is drawn, in units of the capture. Default: the capture's own."""
 
 

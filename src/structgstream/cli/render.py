@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, Folder, StreamFile, parsed
+from structgstream.cli.options import Device, StreamFile, parsed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,19 +39,19 @@ class Render:
 
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
-    scene: tyro.conf.Positional[Folder | None] = None
+    scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FOLDER]", help_behavior_hint="")] = None
     """The capture, for --compare."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT")] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """Where to write. Default: a video beside the stream, named after the camera or the path."""
-    camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA")] = None
+    camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")] = None
     """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
-    path: Literal["orbit", "arc"] | None = None
+    path: Annotated[Literal["orbit", "arc"] | None, tyro.conf.arg(help_behavior_hint="")] = None
     """A camera that moves: around one camera, or from one camera to another."""
-    between: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="CAMERA CAMERA")] = None
+    between: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="CAMERA CAMERA", help_behavior_hint="")] = None
     """Ends of the arc. Default: two cameras well apart on the same side."""
-    seconds: float | None = None
+    seconds: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Length of a path. Default: that of the stream, at least 4 s; a shorter stream runs to and fro."""
-    frame: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """This frame only; on a path, time stands still. Default: all frames."""
     compare: bool = False
     """Truth, rendering and difference side by side."""

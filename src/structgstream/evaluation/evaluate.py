@@ -4,7 +4,7 @@
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.reader import PacketInfo, StreamReader
 from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.affine import psnr_affine
@@ -23,6 +22,9 @@ from structgstream.evaluation.report import FrameScores, Report, Scores, course,
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from structgstream.codec.reader import PacketInfo, StreamReader
 
 Picture = NDArray[np.uint8]
 
@@ -41,7 +43,7 @@ Observer = Callable[[int, Compared], None]
 
 
 def evaluate(
-    reader: StreamReader,
+    reader: "StreamReader",
     source: FrameSource,
     *,
     backend: Backend,
@@ -158,7 +160,7 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
             )
 
 
-def stream_facts(reader: StreamReader, names: tuple[str, ...]) -> dict[str, Any]:
+def stream_facts(reader: "StreamReader", names: tuple[str, ...]) -> dict[str, Any]:
     """Sizes and rates of the file. Bytes are lengths of records in the file; megabits are 10^6 bits."""
     header, packets = reader.header, reader.packets
     seconds = len(packets) / header.fps
@@ -187,7 +189,7 @@ def stream_facts(reader: StreamReader, names: tuple[str, ...]) -> dict[str, Any]
 
 
 def compared_frames(
-    reader: StreamReader, source: FrameSource, *, backend: Backend, camera: str
+    reader: "StreamReader", source: FrameSource, *, backend: Backend, camera: str
 ) -> Iterator[tuple[Picture, Picture]]:
     """Truth and rendering of one camera, frame by frame.
 
@@ -200,7 +202,7 @@ def compared_frames(
         yield frame.images[camera], rendered(scene, view, backend)[0]
 
 
-def _frame_scores(info: PacketInfo, scene: Scene, compared: list[Compared], log: dict[str, Any]) -> FrameScores:
+def _frame_scores(info: "PacketInfo", scene: Scene, compared: list[Compared], log: dict[str, Any]) -> FrameScores:
     scores = {entry.camera: entry.scores for entry in compared}
     return FrameScores(
         index=info.index,

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Dispatch, exit statuses, and one sentence for what goes wrong."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+import structgstream
+from structgstream.cli import app
+from structgstream.cli.app import COMMANDS, main
+from structgstream.errors import CaptureError
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch):
+    """Lets a test say what the command does."""
+
+    def install(action) -> None:
+        monkeypatch.setattr(app.importlib, "import_module", lambda name: SimpleNamespace(main=action))
+
+    return install
+
+
+def raising(error: BaseException):
+    def action(arguments: list[str]) -> None:
+        raise error
+
+    return action
+
+
+def test_help_names_every_command_and_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"\n  {name} " in text for name in COMMANDS)
+    assert "examples:" in text
+
+
+def test_nothing_given_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "usage: structgstream" in capsys.readouterr().err
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == structgstream.__version__
+
+
+def test_a_misspelt_command_is_named_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evalaute"]) == 2
+    assert "Did you mean 'evaluate'?" in capsys.readouterr().err
+
+
+def test_a_problem_is_one_sentence_without_a_traceback(command, capsys: pytest.CaptureFixture[str]) -> None:
+    command(raising(CaptureError("The capture x is an empty folder.")))
+    assert main(["inspect"]) == 1
+    assert capsys.readouterr().err == "structgstream: The capture x is an empty folder.\n"
+    assert main(["inspect", "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_bug_says_that_it_is_one(command, capsys: pytest.CaptureFixture[str]) -> None:
+    command(raising(IndexError("7")))
+    assert main(["inspect"]) == 1
+    text = capsys.readouterr().err
+    assert "should not happen" in text
+    assert "IndexError: 7" in text
+    assert "--debug" in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), app.Interrupted("Go on with --resume.")])
+def test_ctrl_c_ends_cleanly(command, error: BaseException, capsys: pytest.CaptureFixture[str]) -> None:
+    command(raising(error))
+    assert main(["reconstruct"]) == 130
+    assert capsys.readouterr().err.strip() == f"Interrupted. {error}".strip()
+
+
+def test_wrong_usage_of_a_command(command, capsys: pytest.CaptureFixture[str]) -> None:
+    command(raising(app.UsageError("there is no preset 'x'.")))
+    assert main(["reconstruct"]) == 2
+    assert capsys.readouterr().err == "structgstream: there is no preset 'x'.\n"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example_and_no_torch(name: str) -> None:
+    code = (
+        f"import sys; from structgstream.cli import main; status = main(['{name}', '--help']); "
+        "print([m for m in ('torch', 'numpy', 'av', 'cv2', 'matplotlib') if m in sys.modules]); sys.exit(status)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert f"Example: structgstream {name}" in result.stdout
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_importing_the_command_line_is_free() -> None:
+    code = "import sys, structgstream.cli; print([m for m in ('torch', 'tyro', 'rich', 'numpy') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_an_unknown_option_is_wrong_usage() -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "structgstream", "inspect", "x.sgs", "--jsn", "y"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert "--json" in result.stderr

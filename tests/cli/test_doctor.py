@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Doctor says what is there, what is not, and what mends it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from structgstream.cli import doctor, main
+from structgstream.kernels import backend
+
+
+def test_everything_is_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json", str(tmp_path / "d.json")]) == 0
+    found = json.loads((tmp_path / "d.json").read_text())
+    assert [entry["name"] for entry in found["backends"]] == ["cuda", "cpu", "reference"]
+    assert sum(entry["state"].startswith("chosen") for entry in found["backends"]) == 1
+    assert {entry["name"] for entry in found["packages"]} == {"av", "cv2", "scipy", "matplotlib", "gsplat"}
+    text = capsys.readouterr().out
+    assert "reference" in text
+    assert "cores" in text
+
+
+def test_what_is_missing_comes_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    reasons = {"cuda": "No GPU here.", "cpu": None, "reference": None}
+    monkeypatch.setattr(backend, "backend_reasons", lambda: reasons)
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
+    found = doctor.examination()
+    assert [entry["state"] for entry in found["backends"]] == ["missing", "chosen by --device auto", "available"]
+    assert found["backends"][0]["advice"] == "No GPU here."
+    advice = {entry["name"]: entry["advice"] for entry in found["packages"]}
+    assert "pip install 'structgstream[capture]'" in advice["av"]
+    assert "pip install 'structgstream[report]'" in advice["matplotlib"]

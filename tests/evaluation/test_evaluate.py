@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluation of streams whose content is known: the world's own scenes, whole or spoilt."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from structgstream.cameras import CameraRig
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.errors import CaptureError, ConfigError
+from structgstream.evaluation.evaluate import compared_frames, evaluate, score
+from structgstream.evaluation.metrics import PSNR_OF_EQUALS
+from structgstream.evaluation.report import as_json
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import PAPER_DYNAMIC
+from structgstream.similarity import Similarity
+from worlds import World, moving_world
+
+SPEED = 0.03
+
+
+@dataclass
+class Info:
+    kind: PacketKind
+    index: int
+    pts_seconds: float
+    offset: int
+    bytes: int
+    field_bytes: dict[str, int]
+
+
+@dataclass
+class Reader:
+    """What an opened file looks like, around scenes in memory."""
+
+    header: StreamHeader
+    decoded: list[Scene]
+    complete: bool = True
+    header_bytes: int = 5000
+    packets: list[Info] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for i in range(len(self.decoded)):
+            kind = PacketKind.DELTA if i else PacketKind.KEY
+            self.packets.append(Info(kind, i, i / 30, 0, 1000 + i, {"anchor_positions": 900, "free": i}))
+
+    @property
+    def total_bytes(self) -> int:
+        return self.header_bytes + sum(info.bytes for info in self.packets)
+
+    def scenes(self, start: int) -> Iterator[tuple[Info, Scene]]:
+        yield from zip(self.packets[start:], self.decoded[start:])
+
+
+@dataclass
+class Source:
+    """A capture in memory."""
+
+    rig: CameraRig
+    pictures: list[MultiViewFrame]
+    fps: float = 30.0
+    name: str = "world"
+    points: None = None
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        yield from self.pictures[start:]
+
+
+def in_the_stream(world: World, *, similarity: Similarity, follow: bool) -> Reader:
+    """The world as a stream: every frame's own scene, or the first one for ever."""
+    scenes = []
+    for t in range(len(world.frames)):
+        shift = torch.tensor([SPEED * t * follow, 0.0, 0.0])
+        anchors = world.scene.anchors
+        moved = similarity.points(anchors.positions + shift).to(torch.float32)
+        growth = float(np.log(similarity.scale))
+        scenes.append(
+            replace(
+                world.scene,
+                anchors=replace(
+                    anchors,
+                    positions=moved,
+                    log_offset_scales=anchors.log_offset_scales + growth,
+                    log_base_scales=anchors.log_base_scales + growth,
+                ),
+            )
+        )
+    header = StreamHeader(
+        rig=world.rig,
+        similarity=similarity,
+        fps=30.0,
+        codec="raw",
+        dynamic=PAPER_DYNAMIC,
+        static={},
+        distance_input=True,
+        config={},
+        metadata={"capture": "world"},
+    )
+    return Reader(header, scenes)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return moving_world(frames=4, speed=SPEED)
+
+
+def run(reader: Any, source: Any, **options: Any):
+    return evaluate(reader, source, backend=reference_backend(), **options)
+
+
+def test_a_perfect_stream_scores_as_equal(world: World) -> None:
+    report = run(in_the_stream(world, similarity=Similarity(), follow=True), Source(world.rig, world.frames))
+    assert report.mean.psnr == PSNR_OF_EQUALS
+    assert report.mean.ssim == pytest.approx(1.0)
+    assert report.stream["drift_db_per_frame"] == pytest.approx(0.0)
+    assert list(report.cameras) == ["cam00"]
+    assert report.stream["cameras"] == {"cam00": "held out"}
+
+
+def test_a_stream_that_stands_still_loses_the_changed_pixels(world: World) -> None:
+    report = run(in_the_stream(world, similarity=Similarity(), follow=False), Source(world.rig, world.frames))
+    psnrs = [frame.mean.psnr for frame in report.frames]
+    assert psnrs == sorted(psnrs, reverse=True)
+    assert report.stream["drift_db_per_frame"] < -1
+    assert report.stream["drop_from_first_db"] == pytest.approx(psnrs[0] - psnrs[-1])
+    last = report.frames[-1].mean
+    assert last.psnr_changed is not None
+    assert last.psnr_still is not None
+    assert last.psnr_changed < last.psnr < last.psnr_still
+    assert report.frames[0].mean.psnr_changed is None
+    assert [frame.kind for frame in report.frames] == ["key", "delta", "delta", "delta"]
+
+
+def test_cameras_pass_through_the_similarity_of_the_header(world: World) -> None:
+    # The MLPs see the distance, so the world is drawn without it to be the same at another scale.
+    blind = replace(world.scene, mlps=replace_distance(world.scene))
+    plain = World(world.rig, blind, drawn(blind, world))
+    similarity = Similarity(center=(0.3, -0.2, 0.1), scale=2.5)
+    report = run(in_the_stream(plain, similarity=similarity, follow=True), Source(plain.rig, plain.frames))
+    assert report.mean.psnr > 60  # float32 of another scale: a level here and there
+
+
+def replace_distance(scene: Scene):
+    """The MLPs with no weight on the distance, which is the last input."""
+    mlps = scene.mlps
+    heads = {}
+    for name in ("opacity", "color", "covariance"):
+        head = getattr(mlps, name)
+        weights = head.w1.clone()
+        weights[:, -1] = 0.0
+        heads[name] = head._replace(w1=weights)
+    return type(mlps)(**heads)
+
+
+def drawn(scene: Scene, world: World) -> list[MultiViewFrame]:
+    """The world's frames with another scene."""
+    from worlds import rendered
+
+    frames = []
+    for t, frame in enumerate(world.frames):
+        shift = torch.tensor([SPEED * t, 0.0, 0.0])
+        moved = replace(scene, anchors=replace(scene.anchors, positions=scene.anchors.positions + shift))
+        images = {name: rendered(moved, world, name) for name in world.rig}
+        frames.append(MultiViewFrame(frame.index, frame.pts_seconds, images))
+    return frames
+
+
+def test_sizes_and_rates_are_those_of_the_file(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    report = run(reader, Source(world.rig, world.frames))
+    facts = report.stream
+    assert facts["packet_bytes"] == 4006
+    assert facts["total_bytes"] == 9006
+    assert facts["field_bytes"] == {"anchor_positions": 3600, "free": 6}
+    assert facts["megabits_per_second"] == pytest.approx(4006 * 8 / 1e6 / (4 / 30))
+    assert as_json(report)["mean"]["bytes"] == pytest.approx(1001.5)
+    assert as_json(report)["mean"]["seconds"] is None
+
+
+def test_the_log_of_the_trainer_is_merged(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    log = {
+        i: {"index": i, "total_seconds": 10.0 if i == 0 else 2.0, "peak_memory_bytes": 100 + i, "seconds": {}}
+        for i in range(4)
+    }
+    report = run(reader, Source(world.rig, world.frames), log=log)
+    assert report.stream["seconds_first"] == 10.0
+    assert report.stream["seconds_online_mean"] == 2.0
+    assert report.stream["peak_memory_bytes"] == 103
+    assert as_json(report)["mean"]["seconds"] == 4.0
+
+
+def test_the_observer_sees_every_picture(world: World) -> None:
+    seen = []
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    run(
+        reader,
+        Source(world.rig, world.frames),
+        cameras=("cam01", "cam00"),
+        observer=lambda index, compared: seen.append((index, compared.camera, compared.picture.shape)),
+    )
+    assert seen[:2] == [(0, "cam01", (32, 48, 3)), (0, "cam00", (32, 48, 3))]
+    assert len(seen) == 8
+
+
+def test_compared_frames_are_truth_and_rendering(world: World) -> None:
+    reader: Any = in_the_stream(world, similarity=Similarity(), follow=True)
+    source: Any = Source(world.rig, world.frames)
+    pairs = list(compared_frames(reader, source, backend=reference_backend(), camera="cam00"))
+    assert len(pairs) == 4
+    for truth, picture in pairs:
+        np.testing.assert_array_equal(truth, picture)
+
+
+def test_every_pixel_changed_leaves_no_still_one() -> None:
+    dark, bright = np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 200, np.uint8)
+    scores = score(bright, bright, dark)
+    assert (scores.changed_share, scores.psnr_still) == (1.0, None)
+    assert scores.psnr_changed == PSNR_OF_EQUALS
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda s: replace_camera(s, None), "has no camera 'cam00'"),
+        (lambda s: replace_camera(s, s.rig["cam00"].resized(24, 16)), "24x16 pixels .* 48x32 in the stream"),
+        (lambda s: replace_camera(s, s.rig["cam01"]), "another calibration"),
+        (lambda s: replace(s, pictures=s.pictures[:2]), "4 frames .* only 2"),
+    ],
+)
+def test_another_capture_is_refused(world: World, spoil: Any, words: str) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    with pytest.raises(CaptureError, match=words):
+        run(reader, spoil(Source(world.rig, world.frames)))
+
+
+def replace_camera(source: Source, camera: Any) -> Source:
+    """The source with another first camera, or none."""
+    cameras = dict(source.rig.cameras) | {"cam00": camera}
+    if camera is None:
+        del cameras["cam00"]
+    return replace(source, rig=CameraRig(cameras))
+
+
+def test_a_stream_without_held_out_cameras_says_what_to_do(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader.header = replace(reader.header, rig=world.rig.with_held_out(frozenset()))
+    source = Source(world.rig, world.frames)
+    with pytest.raises(ConfigError, match="--cameras"):
+        run(reader, source)
+    report = run(reader, source, cameras=("cam02",))
+    assert report.stream["cameras"] == {"cam02": "training"}
+    with pytest.raises(ConfigError, match="no camera 'cam99'"):
+        run(reader, source, cameras=("cam99",))
