@@ -1,0 +1,564 @@
+// SPDX-License-Identifier: Apache-2.0
+// Anchors to drawable Gaussians and back (paper, equations for mu' and Sigma'; Scaffold-GS's three heads).
+//
+// Lanes are anchors: a block of two vectors of anchors passes through the MLPs, whose weights are broadcast. A first
+// pass computes the opacities, which decide how many Gaussians there are; the second gives their attributes to anchors
+// that have one. The backward pass needs one bit for each hidden unit from the forward pass and recomputes the hidden
+// values of the heads that are trained. Weight gradients are sums over anchors: dot products of rows of a chunk, summed
+// chunk by chunk within a fixed number of groups and then group by group, so the result does not depend on threads.
+
+#include "anchors.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "vec.h"
+
+namespace structgstream {
+namespace SGS_ISA {
+namespace {
+
+constexpr int kBlock = 2 * kLanes;                   // anchors that pass through the MLPs together
+constexpr int kTile = kLanes == 16 ? 8 : 4;          // outputs that share the loads of an input
+constexpr int kRows = 8;                             // rows are padded to a multiple of this
+constexpr int kChunk = 256;                          // anchors, a multiple of every block
+constexpr int kChunkBlocks = kChunk / kBlock;
+constexpr int kGroups = 64;                          // partial sums of the weights' gradients
+constexpr int kHeads = 3;
+constexpr int kOutputs[kHeads] = {1, 3, 7};          // for each offset
+
+constexpr int padded(int rows) { return (rows + kRows - 1) / kRows * kRows; }
+
+struct Sizes {
+    int k, d, inputs, hidden, inputs_padded, hidden_padded, words;
+    int outputs[kHeads], outputs_padded[kHeads];
+    explicit Sizes(const sgs_anchors& a)
+        : k(a.offsets_per_anchor), d(a.feature_size), inputs(d + 3 + (a.distance_input ? 1 : 0)), hidden(a.hidden_size),
+          inputs_padded(padded(inputs)), hidden_padded(padded(hidden)), words((hidden + 31) / 32) {
+        for (int h = 0; h < kHeads; ++h) {
+            outputs[h] = kOutputs[h] * k;
+            outputs_padded[h] = padded(outputs[h]);
+        }
+    }
+};
+
+// A weight matrix in the order in which `dense` reads it: tiles of kTile outputs, inputs within a tile.
+class Packed {
+  public:
+    template <typename Weight>
+    Packed(int outputs, int inputs, Weight weight) : tiles_(padded(outputs) / kTile), inputs_(inputs) {
+        weights_.assign(static_cast<size_t>(tiles_) * kTile * inputs, 0.0f);
+        for (int o = 0; o < outputs; ++o)
+            for (int i = 0; i < inputs; ++i)
+                weights_[(static_cast<size_t>(o / kTile) * inputs + i) * kTile + o % kTile] = weight(o, i);
+        bias_.assign(static_cast<size_t>(tiles_) * kTile, 0.0f);
+    }
+    Packed& with_bias(const float* bias, int outputs) {
+        std::copy(bias, bias + outputs, bias_.begin());
+        return *this;
+    }
+    // y = W x + b for one block; rows of x and y are kBlock floats.
+    void apply(const float* x, float* y) const {
+        const float* w = weights_.data();
+        for (int t = 0; t < tiles_; ++t) {
+            vf sums[kTile][2];
+#pragma GCC unroll 8
+            for (int o = 0; o < kTile; ++o) sums[o][0] = sums[o][1] = splat(bias_[t * kTile + o]);
+            for (int i = 0; i < inputs_; ++i, w += kTile) {
+                const vf x0 = load(x + i * kBlock), x1 = load(x + i * kBlock + kLanes);
+#pragma GCC unroll 8
+                for (int o = 0; o < kTile; ++o) {
+                    sums[o][0] += splat(w[o]) * x0;
+                    sums[o][1] += splat(w[o]) * x1;
+                }
+            }
+#pragma GCC unroll 8
+            for (int o = 0; o < kTile; ++o) {
+                store(y + (t * kTile + o) * kBlock, sums[o][0]);
+                store(y + (t * kTile + o) * kBlock + kLanes, sums[o][1]);
+            }
+        }
+    }
+
+  private:
+    int tiles_, inputs_;
+    std::vector<float> weights_, bias_;
+};
+
+Packed first_layer(const sgs_head& head, const Sizes& s) {
+    return Packed(s.hidden, s.inputs, [&](int o, int i) { return head.w1[o * s.inputs + i]; })
+        .with_bias(head.b1, s.hidden);
+}
+
+Packed second_layer(const sgs_head& head, const Sizes& s, int h) {
+    return Packed(
+               s.outputs[h], s.hidden_padded,
+               [&](int o, int i) { return i < s.hidden ? head.w2[o * s.hidden + i] : 0.0f; })
+        .with_bias(head.b2, s.outputs[h]);
+}
+
+// hidden = max(hidden, 0); bits[word * kBlock + lane] tells which units were positive.
+void rectify(float* hidden, int count, int32_t* bits, int words) {
+    for (int half = 0; half < kBlock; half += kLanes) {
+        for (int word = 0; word < words; ++word) {
+            vi found = {};
+            for (int n = 32 * word; n < std::min(count, 32 * word + 32); ++n) {
+                float* row = hidden + n * kBlock + half;
+                const vf value = load(row);
+                const vi on = value > 0.0f;
+                store(row, (vf)((vi)value & on));
+                found |= on & static_cast<int32_t>(1u << (n & 31));
+            }
+            store(bits + word * kBlock + half, found);
+        }
+    }
+}
+
+// Clears the gradient of the units that were off.
+void mask(float* gradient, int count, const int32_t* bits) {
+    for (int half = 0; half < kBlock; half += kLanes) {
+        for (int n = 0; n < count; ++n) {
+            float* row = gradient + n * kBlock + half;
+            const vi on = (load(bits + (n / 32) * kBlock + half) & static_cast<int32_t>(1u << (n & 31))) != 0;
+            store(row, (vf)((vi)load(row) & on));
+        }
+    }
+}
+
+// The MLPs' inputs of a block: rows 0 ... D - 1 the feature, then the direction, then the distance (always there; the
+// padding of the rows hides it from heads that do not take it).
+struct Inputs {
+    float* rows;      // [inputs_padded + 1][kBlock]
+    float* distance;  // [kBlock]
+    void read(const sgs_anchors& a, const Sizes& s, const int64_t* anchors, int count) const {
+        for (int l = 0; l < kBlock; ++l) {
+            if (l >= count) {
+                for (int i = 0; i < s.inputs; ++i) rows[i * kBlock + l] = 0.0f;
+                distance[l] = 1.0f;
+                continue;
+            }
+            const float* feature = a.features + anchors[l] * s.d;
+            for (int i = 0; i < s.d; ++i) rows[i * kBlock + l] = feature[i];
+            const float* position = a.positions + anchors[l] * 3;
+            const float x = position[0] - a.camera_center[0], y = position[1] - a.camera_center[1],
+                        z = position[2] - a.camera_center[2];
+            const float length = std::max(std::sqrt(x * x + y * y + z * z), 1e-12f);
+            rows[s.d * kBlock + l] = x / length;
+            rows[(s.d + 1) * kBlock + l] = y / length;
+            rows[(s.d + 2) * kBlock + l] = z / length;
+            if (s.inputs > s.d + 3) rows[(s.d + 3) * kBlock + l] = length;
+            distance[l] = length;
+        }
+        for (int i = s.inputs; i < s.inputs_padded; ++i) std::fill_n(rows + i * kBlock, kBlock, 0.0f);
+    }
+};
+
+// Three numbers of each anchor as rows, through the exponential.
+void read_exponentials(const float* values, const int64_t* anchors, int count, float* rows) {
+    for (int l = 0; l < kBlock; ++l)
+        for (int c = 0; c < 3; ++c) rows[c * kBlock + l] = l < count ? values[anchors[l] * 3 + c] : 0.0f;
+    for (int i = 0; i < 3 * kBlock; i += kLanes) store(rows + i, exponential(load(rows + i)));
+}
+
+// Lane n of the result is the sum over the lanes of sums[n].
+vf sums_of_lanes(vf (&sums)[kLanes]) {
+#pragma GCC unroll 4
+    for (int step = 1; step < kLanes; step *= 2) {
+        vi low, high;
+        for (int i = 0; i < kLanes; ++i) {
+            low[i] = i & step ? kLanes + i - step : i;
+            high[i] = i & step ? kLanes + i : i + step;
+        }
+#pragma GCC unroll 8
+        for (int n = 0; n < kLanes / 2 / step; ++n) {
+            const vf a = sums[2 * n], b = sums[2 * n + 1];
+            sums[n] = __builtin_shuffle(a, b, low) + __builtin_shuffle(a, b, high);
+        }
+    }
+    return sums[0];
+}
+
+constexpr int kAcross = kLanes == 16 ? 4 : 2;
+constexpr int kDown = kLanes / kAcross;
+
+// out[i][j] += sum over the anchors of a chunk of a[i] * b[j]. Blocks of a and b are `a_block` and `b_block` floats apart.
+void add_products(
+    const float* a, size_t a_block, int rows, const float* b, size_t b_block, int columns, int blocks, float* out) {
+    for (int i = 0; i < rows; i += kDown) {
+        for (int j = 0; j < columns; j += kAcross) {
+            vf sums[kLanes];
+            for (vf& sum : sums) sum = splat(0.0f);
+            for (int n = 0; n < blocks; ++n) {
+                const float* p = a + n * a_block + i * kBlock;
+                const float* q = b + n * b_block + j * kBlock;
+#pragma GCC unroll 2
+                for (int half = 0; half < kBlock; half += kLanes) {
+                    vf right[kAcross];
+#pragma GCC unroll 4
+                    for (int c = 0; c < kAcross; ++c) right[c] = load(q + c * kBlock + half);
+#pragma GCC unroll 4
+                    for (int r = 0; r < kDown; ++r) {
+                        const vf left = load(p + r * kBlock + half);
+#pragma GCC unroll 4
+                        for (int c = 0; c < kAcross; ++c) sums[r * kAcross + c] += left * right[c];
+                    }
+                }
+            }
+            float totals[kLanes];
+            store(totals, sums_of_lanes(sums));
+            for (int r = 0; r < kDown; ++r)
+                for (int c = 0; c < kAcross; ++c) out[(i + r) * columns + j + c] += totals[r * kAcross + c];
+        }
+    }
+}
+
+// out[i] += sum over the anchors of a chunk of a[i].
+void add_sums(const float* a, size_t a_block, int rows, int blocks, float* out) {
+    for (int i = 0; i < rows; ++i) {
+        vf sum = splat(0.0f);
+        for (int n = 0; n < blocks; ++n) {
+            const float* p = a + n * a_block + i * kBlock;
+            sum += load(p) + load(p + kLanes);
+        }
+        float lanes[kLanes];
+        store(lanes, sum);
+        for (int step = kLanes / 2; step > 0; step /= 2)
+            for (int l = 0; l < step; ++l) lanes[l] += lanes[l + step];
+        out[i] += lanes[0];
+    }
+}
+
+}  // namespace
+
+void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
+    const Sizes s(a);
+    const Packed first = first_layer(a.heads[0], s), second = second_layer(a.heads[0], s, 0);
+    const int m = a.visible_count, chunks = (m + kChunk - 1) / kChunk;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
+    for (int chunk = 0; chunk < chunks; ++chunk) {
+        const Buffer memory(static_cast<size_t>(s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[0] + s.words) * kBlock);
+        const Inputs x{memory.get(), memory.get() + s.inputs_padded * kBlock};
+        float* hidden = x.distance + kBlock;
+        float* raw = hidden + s.hidden_padded * kBlock;
+        int32_t* bits = reinterpret_cast<int32_t*>(raw + s.outputs_padded[0] * kBlock);
+        for (int row = chunk * kChunk; row < std::min(m, (chunk + 1) * kChunk); row += kBlock) {
+            const int count = std::min(kBlock, m - row);
+            x.read(a, s, a.visible + row, count);
+            first.apply(x.rows, hidden);
+            rectify(hidden, s.hidden_padded, bits, s.words);
+            second.apply(hidden, raw);
+            for (int i = 0; i < s.k * kBlock; i += kLanes) store(raw + i, hyperbolic_tangent(load(raw + i)));
+            for (int l = 0; l < count; ++l) {
+                for (int j = 0; j < s.k; ++j) out.raw_opacities[static_cast<size_t>(row + l) * s.k + j] = raw[j * kBlock + l];
+                for (int w = 0; w < s.words; ++w)
+                    out.relu_bits[(static_cast<size_t>(row + l) * kHeads) * s.words + w] = bits[w * kBlock + l];
+            }
+        }
+    }
+    int64_t active = 0, gaussians = 0;
+    for (int row = 0; row < m; ++row) {
+        int drawn = 0;
+        for (int j = 0; j < s.k; ++j) drawn += out.raw_opacities[static_cast<size_t>(row) * s.k + j] > 0.0f;
+        if (drawn == 0) continue;
+        out.active[active] = row;
+        out.starts[active++] = gaussians;
+        gaussians += drawn;
+    }
+    out.starts[active] = gaussians;
+    out.active_count = active;
+    out.gaussian_count = gaussians;
+}
+
+void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const sgs_gaussians& out, int threads) {
+    const Sizes s(a);
+    const Packed first[2] = {first_layer(a.heads[1], s), first_layer(a.heads[2], s)};
+    const Packed second[2] = {second_layer(a.heads[1], s, 1), second_layer(a.heads[2], s, 2)};
+    const int total = static_cast<int>(selection.active_count), chunks = (total + kChunk - 1) / kChunk;
+    const int k = s.k;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
+    for (int chunk = 0; chunk < chunks; ++chunk) {
+        const Buffer memory(
+            static_cast<size_t>(
+                s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[1] + s.outputs_padded[2] + k + 6 + s.words) *
+            kBlock);
+        const Inputs x{memory.get(), memory.get() + s.inputs_padded * kBlock};
+        float* hidden = x.distance + kBlock;
+        float* color = hidden + s.hidden_padded * kBlock;
+        float* covariance = color + s.outputs_padded[1] * kBlock;
+        float* norms = covariance + s.outputs_padded[2] * kBlock;
+        float* reach = norms + k * kBlock;
+        float* base = reach + 3 * kBlock;
+        int32_t* bits = reinterpret_cast<int32_t*>(base + 3 * kBlock);
+        int64_t anchors[kBlock];
+        for (int begin = chunk * kChunk; begin < std::min(total, (chunk + 1) * kChunk); begin += kBlock) {
+            const int count = std::min(kBlock, total - begin);
+            for (int l = 0; l < count; ++l) anchors[l] = a.visible[selection.active[begin + l]];
+            x.read(a, s, anchors, count);
+            for (int h = 1; h < kHeads; ++h) {
+                first[h - 1].apply(x.rows, hidden);
+                rectify(hidden, s.hidden_padded, bits, s.words);
+                for (int l = 0; l < count; ++l)
+                    for (int w = 0; w < s.words; ++w)
+                        selection.relu_bits[(static_cast<size_t>(selection.active[begin + l]) * kHeads + h) * s.words + w] =
+                            bits[w * kBlock + l];
+                second[h - 1].apply(hidden, h == 1 ? color : covariance);
+            }
+            read_exponentials(a.log_offset_scales, anchors, count, reach);
+            read_exponentials(a.log_base_scales, anchors, count, base);
+            for (int i = 0; i < 3 * k * kBlock; i += kLanes) store(color + i, sigmoid(load(color + i)));
+            for (int j = 0; j < k; ++j) {
+                float* rows = covariance + 7 * j * kBlock;
+                for (int i = 0; i < 3 * kBlock; i += kLanes) store(rows + i, sigmoid(load(rows + i)) * load(base + i));
+                float* quat = rows + 3 * kBlock;
+                float* norm = norms + j * kBlock;
+                for (int l = 0; l < kBlock; ++l) {
+                    const float w = quat[l], x1 = quat[kBlock + l], y = quat[2 * kBlock + l], z = quat[3 * kBlock + l];
+                    norm[l] = 1.0f / std::max(std::sqrt(w * w + x1 * x1 + y * y + z * z), 1e-12f);
+                    for (int c = 0; c < 4; ++c) quat[c * kBlock + l] *= norm[l];
+                }
+            }
+            for (int l = 0; l < count; ++l) {
+                const float* raw = selection.raw_opacities + static_cast<size_t>(selection.active[begin + l]) * k;
+                const float* position = a.positions + anchors[l] * 3;
+                const float* offset = a.offsets + anchors[l] * k * 3;
+                int64_t g = selection.starts[begin + l];
+                for (int j = 0; j < k; ++j) {
+                    if (!(raw[j] > 0.0f)) continue;
+                    for (int c = 0; c < 3; ++c) {
+                        out.means[3 * g + c] = position[c] + offset[3 * j + c] * reach[c * kBlock + l];
+                        out.scales[3 * g + c] = covariance[(7 * j + c) * kBlock + l];
+                        out.colors[3 * g + c] = color[(3 * j + c) * kBlock + l];
+                    }
+                    for (int c = 0; c < 4; ++c) out.quats[4 * g + c] = covariance[(7 * j + 3 + c) * kBlock + l];
+                    out.quat_norms[g] = norms[j * kBlock + l];
+                    out.opacities[g] = raw[j];
+                    out.ids[g] = anchors[l] * k + j;
+                    ++g;
+                }
+            }
+        }
+    }
+}
+
+namespace {
+
+// Everything that the backward pass knows before it starts.
+struct Backward {
+    const sgs_anchors& a;
+    const sgs_selection& selection;
+    const sgs_gaussians& drawn;
+    const sgs_gaussian_gradients& from;
+    const sgs_anchor_gradients& to;
+    Sizes s;
+    bool trained[kHeads];
+    bool to_inputs;    // the MLPs' inputs carry a gradient
+    int input_first;   // its first row
+    size_t partial[kHeads + 1];  // where each head's sums start within a group's
+
+    Backward(
+        const sgs_anchors& anchors, const sgs_selection& selected, const sgs_gaussians& gaussians,
+        const sgs_gaussian_gradients& given, const sgs_anchor_gradients& wanted)
+        : a(anchors), selection(selected), drawn(gaussians), from(given), to(wanted), s(anchors) {
+        to_inputs = to.positions != nullptr || to.features != nullptr;
+        input_first = to.features != nullptr ? 0 : s.d;
+        partial[0] = 0;
+        for (int h = 0; h < kHeads; ++h) {
+            trained[h] = to.heads[h].w1 != nullptr;
+            const size_t size = static_cast<size_t>(s.hidden_padded) * (s.inputs_padded + 1) +
+                                static_cast<size_t>(s.outputs_padded[h]) * (s.hidden_padded + 1);
+            partial[h + 1] = partial[h] + (trained[h] ? size : 0);
+        }
+    }
+    bool uses(int h) const { return trained[h] || to_inputs; }
+};
+
+// Gradients of a block's Gaussians to gradients of the heads' outputs (before their activations) and of the anchors.
+void gather(const Backward& b, int begin, int count, const int64_t* anchors, float* const (&outputs)[kHeads], float* means) {
+    const int k = b.s.k;
+    float reach[3 * kBlock], base[3 * kBlock];
+    read_exponentials(b.a.log_offset_scales, anchors, count, reach);
+    read_exponentials(b.a.log_base_scales, anchors, count, base);
+    for (int h = 0; h < kHeads; ++h)
+        if (b.uses(h)) std::memset(outputs[h], 0, sizeof(float) * b.s.outputs_padded[h] * kBlock);
+    for (int l = 0; l < count; ++l) {
+        const int row = b.selection.active[begin + l];
+        const float* raw = b.selection.raw_opacities + static_cast<size_t>(row) * k;
+        const float* offset = b.a.offsets + anchors[l] * k * 3;
+        float to_mean[3] = {}, to_reach[3] = {}, to_base[3] = {};
+        int64_t g = b.selection.starts[begin + l];
+        for (int j = 0; j < k; ++j) {
+            if (!(raw[j] > 0.0f)) continue;
+            if (b.from.means != nullptr) {
+                for (int c = 0; c < 3; ++c) {
+                    const float gradient = b.from.means[3 * g + c];
+                    to_mean[c] += gradient;
+                    to_reach[c] += gradient * offset[3 * j + c];
+                    if (b.to.offsets != nullptr)
+                        b.to.offsets[(anchors[l] * k + j) * 3 + c] = gradient * reach[c * kBlock + l];
+                }
+            }
+            if (b.from.opacities != nullptr && b.uses(0))
+                outputs[0][j * kBlock + l] = b.from.opacities[g] * (1.0f - raw[j] * raw[j]);
+            if (b.from.colors != nullptr && b.uses(1)) {
+                for (int c = 0; c < 3; ++c) {
+                    const float value = b.drawn.colors[3 * g + c];
+                    outputs[1][(3 * j + c) * kBlock + l] = b.from.colors[3 * g + c] * value * (1.0f - value);
+                }
+            }
+            if (b.from.scales != nullptr) {
+                for (int c = 0; c < 3; ++c) {
+                    const float value = b.drawn.scales[3 * g + c], gradient = b.from.scales[3 * g + c] * value;
+                    to_base[c] += gradient;
+                    if (b.uses(2)) outputs[2][(7 * j + c) * kBlock + l] = gradient * (1.0f - value / base[c * kBlock + l]);
+                }
+            }
+            if (b.from.quats != nullptr && b.uses(2)) {
+                const float* gradient = b.from.quats + 4 * g;
+                const float* quat = b.drawn.quats + 4 * g;
+                float along = 0.0f;
+                for (int c = 0; c < 4; ++c) along += gradient[c] * quat[c];
+                for (int c = 0; c < 4; ++c)
+                    outputs[2][(7 * j + 3 + c) * kBlock + l] = (gradient[c] - along * quat[c]) * b.drawn.quat_norms[g];
+            }
+            ++g;
+        }
+        for (int c = 0; c < 3; ++c) {
+            means[c * kBlock + l] = to_mean[c];
+            if (b.to.log_offset_scales != nullptr)
+                b.to.log_offset_scales[anchors[l] * 3 + c] = to_reach[c] * reach[c * kBlock + l];
+            if (b.to.log_base_scales != nullptr) b.to.log_base_scales[anchors[l] * 3 + c] = to_base[c];
+        }
+    }
+}
+
+// Gradients of the MLPs' inputs, and of the means, to features and positions.
+void give(const Backward& b, const Inputs& x, const float* inputs, const float* means, const int64_t* anchors, int count) {
+    const int d = b.s.d;
+    for (int l = 0; l < count; ++l) {
+        if (b.to.features != nullptr)
+            for (int i = 0; i < d; ++i) b.to.features[anchors[l] * d + i] = inputs[i * kBlock + l];
+        if (b.to.positions == nullptr) continue;
+        const float* gradient = inputs + (d - b.input_first) * kBlock + l;
+        const float* direction = x.rows + d * kBlock + l;
+        float along = 0.0f;
+        for (int c = 0; c < 3; ++c) along += gradient[c * kBlock] * direction[c * kBlock];
+        const float to_distance = b.s.inputs > d + 3 ? gradient[3 * kBlock] : 0.0f;
+        for (int c = 0; c < 3; ++c)
+            b.to.positions[anchors[l] * 3 + c] = means[c * kBlock + l] +
+                                                 (gradient[c * kBlock] - along * direction[c * kBlock]) / x.distance[l] +
+                                                 to_distance * direction[c * kBlock];
+    }
+}
+
+}  // namespace
+
+void anchors_backward(
+    const sgs_anchors& a, const sgs_selection& selection, const sgs_gaussians& drawn, const sgs_gaussian_gradients& from,
+    const sgs_anchor_gradients& to, int threads) {
+    const Backward b(a, selection, drawn, from, to);
+    const Sizes& s = b.s;
+    std::vector<Packed> first, to_hidden;
+    for (int h = 0; h < kHeads; ++h) {
+        const sgs_head& head = a.heads[h];
+        first.push_back(first_layer(head, s));
+        to_hidden.emplace_back(s.hidden, s.outputs[h], [&](int o, int i) { return head.w2[i * s.hidden + o]; });
+    }
+    const Packed to_input(s.inputs - b.input_first, kHeads * s.hidden_padded, [&](int o, int i) {
+        const int h = i / s.hidden_padded, unit = i % s.hidden_padded;
+        return unit < s.hidden ? a.heads[h].w1[unit * s.inputs + b.input_first + o] : 0.0f;
+    });
+    const int total = static_cast<int>(selection.active_count), chunks = (total + kChunk - 1) / kChunk;
+    const int groups = std::min(chunks, kGroups);
+    const size_t sums_size = b.partial[kHeads];
+    std::vector<float> sums(groups * sums_size, 0.0f);
+    // Rows of one block: inputs, distance, outputs of the heads, their hidden layers' gradients, hidden values.
+    const int outputs_rows = s.outputs_padded[0] + s.outputs_padded[1] + s.outputs_padded[2];
+    const size_t block_size = static_cast<size_t>(s.inputs_padded + 1 + outputs_rows + 2 * kHeads * s.hidden_padded) * kBlock;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
+    for (int group = 0; group < groups; ++group) {
+        const Buffer memory(kChunkBlocks * block_size + (s.inputs_padded + 3) * kBlock);
+        float* input_gradient = memory.get() + kChunkBlocks * block_size;
+        float* means = input_gradient + s.inputs_padded * kBlock;
+        std::vector<int32_t> bits(static_cast<size_t>(s.words) * kBlock);
+        int64_t anchors[kBlock];
+        for (int chunk = static_cast<int>(static_cast<int64_t>(chunks) * group / groups);
+             chunk < static_cast<int>(static_cast<int64_t>(chunks) * (group + 1) / groups); ++chunk) {
+            const int end = std::min(total, (chunk + 1) * kChunk);
+            const int blocks = (end - chunk * kChunk + kBlock - 1) / kBlock;
+            for (int n = 0; n < blocks; ++n) {
+                const int begin = chunk * kChunk + n * kBlock, count = std::min(kBlock, end - begin);
+                float* rows = memory.get() + n * block_size;
+                const Inputs x{rows, rows + s.inputs_padded * kBlock};
+                float* outputs[kHeads];
+                float* next = x.distance + kBlock;
+                for (int h = 0; h < kHeads; ++h) outputs[h] = next, next += s.outputs_padded[h] * kBlock;
+                float* hidden_gradient = next;
+                float* hidden = next + kHeads * s.hidden_padded * kBlock;
+                for (int l = 0; l < count; ++l) anchors[l] = a.visible[selection.active[begin + l]];
+                x.read(a, s, anchors, count);
+                gather(b, begin, count, anchors, outputs, means);
+                for (int h = 0; h < kHeads; ++h) {
+                    if (!b.uses(h)) continue;
+                    float* gradient = hidden_gradient + h * s.hidden_padded * kBlock;
+                    to_hidden[h].apply(outputs[h], gradient);
+                    std::fill(bits.begin(), bits.end(), 0);
+                    for (int l = 0; l < count; ++l)
+                        for (int w = 0; w < s.words; ++w)
+                            bits[w * kBlock + l] =
+                                selection.relu_bits[(static_cast<size_t>(selection.active[begin + l]) * kHeads + h) * s.words + w];
+                    mask(gradient, s.hidden_padded, bits.data());
+                    if (b.trained[h]) {
+                        float* values = hidden + h * s.hidden_padded * kBlock;
+                        first[h].apply(x.rows, values);
+                        mask(values, s.hidden_padded, bits.data());
+                    }
+                }
+                if (b.to_inputs) {
+                    to_input.apply(hidden_gradient, input_gradient);
+                    give(b, x, input_gradient, means, anchors, count);
+                }
+            }
+            const float* rows = memory.get();
+            const float* outputs = rows + (s.inputs_padded + 1) * kBlock;
+            for (int h = 0; h < kHeads; ++h) {
+                const float* gradient = rows + (s.inputs_padded + 1 + outputs_rows + h * s.hidden_padded) * kBlock;
+                const float* hidden = gradient + kHeads * s.hidden_padded * kBlock;
+                if (b.trained[h]) {
+                    float* w1 = sums.data() + group * sums_size + b.partial[h];
+                    float* b1 = w1 + s.hidden_padded * s.inputs_padded;
+                    float* w2 = b1 + s.hidden_padded;
+                    float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
+                    add_products(gradient, block_size, s.hidden_padded, rows, block_size, s.inputs_padded, blocks, w1);
+                    add_sums(gradient, block_size, s.hidden_padded, blocks, b1);
+                    add_products(outputs, block_size, s.outputs_padded[h], hidden, block_size, s.hidden_padded, blocks, w2);
+                    add_sums(outputs, block_size, s.outputs_padded[h], blocks, b2);
+                }
+                outputs += s.outputs_padded[h] * kBlock;
+            }
+        }
+    }
+    for (int group = 1; group < groups; ++group)
+        for (size_t i = 0; i < sums_size; ++i) sums[i] += sums[group * sums_size + i];
+    sums.resize(sums_size);
+    for (int h = 0; h < kHeads; ++h) {
+        if (!b.trained[h]) continue;
+        const float* w1 = sums.data() + b.partial[h];
+        const float* b1 = w1 + s.hidden_padded * s.inputs_padded;
+        const float* w2 = b1 + s.hidden_padded;
+        const float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
+        const sgs_head_gradient& out = to.heads[h];
+        for (int o = 0; o < s.hidden; ++o) {
+            std::copy_n(w1 + o * s.inputs_padded, s.inputs, out.w1 + o * s.inputs);
+            out.b1[o] = b1[o];
+        }
+        for (int o = 0; o < s.outputs[h]; ++o) {
+            std::copy_n(w2 + o * s.hidden_padded, s.hidden, out.w2 + o * s.hidden);
+            out.b2[o] = b2[o];
+        }
+    }
+}
+
+}  // namespace SGS_ISA
+}  // namespace structgstream

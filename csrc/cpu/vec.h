@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: Apache-2.0
+// Vectors of floats as wide as the instruction set this file is compiled for, and the functions that the loss and the
+// anchors need on them. Plain compiler vectors: no mask types, so one source serves every width.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <new>
+
+#ifndef SGS_ISA
+#define SGS_ISA native
+#endif
+
+#if defined(__AVX512F__)
+#define SGS_LANES 16
+#elif defined(__AVX__)
+#define SGS_LANES 8
+#else
+#define SGS_LANES 4
+#endif
+
+namespace structgstream {
+namespace SGS_ISA {
+
+constexpr int kLanes = SGS_LANES;
+constexpr std::size_t kAlignment = 64;
+
+typedef float vf __attribute__((vector_size(4 * SGS_LANES)));
+typedef int32_t vi __attribute__((vector_size(4 * SGS_LANES)));
+typedef float unaligned_vf __attribute__((vector_size(4 * SGS_LANES), aligned(4), may_alias));
+typedef int32_t unaligned_vi __attribute__((vector_size(4 * SGS_LANES), aligned(4), may_alias));
+
+inline vf load(const float* p) { return *reinterpret_cast<const unaligned_vf*>(p); }
+inline vi load(const int32_t* p) { return *reinterpret_cast<const unaligned_vi*>(p); }
+inline void store(float* p, vf v) { *reinterpret_cast<unaligned_vf*>(p) = v; }
+inline void store(int32_t* p, vi v) { *reinterpret_cast<unaligned_vi*>(p) = v; }
+inline vf splat(float x) { return x - vf{}; }
+inline vf absolute(vf x) { return (vf)((vi)x & 0x7fffffff); }
+inline vf largest(vf a, vf b) { return a > b ? a : b; }
+inline vf smallest(vf a, vf b) { return a < b ? a : b; }
+
+// e^x to about one unit in the last place; saturates instead of overflowing or giving denormal numbers.
+inline vf exponential(vf x) {
+    const vf clamped = smallest(largest(x, splat(-87.0f)), splat(88.0f));
+    const vf magic = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer in the low bits
+    const vf rounded = clamped * 1.44269504f + magic;
+    const vf n = rounded - magic;
+    const vf r = (clamped - n * 0.693359375f) + n * 2.12194440e-4f;  // ln 2 in two parts
+    vf p = splat(1.0f / 5040.0f);
+    p = p * r + 1.0f / 720.0f;
+    p = p * r + 1.0f / 120.0f;
+    p = p * r + 1.0f / 24.0f;
+    p = p * r + 1.0f / 6.0f;
+    p = p * r + 0.5f;
+    p = p * r + 1.0f;
+    p = p * r + 1.0f;
+    return (vf)((vi)p + ((vi)rounded << 23));  // the low bits of `rounded` hold n; its own exponent is shifted out
+}
+
+inline vf sigmoid(vf x) { return splat(1.0f) / (1.0f + exponential(-x)); }
+
+// tanh with full relative precision near zero, where the sign of an opacity decides what is drawn.
+inline vf hyperbolic_tangent(vf x) {
+    const vf size = absolute(x), z = x * x;
+    vf p = splat(-5.704986e-3f);
+    p = p * z + 2.0639087e-2f;
+    p = p * z + -5.3739715e-2f;
+    p = p * z + 1.3331442e-1f;
+    p = p * z + -3.3333282e-1f;
+    const vf small = x + x * z * p;
+    const vf large = 1.0f - 2.0f / (exponential(2.0f * size) + 1.0f);
+    const vf with_sign = (vf)((vi)large | ((vi)x & INT32_MIN));
+    return size < 0.625f ? small : with_sign;
+}
+
+// Memory on a cache line's border.
+class Buffer {
+  public:
+    explicit Buffer(std::size_t floats)
+        : data_(static_cast<float*>(::operator new(floats * sizeof(float) + 1, std::align_val_t{kAlignment}))) {}
+    ~Buffer() { ::operator delete(data_, std::align_val_t{kAlignment}); }
+    Buffer(const Buffer&) = delete;
+    Buffer& operator=(const Buffer&) = delete;
+    float* get() const { return data_; }
+
+  private:
+    float* data_;
+};
+
+}  // namespace SGS_ISA
+}  // namespace structgstream

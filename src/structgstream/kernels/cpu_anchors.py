@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Anchors to drawable Gaussians in this package's C++; the contract is ``kernels.reference_anchors``'s."""
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from structgstream.errors import BackendError
+from structgstream.kernels._load import native_library
+from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
+
+# The structures below mirror csrc/cpu/anchors.h, field by field.
+
+
+class _Head(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("w1", "b1", "w2", "b2")]
+
+
+class _Anchors(ctypes.Structure):
+    _fields_ = [
+        *[
+            (name, ctypes.c_void_p)
+            for name in ("positions", "log_offset_scales", "log_base_scales", "offsets", "features", "visible")
+        ],
+        ("heads", _Head * 3),
+        ("camera_center", ctypes.c_float * 3),
+        *[
+            (name, ctypes.c_int32)
+            for name in ("visible_count", "offsets_per_anchor", "feature_size", "hidden_size", "distance_input")
+        ],
+    ]
+
+
+class _Selection(ctypes.Structure):
+    _fields_ = [
+        *[(name, ctypes.c_void_p) for name in ("raw_opacities", "relu_bits", "active", "starts")],
+        ("active_count", ctypes.c_int64),
+        ("gaussian_count", ctypes.c_int64),
+    ]
+
+
+class _Gaussians(ctypes.Structure):
+    _fields_ = [
+        (name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "ids", "quat_norms")
+    ]
+
+
+class _GaussianGradients(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors")]
+
+
+class _AnchorGradients(ctypes.Structure):
+    _fields_ = [
+        *[
+            (name, ctypes.c_void_p)
+            for name in ("positions", "log_offset_scales", "log_base_scales", "offsets", "features")
+        ],
+        ("heads", _Head * 3),
+    ]
+
+
+def _pointers(tensors: Sequence[Tensor | None]) -> list[int | None]:
+    return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
+
+
+def _heads(weights: Sequence[Tensor | None]) -> Any:
+    return (_Head * 3)(*(_Head(*_pointers(weights[4 * head : 4 * head + 4])) for head in range(3)))
+
+
+def _anchors(tensors: Sequence[Tensor], visible: Tensor, center: list[float], distance_input: bool) -> _Anchors:
+    """``tensors``: the five anchor tensors, then four weights for each of the three heads."""
+    return _Anchors(
+        *_pointers([*tensors[:5], visible]),
+        _heads(tensors[5:]),
+        (ctypes.c_float * 3)(*center),
+        visible.shape[0],
+        tensors[3].shape[1],
+        tensors[4].shape[1],
+        tensors[5].shape[0],
+        int(distance_input),
+    )
+
+
+class _Generate(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, visible: Tensor, center: list[float], distance_input: bool, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        library, threads = native_library(), ctypes.c_int(torch.get_num_threads())
+        m, k, hidden = visible.shape[0], tensors[3].shape[1], tensors[5].shape[0]
+        raw = torch.empty(m, k)
+        bits = torch.empty(m, 3, (hidden + 31) // 32, dtype=torch.int32)
+        active, starts = torch.empty(m, dtype=torch.int32), torch.empty(m + 1, dtype=torch.int64)
+        anchors = _anchors(tensors, visible, center, distance_input)
+        selection = _Selection(*_pointers([raw, bits, active, starts]))
+        library.sgs_anchors_select(ctypes.byref(anchors), ctypes.byref(selection), threads)
+        n = selection.gaussian_count
+        drawn = [torch.empty(n, 3), torch.empty(n, 4), torch.empty(n, 3), torch.empty(n), torch.empty(n, 3)]
+        ids, norms = torch.empty(n, dtype=torch.int64), torch.empty(n)
+        gaussians = _Gaussians(*_pointers([*drawn, ids, norms]))
+        library.sgs_anchors_dress(ctypes.byref(anchors), ctypes.byref(selection), ctypes.byref(gaussians), threads)
+        ctx.save_for_backward(visible, raw, bits, active, starts, ids, norms, *drawn, *tensors)
+        ctx.arguments = center, distance_input, selection.active_count
+        ctx.mark_non_differentiable(ids, raw)
+        ctx.set_materialize_grads(False)
+        return *drawn, ids, raw
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        center, distance_input, active_count = ctx.arguments
+        visible, raw, bits, active, starts, ids, norms, *saved = ctx.saved_tensors
+        drawn, tensors = saved[:5], saved[5:]
+        given = [None if gradient is None else gradient.contiguous() for gradient in gradients[:5]]
+        wanted = ctx.needs_input_grad[3:]
+        # The four tensors of a head are trained or frozen together; the C++ writes whole heads.
+        head_wanted = [any(wanted[5 + 4 * head : 9 + 4 * head]) for head in range(3)]
+        results = [
+            (torch.zeros_like(tensor) if index < 5 else torch.empty_like(tensor))
+            if (wanted[index] if index < 5 else head_wanted[(index - 5) // 4])
+            else None
+            for index, tensor in enumerate(tensors)
+        ]
+        native_library().sgs_anchors_backward(
+            ctypes.byref(_anchors(tensors, visible, center, distance_input)),
+            ctypes.byref(_Selection(*_pointers([raw, bits, active, starts]), active_count, ids.shape[0])),
+            ctypes.byref(_Gaussians(*_pointers([*drawn, ids, norms]))),
+            ctypes.byref(_GaussianGradients(*_pointers(given))),
+            ctypes.byref(_AnchorGradients(*_pointers(results[:5]), _heads(results[5:]))),
+            ctypes.c_int(torch.get_num_threads()),
+        )
+        return None, None, None, *(result if want else None for result, want in zip(results, wanted, strict=True))
+
+
+def _check(tensors: Sequence[Tensor], mlps: MLPWeights, distance_input: bool) -> None:
+    m, k = tensors[3].shape[:2]
+    d, hidden = tensors[4].shape[1], mlps.opacity.w1.shape[0]
+    inputs = d + 3 + int(distance_input)
+    expected = [(m, 3), (m, 3), (m, 3), (m, k, 3), (m, d)]
+    for outputs in (k, 3 * k, 7 * k):
+        expected += [(hidden, inputs), (hidden,), (outputs, hidden), (outputs,)]
+    for tensor, shape in zip(tensors, expected, strict=True):
+        if tensor.dtype != torch.float32 or tuple(tensor.shape) != shape:
+            raise BackendError(
+                f"The cpu back-end generates from float32 tensors that fit each other: expected {shape}, got "
+                f"{tensor.dtype} {tuple(tensor.shape)}; the reference back-end takes other precisions."
+            )
+
+
+def generate_structured(
+    positions: Tensor,
+    log_offset_scales: Tensor,
+    log_base_scales: Tensor,
+    offsets: Tensor,
+    features: Tensor,
+    mlps: MLPWeights,
+    camera_center: Tensor,
+    visible: Tensor,
+    *,
+    distance_input: bool,
+) -> StructuredGaussians:
+    """Dress the visible anchors for one camera, see ``kernels.reference_anchors.generate_structured``.
+
+    Gradients of what does not require them are not computed. Results do not depend on the number of threads.
+
+    Raises:
+        BackendError: a tensor of another precision, or shapes that do not fit each other.
+    """
+    heads: tuple[HeadWeights, ...] = (mlps.opacity, mlps.color, mlps.covariance)
+    tensors = [positions, log_offset_scales, log_base_scales, offsets, features]
+    tensors = [tensor.contiguous() for tensor in [*tensors, *(weight for head in heads for weight in head)]]
+    _check(tensors, mlps, distance_input)
+    visible = visible.to(torch.int64).contiguous()
+    means, quats, scales, opacities, colors, ids, raw = _Generate.apply(  # type: ignore[misc]
+        visible, camera_center.tolist(), distance_input, *tensors
+    )
+    return StructuredGaussians(means, quats, scales, opacities, colors, ids, raw)
