@@ -42,7 +42,8 @@ class _L1SSIM(torch.autograd.Function):
         return l1, ssim
 
     @staticmethod
-    def backward(ctx: Any, grad_l1: Tensor, grad_ssim: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        to_l1, to_ssim = gradients
         image, target, ssim_gradient = ctx.saved_tensors
         gradient = torch.empty_like(image)
         native_library().sgs_l1_ssim_backward(
@@ -50,8 +51,8 @@ class _L1SSIM(torch.autograd.Function):
             *_targets(target),
             _pointer(ssim_gradient),
             ctypes.c_int64(image.numel()),
-            ctypes.c_float(float(grad_l1) / image.numel()),
-            ctypes.c_float(float(grad_ssim)),
+            ctypes.c_float(float(to_l1) / image.numel()),
+            ctypes.c_float(float(to_ssim)),
             _pointer(gradient),
             ctypes.c_int(torch.get_num_threads()),
         )

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The C++ optimiser step beside its oracle."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from structgstream.errors import BackendError
+from structgstream.kernels import cpu_adam, reference_adam
+
+OPTIONS = {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-15}
+
+
+def steps(module, param: Tensor, gradients: list[Tensor], rows: Tensor | None = None) -> list[Tensor]:
+    state = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
+    for n, gradient in enumerate(gradients, start=1):
+        module.adam_step(state[0], gradient.to(param), state[1], state[2], step=n, rows=rows, **OPTIONS)
+    return state
+
+
+@pytest.mark.parametrize("shape", [(1,), (7, 3), (50, 5, 3), (9001, 4)])
+def test_steps(shape: tuple[int, ...]) -> None:
+    param = torch.randn(shape)
+    # Gradients of a mean over pixels are tiny, and those of unseen rows are zero.
+    gradients = [torch.randn(shape) * 1e-6 * (torch.rand(shape) < 0.8) for _ in range(10)]
+    ours, exact = steps(cpu_adam, param, gradients), steps(reference_adam, param.double(), gradients)
+    assert torch.allclose(ours[0].double(), exact[0], rtol=1e-6, atol=1e-6)
+    for moment, wanted in zip(ours[1:], exact[1:], strict=True):
+        assert (moment.double() - wanted).norm() <= 1e-6 * wanted.norm()
+
+
+def test_as_torch() -> None:
+    param = torch.randn(33, 3)
+    gradients = [torch.randn(33, 3) for _ in range(20)]
+    twin = param.clone().requires_grad_()
+    theirs = torch.optim.Adam([twin], **OPTIONS)
+    for gradient in gradients:
+        twin.grad = gradient
+        theirs.step()
+    assert torch.allclose(steps(cpu_adam, param, gradients)[0], twin.detach(), rtol=1e-6, atol=1e-6)
+
+
+def test_selected_rows_move_and_others_stay() -> None:
+    param, rows = torch.randn(60, 2, 3), torch.tensor([1, 3, 59])
+    gradients = [torch.randn(60, 2, 3) for _ in range(3)]
+    some, every = steps(cpu_adam, param, gradients, rows), steps(cpu_adam, param, gradients)
+    others = torch.ones(60, dtype=torch.bool)
+    others[rows] = False
+    assert torch.equal(some[0][others], param[others])
+    assert (some[1][others] == 0).all()
+    assert (some[2][others] == 0).all()
+    assert all(torch.allclose(a[rows], b[rows], atol=1e-6) for a, b in zip(some, every, strict=True))
+
+
+def test_bitwise_equal_for_any_number_of_threads() -> None:
+    param, rows = torch.randn(30_000, 3), torch.arange(0, 30_000, 2)
+    gradients = [torch.randn(30_000, 3) for _ in range(2)]
+    for selected in (None, rows):
+        results = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(steps(cpu_adam, param, gradients, selected))
+        for other in results[1:]:
+            assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_nothing_to_move() -> None:
+    assert steps(cpu_adam, torch.zeros(0, 3), [torch.zeros(0, 3)])[0].shape == (0, 3)
+
+
+def test_what_it_cannot_step() -> None:
+    param = torch.zeros(4, 3)
+    with pytest.raises(BackendError, match="float64"):
+        steps(cpu_adam, param.double(), [param.double()])
+    with pytest.raises(BackendError, match="contiguous"):
+        cpu_adam.adam_step(torch.zeros(3, 4).T, param, param.clone(), param.clone(), step=1, **OPTIONS)
+    with pytest.raises(BackendError, match=r"0 \.\.\. 3"):
+        steps(cpu_adam, param, [param], torch.tensor([4]))

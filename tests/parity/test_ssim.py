@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The C++ loss beside its oracle in float64."""
+
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from structgstream.errors import BackendError
+from structgstream.kernels import cpu_ssim, reference_ssim
+
+
+def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """A smooth picture and a noisy copy."""
+    rough = torch.rand(3, height, width)
+    target = torch.nn.functional.avg_pool2d(rough, 5, 1, 2).permute(1, 2, 0).contiguous()
+    return (target + 0.05 * torch.randn(height, width, 3)).clamp(0, 1), target
+
+
+def value_and_gradient(module, image: Tensor, target: Tensor, weights: tuple[float, float]) -> tuple[Tensor, ...]:
+    image = image.clone().requires_grad_()
+    l1, ssim = module.l1_ssim(image, target)
+    (gradient,) = torch.autograd.grad(weights[0] * l1 + weights[1] * ssim, image)
+    return l1.detach(), ssim.detach(), gradient
+
+
+# One row, one pixel, less than a window, an odd size, more than one strip of columns.
+@pytest.mark.parametrize("size", [(1, 23), (1, 1), (7, 5), (37, 29), (24, 600)])
+@pytest.mark.parametrize("as_bytes", [False, True])
+def test_value_and_gradient(size: tuple[int, int], as_bytes: bool) -> None:
+    image, target = pictures(*size)
+    if as_bytes:
+        target = (target * 255).round().to(torch.uint8)
+    exact_target = target if as_bytes else target.double()
+    for weights in [(0.0, 1.0), (1.0, -0.2)]:
+        l1, ssim, gradient = value_and_gradient(cpu_ssim, image, target, weights)
+        exact_l1, exact_ssim, exact = value_and_gradient(reference_ssim, image.double(), exact_target, weights)
+        assert abs(l1.double() - exact_l1) < 1e-6
+        assert abs(ssim.double() - exact_ssim) < 1e-6
+        assert (gradient - exact).norm() < 1e-5 * exact.norm()
+
+
+def test_inside_the_border_it_is_the_published_ssim() -> None:
+    """A border of zeros makes every window lie inside, so the mean is that of scikit-image's map."""
+    image, target = pictures(40, 48)
+    margin = 12
+    padded = [torch.nn.functional.pad(x, (0, 0, margin, margin, margin, margin)) for x in (image, target)]
+    _, theirs = structural_similarity(
+        padded[0].double().numpy(),
+        padded[1].double().numpy(),
+        data_range=1.0,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+        truncate=5 / 1.5,
+    )
+    assert cpu_ssim.ssim(padded[0], padded[1]).item() == pytest.approx(theirs.mean(), abs=1e-6)
+
+
+def test_bitwise_equal_for_any_number_of_threads() -> None:
+    image, target = pictures(45, 320)
+    results = []
+    for threads in (1, 2, 3, 2):
+        torch.set_num_threads(threads)
+        results.append(value_and_gradient(cpu_ssim, image, target, (0.8, -0.2)))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_equal_pictures_score_one_and_pull_nowhere() -> None:
+    image, _ = pictures(20, 20)
+    l1, ssim, gradient = value_and_gradient(cpu_ssim, image, image.clone(), (1.0, -1.0))
+    assert l1 == 0.0
+    assert ssim.item() == pytest.approx(1.0, abs=1e-6)
+    assert gradient.abs().max() < 1e-6
+
+
+def test_a_picture_that_is_not_contiguous() -> None:
+    image, target = pictures(20, 24)
+    turned = image.permute(1, 0, 2).contiguous().permute(1, 0, 2)
+    assert torch.equal(cpu_ssim.ssim(turned, target), cpu_ssim.ssim(image, target))
+
+
+def test_what_it_cannot_compare() -> None:
+    image, target = pictures(8, 8)
+    with pytest.raises(BackendError, match="float64"):
+        cpu_ssim.l1_ssim(image.double(), target)
+    with pytest.raises(BackendError, match=r"\(8, 7, 3\)"):
+        cpu_ssim.l1_ssim(image, target[:, :7])
