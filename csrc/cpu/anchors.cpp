@@ -60,7 +60,7 @@ class Packed {
         return *this;
     }
     // y = W x + b for one block; rows of x and y are kBlock floats.
-    void apply(const float* x, float* y) const {
+    [[gnu::noinline]] void apply(const float* x, float* y) const {
         const float* w = weights_.data();
         for (int t = 0; t < tiles_; ++t) {
             vf sums[kTile][2];
@@ -127,72 +127,87 @@ void mask(float* gradient, int count, const int32_t* bits) {
     }
 }
 
-// The MLPs' inputs of a block: rows 0 ... D - 1 the feature, then the direction, then the distance (always there; the
-// padding of the rows hides it from heads that do not take it).
-struct Inputs {
-    float* rows;      // [inputs_padded + 1][kBlock]
-    float* distance;  // [kBlock]
-    void read(const sgs_anchors& a, const Sizes& s, const int64_t* anchors, int count) const {
-        for (int l = 0; l < kBlock; ++l) {
-            if (l >= count) {
-                for (int i = 0; i < s.inputs; ++i) rows[i * kBlock + l] = 0.0f;
-                distance[l] = 1.0f;
-                continue;
-            }
-            const float* feature = a.features + anchors[l] * s.d;
-            for (int i = 0; i < s.d; ++i) rows[i * kBlock + l] = feature[i];
-            const float* position = a.positions + anchors[l] * 3;
-            const float x = position[0] - a.camera_center[0], y = position[1] - a.camera_center[1],
-                        z = position[2] - a.camera_center[2];
-            const float length = std::max(std::sqrt(x * x + y * y + z * z), 1e-12f);
-            rows[s.d * kBlock + l] = x / length;
-            rows[(s.d + 1) * kBlock + l] = y / length;
-            rows[(s.d + 2) * kBlock + l] = z / length;
-            if (s.inputs > s.d + 3) rows[(s.d + 3) * kBlock + l] = length;
-            distance[l] = length;
+// The anchors of a block. Lanes beyond `count` repeat the last anchor; nothing of theirs is written.
+struct Block {
+    int count;
+    int64_t anchors[kBlock];
+};
+
+// Rows of `values` (`width` floats for each anchor) as rows of lanes.
+void read_rows(const float* values, int width, const Block& block, float* rows) {
+    int column = 0;
+    for (; column + kLanes <= width; column += kLanes) {
+        for (int half = 0; half < kBlock; half += kLanes) {
+            vf square[kLanes];
+#pragma GCC unroll 16
+            for (int l = 0; l < kLanes; ++l) square[l] = load(values + block.anchors[half + l] * width + column);
+            transpose(square);
+#pragma GCC unroll 16
+            for (int c = 0; c < kLanes; ++c) store(rows + (column + c) * kBlock + half, square[c]);
         }
+    }
+    for (; column < width; ++column)
+        for (int l = 0; l < kBlock; ++l) rows[column * kBlock + l] = values[block.anchors[l] * width + column];
+}
+
+// The way back, for `count` anchors.
+void write_rows(const float* rows, int width, const Block& block, float* values) {
+    int column = 0;
+    for (; column + kLanes <= width; column += kLanes) {
+        for (int half = 0; half < block.count; half += kLanes) {
+            vf square[kLanes];
+#pragma GCC unroll 16
+            for (int c = 0; c < kLanes; ++c) square[c] = load(rows + (column + c) * kBlock + half);
+            transpose(square);
+            for (int l = 0; l < std::min(kLanes, block.count - half); ++l)
+                store(values + block.anchors[half + l] * width + column, square[l]);
+        }
+    }
+    for (; column < width; ++column)
+        for (int l = 0; l < block.count; ++l) values[block.anchors[l] * width + column] = rows[column * kBlock + l];
+}
+
+// The MLPs' inputs of a block: rows 0 ... D - 1 the feature, then the direction, then the distance if it is an input.
+struct Inputs {
+    float* rows;      // [inputs_padded][kBlock]
+    float* distance;  // [kBlock]
+    [[gnu::noinline]] void read(const sgs_anchors& a, const Sizes& s, const Block& block) const {
+        read_rows(a.features, s.d, block, rows);
+        float* direction = rows + s.d * kBlock;
+        read_rows(a.positions, 3, block, direction);
+        for (int l = 0; l < kBlock; ++l) {
+            const float x = direction[l] - a.camera_center[0], y = direction[kBlock + l] - a.camera_center[1],
+                        z = direction[2 * kBlock + l] - a.camera_center[2];
+            distance[l] = std::max(std::sqrt(x * x + y * y + z * z), 1e-12f);
+            direction[l] = x / distance[l];
+            direction[kBlock + l] = y / distance[l];
+            direction[2 * kBlock + l] = z / distance[l];
+        }
+        if (s.inputs > s.d + 3) std::copy_n(distance, kBlock, direction + 3 * kBlock);
         for (int i = s.inputs; i < s.inputs_padded; ++i) std::fill_n(rows + i * kBlock, kBlock, 0.0f);
     }
 };
 
 // Three numbers of each anchor as rows, through the exponential.
-void read_exponentials(const float* values, const int64_t* anchors, int count, float* rows) {
-    for (int l = 0; l < kBlock; ++l)
-        for (int c = 0; c < 3; ++c) rows[c * kBlock + l] = l < count ? values[anchors[l] * 3 + c] : 0.0f;
+void read_exponentials(const float* values, const Block& block, float* rows) {
+    read_rows(values, 3, block, rows);
     for (int i = 0; i < 3 * kBlock; i += kLanes) store(rows + i, exponential(load(rows + i)));
-}
-
-// Lane n of the result is the sum over the lanes of sums[n].
-vf sums_of_lanes(vf (&sums)[kLanes]) {
-#pragma GCC unroll 4
-    for (int step = 1; step < kLanes; step *= 2) {
-        vi low, high;
-        for (int i = 0; i < kLanes; ++i) {
-            low[i] = i & step ? kLanes + i - step : i;
-            high[i] = i & step ? kLanes + i : i + step;
-        }
-#pragma GCC unroll 8
-        for (int n = 0; n < kLanes / 2 / step; ++n) {
-            const vf a = sums[2 * n], b = sums[2 * n + 1];
-            sums[n] = __builtin_shuffle(a, b, low) + __builtin_shuffle(a, b, high);
-        }
-    }
-    return sums[0];
 }
 
 constexpr int kAcross = kLanes == 16 ? 4 : 2;
 constexpr int kDown = kLanes / kAcross;
 
-// out[i][j] += sum over the anchors of a chunk of a[i] * b[j]. Blocks of a and b are `a_block` and `b_block` floats apart.
-void add_products(
-    const float* a, size_t a_block, int rows, const float* b, size_t b_block, int columns, int blocks, float* out) {
+// out[i][j] += sum over the anchors of a chunk of a[i] * b[j], with `out` in tiles of kDown x kAcross (see `in_tiles`).
+// Blocks of a and of b are `stride` floats apart.
+[[gnu::noinline]] void add_products(
+    const float* a, int rows, const float* b, int columns, size_t stride, int blocks, float* out) {
     for (int i = 0; i < rows; i += kDown) {
-        for (int j = 0; j < columns; j += kAcross) {
+        for (int j = 0; j < columns; j += kAcross, out += kLanes) {
             vf sums[kLanes];
             for (vf& sum : sums) sum = splat(0.0f);
             for (int n = 0; n < blocks; ++n) {
-                const float* p = a + n * a_block + i * kBlock;
-                const float* q = b + n * b_block + j * kBlock;
+                const float* p = a + n * stride + i * kBlock;
+                const float* q = b + n * stride + j * kBlock;
 #pragma GCC unroll 2
                 for (int half = 0; half < kBlock; half += kLanes) {
                     vf right[kAcross];
@@ -206,20 +221,22 @@ void add_products(
                     }
                 }
             }
-            float totals[kLanes];
-            store(totals, sums_of_lanes(sums));
-            for (int r = 0; r < kDown; ++r)
-                for (int c = 0; c < kAcross; ++c) out[(i + r) * columns + j + c] += totals[r * kAcross + c];
+            store(out, load(out) + sums_of_lanes(sums));
         }
     }
 }
 
+// Where element (i, j) lies in the output of `add_products`.
+inline int in_tiles(int i, int j, int columns) {
+    return ((i / kDown) * (columns / kAcross) + j / kAcross) * kLanes + (i % kDown) * kAcross + j % kAcross;
+}
+
 // out[i] += sum over the anchors of a chunk of a[i].
-void add_sums(const float* a, size_t a_block, int rows, int blocks, float* out) {
+void add_sums(const float* a, int rows, size_t stride, int blocks, float* out) {
     for (int i = 0; i < rows; ++i) {
         vf sum = splat(0.0f);
         for (int n = 0; n < blocks; ++n) {
-            const float* p = a + n * a_block + i * kBlock;
+            const float* p = a + n * stride + i * kBlock;
             sum += load(p) + load(p + kLanes);
         }
         float lanes[kLanes];
@@ -228,6 +245,12 @@ void add_sums(const float* a, size_t a_block, int rows, int blocks, float* out) 
             for (int l = 0; l < step; ++l) lanes[l] += lanes[l + step];
         out[i] += lanes[0];
     }
+}
+
+Block active_block(const sgs_anchors& a, const sgs_selection& selection, int begin, int count) {
+    Block block{count, {}};
+    for (int l = 0; l < kBlock; ++l) block.anchors[l] = a.visible[selection.active[begin + std::min(l, count - 1)]];
+    return block;
 }
 
 }  // namespace
@@ -245,7 +268,9 @@ void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
         int32_t* bits = reinterpret_cast<int32_t*>(raw + s.outputs_padded[0] * kBlock);
         for (int row = chunk * kChunk; row < std::min(m, (chunk + 1) * kChunk); row += kBlock) {
             const int count = std::min(kBlock, m - row);
-            x.read(a, s, a.visible + row, count);
+            Block block{count, {}};
+            for (int l = 0; l < kBlock; ++l) block.anchors[l] = a.visible[row + std::min(l, count - 1)];
+            x.read(a, s, block);
             first.apply(x.rows, hidden);
             rectify(hidden, s.hidden_padded, bits, s.words);
             second.apply(hidden, raw);
@@ -291,11 +316,10 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
         float* reach = norms + k * kBlock;
         float* base = reach + 3 * kBlock;
         int32_t* bits = reinterpret_cast<int32_t*>(base + 3 * kBlock);
-        int64_t anchors[kBlock];
         for (int begin = chunk * kChunk; begin < std::min(total, (chunk + 1) * kChunk); begin += kBlock) {
             const int count = std::min(kBlock, total - begin);
-            for (int l = 0; l < count; ++l) anchors[l] = a.visible[selection.active[begin + l]];
-            x.read(a, s, anchors, count);
+            const Block block = active_block(a, selection, begin, count);
+            x.read(a, s, block);
             for (int h = 1; h < kHeads; ++h) {
                 first[h - 1].apply(x.rows, hidden);
                 rectify(hidden, s.hidden_padded, bits, s.words);
@@ -305,8 +329,8 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
                             bits[w * kBlock + l];
                 second[h - 1].apply(hidden, h == 1 ? color : covariance);
             }
-            read_exponentials(a.log_offset_scales, anchors, count, reach);
-            read_exponentials(a.log_base_scales, anchors, count, base);
+            read_exponentials(a.log_offset_scales, block, reach);
+            read_exponentials(a.log_base_scales, block, base);
             for (int i = 0; i < 3 * k * kBlock; i += kLanes) store(color + i, sigmoid(load(color + i)));
             for (int j = 0; j < k; ++j) {
                 float* rows = covariance + 7 * j * kBlock;
@@ -320,22 +344,27 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
                 }
             }
             for (int l = 0; l < count; ++l) {
+                const int64_t anchor = block.anchors[l];
                 const float* raw = selection.raw_opacities + static_cast<size_t>(selection.active[begin + l]) * k;
-                const float* position = a.positions + anchors[l] * 3;
-                const float* offset = a.offsets + anchors[l] * k * 3;
-                int64_t g = selection.starts[begin + l];
-                for (int j = 0; j < k; ++j) {
-                    if (!(raw[j] > 0.0f)) continue;
+                const float* position = a.positions + anchor * 3;
+                const int64_t start = selection.starts[begin + l], end = selection.starts[begin + l + 1];
+                for (int64_t j = 0, g = start; g < end; ++j) {  // writes what is not drawn too, and then over it
+                    out.ids[g] = anchor * k + j;
+                    g += raw[j] > 0.0f;
+                }
+                for (int64_t g = start; g < end; ++g) {
+                    const int j = static_cast<int>(out.ids[g] - anchor * k);
+                    const float* offset = a.offsets + out.ids[g] * 3;
+                    const float* shape = covariance + 7 * j * kBlock + l;
+                    const float* shade = color + 3 * j * kBlock + l;
                     for (int c = 0; c < 3; ++c) {
-                        out.means[3 * g + c] = position[c] + offset[3 * j + c] * reach[c * kBlock + l];
-                        out.scales[3 * g + c] = covariance[(7 * j + c) * kBlock + l];
-                        out.colors[3 * g + c] = color[(3 * j + c) * kBlock + l];
+                        out.means[3 * g + c] = position[c] + offset[c] * reach[c * kBlock + l];
+                        out.scales[3 * g + c] = shape[c * kBlock];
+                        out.colors[3 * g + c] = shade[c * kBlock];
                     }
-                    for (int c = 0; c < 4; ++c) out.quats[4 * g + c] = covariance[(7 * j + 3 + c) * kBlock + l];
+                    for (int c = 0; c < 4; ++c) out.quats[4 * g + c] = shape[(3 + c) * kBlock];
                     out.quat_norms[g] = norms[j * kBlock + l];
                     out.opacities[g] = raw[j];
-                    out.ids[g] = anchors[l] * k + j;
-                    ++g;
                 }
             }
         }
@@ -375,81 +404,85 @@ struct Backward {
 };
 
 // Gradients of a block's Gaussians to gradients of the heads' outputs (before their activations) and of the anchors.
-void gather(const Backward& b, int begin, int count, const int64_t* anchors, float* const (&outputs)[kHeads], float* means) {
+[[gnu::noinline]] void gather(
+    const Backward& b, int begin, const Block& block, float* const (&outputs)[kHeads], float* to_means) {
     const int k = b.s.k;
-    float reach[3 * kBlock], base[3 * kBlock];
-    read_exponentials(b.a.log_offset_scales, anchors, count, reach);
-    read_exponentials(b.a.log_base_scales, anchors, count, base);
+    float reach[3 * kBlock], base[3 * kBlock], to_reach[3 * kBlock], to_base[3 * kBlock];
+    read_exponentials(b.a.log_offset_scales, block, reach);
+    read_exponentials(b.a.log_base_scales, block, base);
     for (int h = 0; h < kHeads; ++h)
         if (b.uses(h)) std::memset(outputs[h], 0, sizeof(float) * b.s.outputs_padded[h] * kBlock);
-    for (int l = 0; l < count; ++l) {
-        const int row = b.selection.active[begin + l];
-        const float* raw = b.selection.raw_opacities + static_cast<size_t>(row) * k;
-        const float* offset = b.a.offsets + anchors[l] * k * 3;
-        float to_mean[3] = {}, to_reach[3] = {}, to_base[3] = {};
-        int64_t g = b.selection.starts[begin + l];
-        for (int j = 0; j < k; ++j) {
-            if (!(raw[j] > 0.0f)) continue;
-            if (b.from.means != nullptr) {
-                for (int c = 0; c < 3; ++c) {
-                    const float gradient = b.from.means[3 * g + c];
-                    to_mean[c] += gradient;
-                    to_reach[c] += gradient * offset[3 * j + c];
-                    if (b.to.offsets != nullptr)
-                        b.to.offsets[(anchors[l] * k + j) * 3 + c] = gradient * reach[c * kBlock + l];
-                }
+    for (int l = 0; l < block.count; ++l) {
+        const int64_t first_id = block.anchors[l] * k;
+        float mean_sum[3] = {}, reach_sum[3] = {}, base_sum[3] = {};
+        for (int64_t g = b.selection.starts[begin + l]; g < b.selection.starts[begin + l + 1]; ++g) {
+            const int j = static_cast<int>(b.drawn.ids[g] - first_id);
+            const float* offset = b.a.offsets + b.drawn.ids[g] * 3;
+            float scale_gradient[3];
+            for (int c = 0; c < 3; ++c) {
+                const float gradient = b.from.means[3 * g + c];
+                mean_sum[c] += gradient;
+                reach_sum[c] += gradient * offset[c];
+                scale_gradient[c] = b.from.scales[3 * g + c] * b.drawn.scales[3 * g + c];
+                base_sum[c] += scale_gradient[c];
             }
-            if (b.from.opacities != nullptr && b.uses(0))
-                outputs[0][j * kBlock + l] = b.from.opacities[g] * (1.0f - raw[j] * raw[j]);
-            if (b.from.colors != nullptr && b.uses(1)) {
+            if (b.to.offsets != nullptr)
+                for (int c = 0; c < 3; ++c)
+                    b.to.offsets[b.drawn.ids[g] * 3 + c] = b.from.means[3 * g + c] * reach[c * kBlock + l];
+            if (b.uses(0)) {
+                const float value = b.drawn.opacities[g];
+                outputs[0][j * kBlock + l] = b.from.opacities[g] * (1.0f - value * value);
+            }
+            if (b.uses(1)) {
+                float* out = outputs[1] + 3 * j * kBlock + l;
                 for (int c = 0; c < 3; ++c) {
                     const float value = b.drawn.colors[3 * g + c];
-                    outputs[1][(3 * j + c) * kBlock + l] = b.from.colors[3 * g + c] * value * (1.0f - value);
+                    out[c * kBlock] = b.from.colors[3 * g + c] * value * (1.0f - value);
                 }
             }
-            if (b.from.scales != nullptr) {
-                for (int c = 0; c < 3; ++c) {
-                    const float value = b.drawn.scales[3 * g + c], gradient = b.from.scales[3 * g + c] * value;
-                    to_base[c] += gradient;
-                    if (b.uses(2)) outputs[2][(7 * j + c) * kBlock + l] = gradient * (1.0f - value / base[c * kBlock + l]);
-                }
-            }
-            if (b.from.quats != nullptr && b.uses(2)) {
+            if (b.uses(2)) {
+                float* out = outputs[2] + 7 * j * kBlock + l;
+                for (int c = 0; c < 3; ++c)
+                    out[c * kBlock] = scale_gradient[c] * (1.0f - b.drawn.scales[3 * g + c] / base[c * kBlock + l]);
                 const float* gradient = b.from.quats + 4 * g;
                 const float* quat = b.drawn.quats + 4 * g;
-                float along = 0.0f;
-                for (int c = 0; c < 4; ++c) along += gradient[c] * quat[c];
+                const float along =
+                    gradient[0] * quat[0] + gradient[1] * quat[1] + gradient[2] * quat[2] + gradient[3] * quat[3];
                 for (int c = 0; c < 4; ++c)
-                    outputs[2][(7 * j + 3 + c) * kBlock + l] = (gradient[c] - along * quat[c]) * b.drawn.quat_norms[g];
+                    out[(3 + c) * kBlock] = (gradient[c] - along * quat[c]) * b.drawn.quat_norms[g];
             }
-            ++g;
         }
         for (int c = 0; c < 3; ++c) {
-            means[c * kBlock + l] = to_mean[c];
-            if (b.to.log_offset_scales != nullptr)
-                b.to.log_offset_scales[anchors[l] * 3 + c] = to_reach[c] * reach[c * kBlock + l];
-            if (b.to.log_base_scales != nullptr) b.to.log_base_scales[anchors[l] * 3 + c] = to_base[c];
+            to_means[c * kBlock + l] = mean_sum[c];
+            to_reach[c * kBlock + l] = reach_sum[c] * reach[c * kBlock + l];
+            to_base[c * kBlock + l] = base_sum[c];
         }
     }
+    if (b.to.log_offset_scales != nullptr) write_rows(to_reach, 3, block, b.to.log_offset_scales);
+    if (b.to.log_base_scales != nullptr) write_rows(to_base, 3, block, b.to.log_base_scales);
 }
 
 // Gradients of the MLPs' inputs, and of the means, to features and positions.
-void give(const Backward& b, const Inputs& x, const float* inputs, const float* means, const int64_t* anchors, int count) {
+[[gnu::noinline]] void give(
+    const Backward& b, const Inputs& x, const float* inputs, const float* to_means, const Block& block) {
     const int d = b.s.d;
-    for (int l = 0; l < count; ++l) {
-        if (b.to.features != nullptr)
-            for (int i = 0; i < d; ++i) b.to.features[anchors[l] * d + i] = inputs[i * kBlock + l];
-        if (b.to.positions == nullptr) continue;
-        const float* gradient = inputs + (d - b.input_first) * kBlock + l;
-        const float* direction = x.rows + d * kBlock + l;
+    if (b.to.features != nullptr) write_rows(inputs, d, block, b.to.features);
+    if (b.to.positions == nullptr) return;
+    const float* gradient = inputs + (d - b.input_first) * kBlock;
+    const float* direction = x.rows + d * kBlock;
+    const bool distance_input = b.s.inputs > d + 3;
+    float to_positions[3 * kBlock];
+    for (int l = 0; l < kBlock; ++l) {
         float along = 0.0f;
-        for (int c = 0; c < 3; ++c) along += gradient[c * kBlock] * direction[c * kBlock];
-        const float to_distance = b.s.inputs > d + 3 ? gradient[3 * kBlock] : 0.0f;
+        for (int c = 0; c < 3; ++c) along += gradient[c * kBlock + l] * direction[c * kBlock + l];
+        const float to_distance = distance_input ? gradient[3 * kBlock + l] : 0.0f;
         for (int c = 0; c < 3; ++c)
-            b.to.positions[anchors[l] * 3 + c] = means[c * kBlock + l] +
-                                                 (gradient[c * kBlock] - along * direction[c * kBlock]) / x.distance[l] +
-                                                 to_distance * direction[c * kBlock];
+            to_positions[c * kBlock + l] =
+                to_means[c * kBlock + l] +
+                (gradient[c * kBlock + l] - along * direction[c * kBlock + l]) / x.distance[l] +
+                to_distance * direction[c * kBlock + l];
     }
+    write_rows(to_positions, 3, block, b.to.positions);
 }
 
 }  // namespace
@@ -482,7 +515,6 @@ void anchors_backward(
         float* input_gradient = memory.get() + kChunkBlocks * block_size;
         float* means = input_gradient + s.inputs_padded * kBlock;
         std::vector<int32_t> bits(static_cast<size_t>(s.words) * kBlock);
-        int64_t anchors[kBlock];
         for (int chunk = static_cast<int>(static_cast<int64_t>(chunks) * group / groups);
              chunk < static_cast<int>(static_cast<int64_t>(chunks) * (group + 1) / groups); ++chunk) {
             const int end = std::min(total, (chunk + 1) * kChunk);
@@ -496,9 +528,9 @@ void anchors_backward(
                 for (int h = 0; h < kHeads; ++h) outputs[h] = next, next += s.outputs_padded[h] * kBlock;
                 float* hidden_gradient = next;
                 float* hidden = next + kHeads * s.hidden_padded * kBlock;
-                for (int l = 0; l < count; ++l) anchors[l] = a.visible[selection.active[begin + l]];
-                x.read(a, s, anchors, count);
-                gather(b, begin, count, anchors, outputs, means);
+                const Block block = active_block(a, selection, begin, count);
+                x.read(a, s, block);
+                gather(b, begin, block, outputs, means);
                 for (int h = 0; h < kHeads; ++h) {
                     if (!b.uses(h)) continue;
                     float* gradient = hidden_gradient + h * s.hidden_padded * kBlock;
@@ -517,7 +549,7 @@ void anchors_backward(
                 }
                 if (b.to_inputs) {
                     to_input.apply(hidden_gradient, input_gradient);
-                    give(b, x, input_gradient, means, anchors, count);
+                    give(b, x, input_gradient, means, block);
                 }
             }
             const float* rows = memory.get();
@@ -530,10 +562,10 @@ void anchors_backward(
                     float* b1 = w1 + s.hidden_padded * s.inputs_padded;
                     float* w2 = b1 + s.hidden_padded;
                     float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
-                    add_products(gradient, block_size, s.hidden_padded, rows, block_size, s.inputs_padded, blocks, w1);
-                    add_sums(gradient, block_size, s.hidden_padded, blocks, b1);
-                    add_products(outputs, block_size, s.outputs_padded[h], hidden, block_size, s.hidden_padded, blocks, w2);
-                    add_sums(outputs, block_size, s.outputs_padded[h], blocks, b2);
+                    add_products(gradient, s.hidden_padded, rows, s.inputs_padded, block_size, blocks, w1);
+                    add_sums(gradient, s.hidden_padded, block_size, blocks, b1);
+                    add_products(outputs, s.outputs_padded[h], hidden, s.hidden_padded, block_size, blocks, w2);
+                    add_sums(outputs, s.outputs_padded[h], block_size, blocks, b2);
                 }
                 outputs += s.outputs_padded[h] * kBlock;
             }
@@ -550,11 +582,11 @@ void anchors_backward(
         const float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
         const sgs_head_gradient& out = to.heads[h];
         for (int o = 0; o < s.hidden; ++o) {
-            std::copy_n(w1 + o * s.inputs_padded, s.inputs, out.w1 + o * s.inputs);
+            for (int i = 0; i < s.inputs; ++i) out.w1[o * s.inputs + i] = w1[in_tiles(o, i, s.inputs_padded)];
             out.b1[o] = b1[o];
         }
         for (int o = 0; o < s.outputs[h]; ++o) {
-            std::copy_n(w2 + o * s.hidden_padded, s.hidden, out.w2 + o * s.hidden);
+            for (int i = 0; i < s.hidden; ++i) out.w2[o * s.hidden + i] = w2[in_tiles(o, i, s.hidden_padded)];
             out.b2[o] = b2[o];
         }
     }

@@ -55,10 +55,9 @@ struct sgs_gaussians {
     float* opacities;   // [N]
     float* colors;      // [N, 3]
     int64_t* ids;       // [N]
-    float* quat_norms;  // [N] one over the length before normalisation
+    float* quat_norms;  // [N] one over the quaternion's length before it was normalised
 };
 
-// Any pointer may be null: a missing gradient counts as zero.
 struct sgs_gaussian_gradients {
     const float* means;
     const float* quats;

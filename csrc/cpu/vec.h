@@ -73,6 +73,43 @@ inline vf hyperbolic_tangent(vf x) {
     return size < 0.625f ? small : with_sign;
 }
 
+// Lanes of `a` and `b` interleaved by groups of `step`: low takes the groups with an even number, high the odd ones.
+template <int Step>
+inline void interleave(vf a, vf b, vf& low, vf& high) {
+    vi from_low, from_high;
+    for (int i = 0; i < kLanes; ++i) {
+        from_low[i] = i & Step ? kLanes + i - Step : i;
+        from_high[i] = i & Step ? kLanes + i : i + Step;
+    }
+    low = __builtin_shuffle(a, b, from_low);
+    high = __builtin_shuffle(a, b, from_high);
+}
+
+template <int Step = 1>
+inline void transpose(vf (&rows)[kLanes]) {
+    if constexpr (Step < kLanes) {
+#pragma GCC unroll 16
+        for (int i = 0; i < kLanes; ++i)
+            if ((i & Step) == 0) interleave<Step>(rows[i], rows[i + Step], rows[i], rows[i + Step]);
+        transpose<2 * Step>(rows);
+    }
+}
+
+// Lane n of the result is the sum over the lanes of rows[n].
+template <int Step = 1>
+inline vf sums_of_lanes(vf (&rows)[kLanes]) {
+    if constexpr (Step < kLanes) {
+#pragma GCC unroll 8
+        for (int n = 0; n < kLanes / 2 / Step; ++n) {
+            vf low, high;
+            interleave<Step>(rows[2 * n], rows[2 * n + 1], low, high);
+            rows[n] = low + high;
+        }
+        return sums_of_lanes<2 * Step>(rows);
+    }
+    return rows[0];
+}
+
 // Memory on a cache line's border.
 class Buffer {
   public:

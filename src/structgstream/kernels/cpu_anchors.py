@@ -105,15 +105,14 @@ class _Generate(torch.autograd.Function):
         ctx.save_for_backward(visible, raw, bits, active, starts, ids, norms, *drawn, *tensors)
         ctx.arguments = center, distance_input, selection.active_count
         ctx.mark_non_differentiable(ids, raw)
-        ctx.set_materialize_grads(False)
         return *drawn, ids, raw
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         center, distance_input, active_count = ctx.arguments
         visible, raw, bits, active, starts, ids, norms, *saved = ctx.saved_tensors
         drawn, tensors = saved[:5], saved[5:]
-        given = [None if gradient is None else gradient.contiguous() for gradient in gradients[:5]]
+        given = [gradient.contiguous() for gradient in gradients[:5]]
         wanted = ctx.needs_input_grad[3:]
         # The four tensors of a head are trained or frozen together; the C++ writes whole heads.
         head_wanted = [any(wanted[5 + 4 * head : 9 + 4 * head]) for head in range(3)]
