@@ -3,8 +3,8 @@ import math
 
 import pytest
 import torch
-from rigs import arc_rig
 
+from rigs import arc_rig
 from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import CalibrationError
 

@@ -21,9 +21,7 @@ def test_the_named_defaults_exist() -> None:
 def frozen(value: object) -> bool:
     if not is_dataclass(value):
         return True
-    return type(value).__dataclass_params__.frozen and all(
-        frozen(getattr(value, f.name)) for f in fields(value)
-    )
+    return type(value).__dataclass_params__.frozen and all(frozen(getattr(value, f.name)) for f in fields(value))
 
 
 def test_configurations_are_values() -> None:

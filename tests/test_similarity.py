@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
-from rigs import arc_rig
 
+from rigs import arc_rig
 from structgstream.similarity import Similarity, normalising_similarity, rig_radius
 
 
@@ -15,9 +15,7 @@ def test_normalised_cameras_see_normalised_points_in_the_same_pixels() -> None:
     similarity = Similarity(center=(0.5, -1.0, 2.0), scale=0.3)
     point = torch.tensor([0.3, 0.2, 0.4], dtype=torch.float64)
     for name in rig:
-        assert torch.allclose(
-            pixel(rig[name], point), pixel(similarity.camera(rig[name]), similarity.points(point))
-        )
+        assert torch.allclose(pixel(rig[name], point), pixel(similarity.camera(rig[name]), similarity.points(point)))
 
 
 def test_inverse_gives_the_captures_units_back() -> None:

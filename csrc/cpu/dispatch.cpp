@@ -1,0 +1,187 @@
+// SPDX-License-Identifier: Apache-2.0
+// The C interface: each entry point goes to the build of its kernel for the instruction set in use.
+
+#include <algorithm>
+#include <atomic>
+#include <memory>
+
+#include "bin.h"
+#include "splat.h"
+#include "structgstream.h"
+
+// Every kernel source is compiled once for each instruction set into a namespace of this name (CMakeLists.txt).
+#define SGS_DECLARE(ISA)                                                                                              \
+    namespace structgstream::ISA {                                                                                    \
+    void project(const GaussianInputs&, Raster&, float*, int);                                                        \
+    void project_backward(const GaussianInputs&, const Raster&, const float*, const GaussianGradients&, int);         \
+    void rasterize(const Raster&, const float*, float*, float*, int);                                                 \
+    void rasterize_backward(                                                                                          \
+        const Raster&, const float*, const float*, const float*, const float*, const float*, float*, int);            \
+    void l1_ssim(const float*, const float*, const uint8_t*, int, int, float*, double*, double*, int);                \
+    void l1_ssim_backward(                                                                                            \
+        const float*, const float*, const uint8_t*, const float*, int64_t, float, float, float*, int);                \
+    void anchors_select(const sgs_anchors&, sgs_selection&, int);                                                     \
+    void anchors_dress(const sgs_anchors&, const sgs_selection&, const sgs_gaussians&, int);                          \
+    void anchors_backward(                                                                                            \
+        const sgs_anchors&, const sgs_selection&, const sgs_gaussians&, const sgs_gaussian_gradients&,                \
+        const sgs_anchor_gradients&, int);                                                                            \
+    void adam_step(                                                                                                   \
+        float*, const float*, float*, float*, const int64_t*, int64_t, int64_t, double, int64_t, double, double,      \
+        double, int);                                                                                                 \
+    }
+
+SGS_DECLARE(baseline)
+#ifdef SGS_HAVE_AVX2
+SGS_DECLARE(avx2)
+#define SGS_AVX2(call) \
+    case 1:            \
+        return structgstream::avx2::call;
+#else
+#define SGS_AVX2(call)
+#endif
+#ifdef SGS_HAVE_AVX512
+SGS_DECLARE(avx512)
+#define SGS_AVX512(call) \
+    case 2:              \
+        return structgstream::avx512::call;
+#else
+#define SGS_AVX512(call)
+#endif
+
+#define SGS_DISPATCH(call)                      \
+    switch (sgs_isa()) {                        \
+        SGS_AVX512(call)                        \
+        SGS_AVX2(call)                          \
+        default:                                \
+            return structgstream::baseline::call; \
+    }
+
+namespace {
+
+using namespace structgstream;
+
+int best_isa() {
+#if defined(SGS_HAVE_AVX512)
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl"))
+        return 2;
+#endif
+#if defined(SGS_HAVE_AVX2)
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) return 1;
+#endif
+    return 0;
+}
+
+std::atomic<int> isa{-1};
+
+void project_dispatched(const GaussianInputs& in, Raster& raster, float* radii, int threads) {
+    SGS_DISPATCH(project(in, raster, radii, threads))
+}
+
+void rasterize_dispatched(const Raster& raster, const float* background, float* image, float* alpha, int threads) {
+    SGS_DISPATCH(rasterize(raster, background, image, alpha, threads))
+}
+
+void rasterize_backward_dispatched(
+    const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
+    const float* grad_alpha, float* moments, int threads) {
+    SGS_DISPATCH(rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments, threads))
+}
+
+void project_backward_dispatched(
+    const GaussianInputs& in, const Raster& raster, const float* moments, const GaussianGradients& out, int threads) {
+    SGS_DISPATCH(project_backward(in, raster, moments, out, threads))
+}
+
+Pinhole pinhole(const float* viewmat, const float* K, int width, int height, float near_plane) {
+    Pinhole c;
+    std::copy_n(viewmat, 12, c.view);
+    c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
+    const float margin_x = 0.3f * 0.5f * width / c.fx, margin_y = 0.3f * 0.5f * height / c.fy;
+    c.left = c.cx / c.fx + margin_x, c.right = (width - c.cx) / c.fx + margin_x;
+    c.up = c.cy / c.fy + margin_y, c.down = (height - c.cy) / c.fy + margin_y;
+    c.near = near_plane, c.width = width, c.height = height;
+    return c;
+}
+
+}  // namespace
+
+extern "C" {
+
+int sgs_best_isa(void) { return best_isa(); }
+
+int sgs_isa(void) {
+    int current = isa.load(std::memory_order_relaxed);
+    if (current < 0) isa.store(current = best_isa(), std::memory_order_relaxed);
+    return current;
+}
+
+int sgs_use_isa(int wanted) {
+    isa.store(std::max(0, std::min(wanted, best_isa())), std::memory_order_relaxed);
+    return sgs_isa();
+}
+
+void* sgs_raster_forward(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
+    const float* background, const float* screen_offsets, float* image, float* alpha, float* radii, int threads) {
+    auto raster = std::make_unique<Raster>();
+    raster->camera = pinhole(viewmat, K, width, height, near_plane);
+    raster->tiles_x = (width + kTile - 1) / kTile;
+    raster->tiles_y = (height + kTile - 1) / kTile;
+    raster->splats.resize(count);
+    project_dispatched({means, quats, scales, opacities, colors, screen_offsets, count}, *raster, radii, threads);
+    bin(*raster);
+    rasterize_dispatched(*raster, background, image, alpha, threads);
+    return raster.release();
+}
+
+void sgs_raster_backward(
+    const void* state, int64_t count, const float* means, const float* quats, const float* scales,
+    const float* opacities, const float* colors, const float* background, const float* image, const float* alpha,
+    const float* grad_image, const float* grad_alpha, float* grad_means, float* grad_quats, float* grad_scales,
+    float* grad_opacities, float* grad_colors, float* grad_screen_offsets, int threads) {
+    const Raster& raster = *static_cast<const Raster*>(state);
+    std::vector<float> moments(raster.pairs.size() * kMomentCount, 0.0f);
+    rasterize_backward_dispatched(raster, background, image, alpha, grad_image, grad_alpha, moments.data(), threads);
+    project_backward_dispatched(
+        {means, quats, scales, opacities, colors, nullptr, count}, raster, moments.data(),
+        {grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_screen_offsets}, threads);
+}
+
+void sgs_raster_free(void* state) { delete static_cast<Raster*>(state); }
+
+void sgs_l1_ssim(
+    const float* image, const float* target, const uint8_t* target_u8, int height, int width, float* gradient,
+    double* row_l1, double* row_ssim, int threads) {
+    SGS_DISPATCH(l1_ssim(image, target, target_u8, height, width, gradient, row_l1, row_ssim, threads))
+}
+
+void sgs_l1_ssim_backward(
+    const float* image, const float* target, const uint8_t* target_u8, const float* ssim_gradient, int64_t count,
+    float l1_scale, float ssim_scale, float* gradient, int threads) {
+    SGS_DISPATCH(l1_ssim_backward(image, target, target_u8, ssim_gradient, count, l1_scale, ssim_scale, gradient, threads))
+}
+
+void sgs_anchors_select(const sgs_anchors* anchors, sgs_selection* selection, int threads) {
+    SGS_DISPATCH(anchors_select(*anchors, *selection, threads))
+}
+
+void sgs_anchors_dress(
+    const sgs_anchors* anchors, const sgs_selection* selection, const sgs_gaussians* out, int threads) {
+    SGS_DISPATCH(anchors_dress(*anchors, *selection, *out, threads))
+}
+
+void sgs_anchors_backward(
+    const sgs_anchors* anchors, const sgs_selection* selection, const sgs_gaussians* drawn,
+    const sgs_gaussian_gradients* from, const sgs_anchor_gradients* to, int threads) {
+    SGS_DISPATCH(anchors_backward(*anchors, *selection, *drawn, *from, *to, threads))
+}
+
+void sgs_adam_step(
+    float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,
+    double lr, int64_t step, double beta1, double beta2, double eps, int threads) {
+    SGS_DISPATCH(adam_step(param, grad, first, second, rows, count, width, lr, step, beta1, beta2, eps, threads))
+}
+
+}  // extern "C"

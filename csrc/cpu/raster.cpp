@@ -1,0 +1,250 @@
+// SPDX-License-Identifier: Apache-2.0
+// Blending splats over tiles, forward and backward.
+//
+// A vector is a small block of pixels (4 x 4, 4 x 2 or 2 x 2). Backward replays forward front to back: it keeps
+// R = what is still to come of the pixel's colour, dotted with the pixel's gradient, so that
+// dL/dalpha = T q - R / (1 - alpha) with q = color . gradient, and needs only the finished image.
+
+#include <algorithm>
+#include <cstring>
+
+#include "splat.h"
+#include "vec.h"
+
+#if defined(__AVX512F__) || defined(__AVX__) || defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace structgstream {
+namespace SGS_ISA {
+namespace {
+
+constexpr int kBlockX = kLanes == 4 ? 2 : 4;
+constexpr int kBlockY = kLanes / kBlockX;
+constexpr int kBlocksX = kTile / kBlockX;
+constexpr int kBlocksY = kTile / kBlockY;
+constexpr int kBlocks = kBlocksX * kBlocksY;
+
+inline bool any(vi mask) {
+#if defined(__AVX512F__)
+    return _mm512_cmplt_epi32_mask((__m512i)mask, _mm512_setzero_si512()) != 0;
+#elif defined(__AVX__)
+    return _mm256_movemask_ps((__m256)mask) != 0;
+#elif defined(__SSE2__)
+    return _mm_movemask_ps((__m128)mask) != 0;
+#else
+    int32_t found = 0;
+    for (int i = 0; i < kLanes; ++i) found |= mask[i];
+    return found != 0;
+#endif
+}
+
+inline float sum(vf v) {
+    float parts[kLanes];
+    store(parts, v);
+    for (int width = kLanes / 2; width > 0; width /= 2)
+        for (int i = 0; i < width; ++i) parts[i] += parts[i + width];
+    return parts[0];
+}
+
+// 2^x for x in [-8, 0.1]: the rounding splits off the integer, a polynomial fitted around zero does the rest.
+inline vf power_of_two(vf x) {
+    const vf magic = splat(12582912.0f);
+    const vf rounded = x + magic;
+    const vf f = x - (rounded - magic);
+    vf p = splat(1.54035304e-4f);
+    p = p * f + 1.33335581e-3f;
+    p = p * f + 9.61812911e-3f;
+    p = p * f + 5.55041087e-2f;
+    p = p * f + 2.40226507e-1f;
+    p = p * f + 6.93147181e-1f;
+    p = p * f + 1.0f;
+    return (vf)((vi)p + ((vi)rounded << 23));
+}
+
+struct Lanes {
+    vf x, y;  // pixel centres within a block
+    Lanes() {
+        for (int i = 0; i < kLanes; ++i) x[i] = i % kBlockX + 0.5f, y[i] = i / kBlockX + 0.5f;
+    }
+};
+
+// The blocks of a tile that a splat's box touches.
+struct Blocks {
+    int x0, x1, y0, y1;
+    Blocks(const Splat& s, int left, int top)
+        : x0(std::max(0, s.box[0] - left) / kBlockX),
+          x1((std::min(kTile, s.box[2] - left) + kBlockX - 1) / kBlockX),
+          y0(std::max(0, s.box[1] - top) / kBlockY),
+          y1((std::min(kTile, s.box[3] - top) + kBlockY - 1) / kBlockY) {}
+};
+
+// One splat over one block of pixels whose transmittance is T. Positive T is live; a pixel that has stopped keeps its
+// transmittance with a minus sign.
+struct Coverage {
+    vf dx, dy, alpha;
+    vi used, clamped, stopped;
+
+    bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T) {
+        dx = lanes.x + (left - s.x), dy = lanes.y + (top - s.y);
+        const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
+        used = (power >= kLog2MinAlpha) & (T > 0.0f);
+        if (!any(used)) return false;
+        const vf raw = power_of_two(largest(power, splat(-8.0f)));
+        clamped = raw >= kMaxAlpha;
+        alpha = used ? smallest(raw, splat(kMaxAlpha)) : splat(0.0f);
+        stopped = used & (T * (1.0f - alpha) <= kMinTransmittance);
+        alpha = stopped ? splat(0.0f) : alpha;
+        return true;
+    }
+};
+
+struct Tile {
+    int left, top, right, bottom;
+    Tile(const Raster& r, int index)
+        : left(index % r.tiles_x * kTile),
+          top(index / r.tiles_x * kTile),
+          right(std::min(left + kTile, r.camera.width)),
+          bottom(std::min(top + kTile, r.camera.height)) {}
+};
+
+// Pixels of a tile between their picture order and their block order. Outside the picture: zero.
+template <int Channels>
+void gather(const float* picture, int width, const Tile& t, float (*planes)[kTilePixels]) {
+    std::memset(planes, 0, sizeof(float) * Channels * kTilePixels);
+    for (int y = t.top; y < t.bottom; ++y)
+        for (int x = t.left; x < t.right; ++x) {
+            const int bx = (x - t.left) / kBlockX, by = (y - t.top) / kBlockY;
+            const int at = (by * kBlocksX + bx) * kLanes + (y - t.top) % kBlockY * kBlockX + (x - t.left) % kBlockX;
+            for (int c = 0; c < Channels; ++c)
+                planes[c][at] = picture[(static_cast<size_t>(y) * width + x) * Channels + c];
+        }
+}
+
+template <int Channels>
+void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float* picture) {
+    for (int y = t.top; y < t.bottom; ++y)
+        for (int x = t.left; x < t.right; ++x) {
+            const int bx = (x - t.left) / kBlockX, by = (y - t.top) / kBlockY;
+            const int at = (by * kBlocksX + bx) * kLanes + (y - t.top) % kBlockY * kBlockX + (x - t.left) % kBlockX;
+            for (int c = 0; c < Channels; ++c)
+                picture[(static_cast<size_t>(y) * width + x) * Channels + c] = planes[c][at];
+        }
+}
+
+void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
+    const Tile tile(raster, index);
+    const Lanes lanes;
+    alignas(kAlignment) float T[kTilePixels], color[3][kTilePixels] = {};
+    for (float& t : T) t = 1.0f;
+    int live = kBlocks;
+    bool done[kBlocks] = {};
+    for (int n = raster.starts[index]; n < raster.starts[index + 1] && live > 0; ++n) {
+        const Splat& s = raster.splats[raster.pairs[n]];
+        const Blocks blocks(s, tile.left, tile.top);
+        for (int by = blocks.y0; by < blocks.y1; ++by)
+            for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
+                const int block = by * kBlocksX + bx, at = block * kLanes;
+                if (done[block]) continue;
+                const vf before = load(T + at);
+                Coverage c;
+                if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
+                const vf weight = c.alpha * before;
+                for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
+                const vf after = c.stopped ? -before : before * (1.0f - c.alpha);
+                store(T + at, after);
+                if (!any(after > 0.0f)) done[block] = true, --live;
+            }
+    }
+    alignas(kAlignment) float coverage[1][kTilePixels];
+    for (int i = 0; i < kTilePixels; i += kLanes) {
+        const vf rest = absolute(load(T + i));
+        store(coverage[0] + i, 1.0f - rest);
+        for (int k = 0; k < 3 && background; ++k) store(color[k] + i, load(color[k] + i) + rest * background[k]);
+    }
+    scatter<3>(color, raster.camera.width, tile, image);
+    scatter<1>(coverage, raster.camera.width, tile, alpha_out);
+}
+
+void blend_backward(
+    const Raster& raster, int index, const float* background, const float* image, const float* alpha,
+    const float* grad_image, const float* grad_alpha, float* moments) {
+    const Tile tile(raster, index);
+    const Lanes lanes;
+    const int width = raster.camera.width;
+    alignas(kAlignment) float T[kTilePixels], rest[kTilePixels];
+    alignas(kAlignment) float gradient[3][kTilePixels], color[3][kTilePixels];
+    alignas(kAlignment) float grad_coverage[1][kTilePixels] = {}, coverage[1][kTilePixels];
+    gather<3>(grad_image, width, tile, gradient);
+    gather<3>(image, width, tile, color);
+    gather<1>(alpha, width, tile, coverage);
+    if (grad_alpha) gather<1>(grad_alpha, width, tile, grad_coverage);
+    for (int i = 0; i < kTilePixels; ++i) {
+        T[i] = 1.0f;
+        // The background is seen through what coverage leaves: it acts on the coverage's gradient.
+        if (background)
+            for (int k = 0; k < 3; ++k) grad_coverage[0][i] -= background[k] * gradient[k][i];
+        rest[i] = coverage[0][i] * grad_coverage[0][i];
+        for (int k = 0; k < 3; ++k) {
+            const float behind = background ? background[k] * (1.0f - coverage[0][i]) : 0.0f;
+            rest[i] += (color[k][i] - behind) * gradient[k][i];
+        }
+    }
+    int live = kBlocks;
+    bool done[kBlocks] = {};
+    for (int n = raster.starts[index]; n < raster.starts[index + 1] && live > 0; ++n) {
+        const Splat& s = raster.splats[raster.pairs[n]];
+        const Blocks blocks(s, tile.left, tile.top);
+        vf m[kMomentCount];
+        for (vf& v : m) v = splat(0.0f);
+        bool hit = false;
+        for (int by = blocks.y0; by < blocks.y1; ++by)
+            for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
+                const int block = by * kBlocksX + bx, at = block * kLanes;
+                if (done[block]) continue;
+                const vf before = load(T + at);
+                Coverage c;
+                if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
+                hit = true;
+                const vf weight = c.alpha * before;
+                const vf g0 = load(gradient[0] + at), g1 = load(gradient[1] + at), g2 = load(gradient[2] + at);
+                const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(grad_coverage[0] + at);
+                const vf to_come = load(rest + at) - weight * q;
+                store(rest + at, to_come);
+                const vf slope = before * q - to_come / (1.0f - c.alpha);
+                const vi moves = c.used & ~c.clamped & ~c.stopped;  // a clamped alpha does not react
+                const vf d = moves ? slope * c.alpha : splat(0.0f);
+                const vf dx = d * c.dx, dy = d * c.dy;
+                m[0] += d, m[1] += dx, m[2] += dy;
+                m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
+                m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
+                const vf after = c.stopped ? -before : before * (1.0f - c.alpha);
+                store(T + at, after);
+                if (!any(after > 0.0f)) done[block] = true, --live;
+            }
+        if (!hit) continue;
+        float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
+        for (int j = 0; j < kMomentCount; ++j) out[j] = sum(m[j]);
+    }
+}
+
+}  // namespace
+
+void rasterize(const Raster& raster, const float* background, float* image, float* alpha, int threads) {
+    const int tiles = raster.tiles_x * raster.tiles_y;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
+    for (int t = 0; t < tiles; ++t) blend(raster, t, background, image, alpha);
+}
+
+// moments: kMomentCount numbers a pair, zero on entry.
+void rasterize_backward(
+    const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
+    const float* grad_alpha, float* moments, int threads) {
+    const int tiles = raster.tiles_x * raster.tiles_y;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
+    for (int t = 0; t < tiles; ++t)
+        blend_backward(raster, t, background, image, alpha, grad_image, grad_alpha, moments);
+}
+
+}  // namespace SGS_ISA
+}  // namespace structgstream

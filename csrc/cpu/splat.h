@@ -1,0 +1,69 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the stages of the rasteriser share: projected splats, tiles, and the state that backward needs of forward.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+namespace structgstream {
+
+constexpr int kTile = 16;                          // pixels
+constexpr int kTilePixels = kTile * kTile;
+constexpr float kLowPass = 0.3f;                   // square pixels
+constexpr float kMinAlpha = 1.0f / 255.0f;
+constexpr float kMaxAlpha = 0.999f;
+constexpr float kMinTransmittance = 1e-4f;
+constexpr float kLog2MinAlpha = -7.99435344f;      // log2(1 / 255)
+
+struct Pinhole {
+    float view[12];            // world to camera, three rows of four
+    float fx, fy, cx, cy;
+    float left, right, up, down;  // clamp of x / z and y / z where the projection is linearised
+    float near;
+    int width, height;
+};
+
+// alpha = 2^(log2_opacity - (xx dx^2 + xy dx dy + yy dy^2)), the conic scaled by log2(e) / 2 (xy by log2(e)).
+struct Splat {
+    float x, y;
+    float xx, xy, yy;
+    float log2_opacity;
+    float color[3];
+    float depth;
+    int32_t box[4];            // pixels x0, y0, x1, y1 (half open) that can reach alpha = 1/255
+};
+
+struct Raster {
+    Pinhole camera;
+    int tiles_x, tiles_y;
+    std::vector<Splat> splats;        // [N]; box empty where not drawn
+    std::vector<int32_t> starts;      // [tiles + 1] into pairs
+    std::vector<int32_t> pairs;       // splat of each (tile, splat) pair, front to back within a tile
+    std::vector<int32_t> slots;       // [N + 1] first pair slot of each splat, for the fixed order of sums
+    std::vector<int32_t> pair_slots;  // slot of each pair
+};
+
+struct GaussianInputs {
+    const float* means;
+    const float* quats;
+    const float* scales;
+    const float* opacities;
+    const float* colors;
+    const float* screen_offsets;  // or null
+    int64_t count;
+};
+
+struct GaussianGradients {
+    float* means;
+    float* quats;
+    float* scales;
+    float* opacities;
+    float* colors;
+    float* screen_offsets;  // or null
+};
+
+// Moments of dL/dpower over the pixels of a pair (1, dx, dy, dx^2, dx dy, dy^2) and dL/dcolor.
+constexpr int kMomentCount = 9;
+
+}  // namespace structgstream

@@ -1,0 +1,58 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* The C interface of the CPU kernels: plain pointers, no torch. Tensors are contiguous, row-major, float32 unless said
+ * otherwise; `threads` is how many threads a call may use. Results do not depend on it. */
+#pragma once
+
+#include <stdint.h>
+
+#include "../cpu/anchors.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
+int sgs_isa(void);           /* the one in use */
+int sgs_best_isa(void);      /* the widest that was compiled and that this processor has */
+int sgs_use_isa(int isa);    /* switch, for tests; returns the one in use afterwards */
+
+/* Rasteriser. Forward returns a state for backward; sgs_raster_free releases it.
+ * means [N,3], quats [N,4] wxyz, scales [N,3], opacities [N], colors [N,3], viewmat [4,4] world to camera, K [3,3] pixels;
+ * background [3] or null, screen_offsets [N,2] or null. Out: image [H,W,3], alpha [H,W], radii [N]. */
+void* sgs_raster_forward(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
+    const float* background, const float* screen_offsets, float* image, float* alpha, float* radii, int threads);
+/* grad_image [H,W,3]; grad_alpha [H,W] or null. The gradients out are zero on entry. */
+void sgs_raster_backward(
+    const void* state, int64_t count, const float* means, const float* quats, const float* scales,
+    const float* opacities, const float* colors, const float* background, const float* image, const float* alpha,
+    const float* grad_image, const float* grad_alpha, float* grad_means, float* grad_quats, float* grad_scales,
+    float* grad_opacities, float* grad_colors, float* grad_screen_offsets, int threads);
+void sgs_raster_free(void* state);
+
+/* Loss. One of target (float) and target_u8 is null; gradient [H,W,3] of SSIM or null; row sums [H]. */
+void sgs_l1_ssim(
+    const float* image, const float* target, const uint8_t* target_u8, int height, int width, float* gradient,
+    double* row_l1, double* row_ssim, int threads);
+void sgs_l1_ssim_backward(
+    const float* image, const float* target, const uint8_t* target_u8, const float* ssim_gradient, int64_t count,
+    float l1_scale, float ssim_scale, float* gradient, int threads);
+
+/* Structured Gaussians: select, then dress into arrays of selection->gaussian_count rows. */
+void sgs_anchors_select(const struct sgs_anchors* anchors, struct sgs_selection* selection, int threads);
+void sgs_anchors_dress(
+    const struct sgs_anchors* anchors, const struct sgs_selection* selection, const struct sgs_gaussians* out,
+    int threads);
+void sgs_anchors_backward(
+    const struct sgs_anchors* anchors, const struct sgs_selection* selection, const struct sgs_gaussians* drawn,
+    const struct sgs_gaussian_gradients* from, const struct sgs_anchor_gradients* to, int threads);
+
+/* Adam, in place. rows: null, or `count` row numbers (int64) of `width` numbers each. */
+void sgs_adam_step(
+    float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,
+    double lr, int64_t step, double beta1, double beta2, double eps, int threads);
+
+#ifdef __cplusplus
+}
+#endif

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records: the frame of everything in a stream file (docs/bitstream.md, section Records).
+
+A file is the magic, the version, and records one after another. A record that is cut or damaged ends what can be read;
+everything before it stands.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+from structgstream.errors import StreamError
+
+MAGIC = b"\x89SGS\r\n\x1a\n"
+MAJOR, MINOR = 1, 0
+PREFIX = struct.Struct("<8sHH")
+RECORD = struct.Struct("<BBHI")
+CHECKSUM = struct.Struct("<I")
+MAX_RECORD_BYTES = 2**32 - 1
+
+
+class RecordType(IntEnum):
+    """Readers skip the types they do not know."""
+
+    INIT = 1
+    KEY = 2
+    DELTA = 3
+    INDEX = 4
+
+
+@dataclass(frozen=True)
+class Record:
+    """One record: its type, payload, and where its first byte is in the file."""
+
+    type: int
+    payload: bytes
+    offset: int
+
+    @property
+    def end(self) -> int:
+        """Offset of the byte after the record."""
+        return self.offset + RECORD.size + len(self.payload) + CHECKSUM.size
+
+
+def prefix() -> bytes:
+    """The first bytes of every file."""
+    return PREFIX.pack(MAGIC, MAJOR, MINOR)
+
+
+def packed(kind: RecordType, payload: bytes) -> bytes:
+    """A record as bytes: header, payload, CRC-32 of both.
+
+    Raises:
+        StreamError: the payload is longer than a record can say.
+    """
+    if len(payload) > MAX_RECORD_BYTES:
+        raise StreamError(f"A record of {len(payload)} bytes is too long; the format holds {MAX_RECORD_BYTES}.")
+    head = RECORD.pack(kind, 0, 0, len(payload))
+    return head + payload + CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(head)))
+
+
+def check_prefix(data: bytes | memoryview, name: str) -> None:
+    """Refuse what is not a stream of this major version.
+
+    Raises:
+        StreamError: with what was found and what to do.
+    """
+    if len(data) < PREFIX.size or bytes(data[:8]) != MAGIC:
+        raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
+    _, major, minor = PREFIX.unpack_from(data)
+    if major != MAJOR:
+        raise StreamError(
+            f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. Install a newer structgstream."
+        )
+
+
+def record_at(data: bytes | memoryview, offset: int) -> Record | None:
+    """The whole, undamaged record at ``offset``, or None. Nothing is allocated before its length is known to fit."""
+    if offset + RECORD.size + CHECKSUM.size > len(data):
+        return None
+    kind, _, _, length = RECORD.unpack_from(data, offset)
+    end = offset + RECORD.size + length
+    if end + CHECKSUM.size > len(data):
+        return None
+    (stated,) = CHECKSUM.unpack_from(data, end)
+    if zlib.crc32(data[offset:end]) != stated:
+        return None
+    return Record(kind, bytes(data[offset + RECORD.size : end]), offset)
+
+
+def scanned(data: bytes | memoryview) -> Iterator[Record]:
+    """Every record up to the first that is cut or damaged."""
+    offset = PREFIX.size
+    while (record := record_at(data, offset)) is not None:
+        yield record
+        offset = record.end

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds and loads the native library once, and remembers why it is not there."""
+
+import ctypes
+import sys
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+from structgstream.errors import BackendError
+
+_NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
+_POINTER_RESULTS = ("sgs_raster_forward",)
+
+
+def library_path() -> Path:
+    """Where the install puts the library."""
+    return Path(str(files("structgstream") / "_native" / _NAMES.get(sys.platform, "libstructgstream.so")))
+
+
+@cache
+def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
+    path = library_path()
+    if not path.is_file():
+        return None, (
+            "The CPU kernels were not built when structgstream was installed; install a C++17 compiler (for example "
+            "g++) and install structgstream again."
+        )
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        return None, f"The CPU kernels at {path} do not load ({error}); install structgstream again on this machine."
+    for name in _POINTER_RESULTS:
+        getattr(library, name).restype = ctypes.c_void_p
+    return library, None
+
+
+def native_reason() -> str | None:
+    """Why the native library cannot be used, with the way to mend it; None when it can."""
+    return _loaded()[1]
+
+
+def native_library() -> ctypes.CDLL:
+    """The native library.
+
+    Raises:
+        BackendError: it is not there or does not load.
+    """
+    library, reason = _loaded()
+    if library is None:
+        raise BackendError(str(reason))
+    return library
+
+
+ISA_NAMES = ("baseline", "avx2", "avx512")
+
+
+def instruction_set() -> str:
+    """The instruction set that the kernels use on this machine."""
+    return ISA_NAMES[native_library().sgs_isa()]

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rasteriser in this package's C++; the contract is ``kernels.reference_raster``'s."""
+
+import ctypes
+import weakref
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from structgstream.errors import BackendError
+from structgstream.kernels._load import native_library
+from structgstream.kernels.raster_types import RasterOutput
+
+
+def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+
+
+class _State:
+    """Owns what forward leaves for backward."""
+
+    def __init__(self, address: int) -> None:
+        self.pointer = ctypes.c_void_p(address)
+        weakref.finalize(self, native_library().sgs_raster_free, self.pointer)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        screen_offsets: Tensor | None,
+        viewmat: Tensor,
+        K: Tensor,
+        background: Tensor | None,
+        size: tuple[int, int],
+        near: float,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        width, height = size
+        count = means.shape[0]
+        image, alpha, radii = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(count)
+        state = _State(
+            native_library().sgs_raster_forward(
+                ctypes.c_int64(count),
+                *(_pointer(tensor) for tensor in (means, quats, scales, opacities, colors, viewmat, K)),
+                ctypes.c_int(width),
+                ctypes.c_int(height),
+                ctypes.c_float(near),
+                *(_pointer(tensor) for tensor in (background, screen_offsets, image, alpha, radii)),
+                ctypes.c_int(torch.get_num_threads()),
+            )
+        )
+        ctx.state = state
+        ctx.tracked = screen_offsets is not None
+        ctx.save_for_backward(means, quats, scales, opacities, colors, background, image, alpha)
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        return image, alpha, radii
+
+    @staticmethod
+    def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
+        means, quats, scales, opacities, colors, background, image, alpha = ctx.saved_tensors
+        given = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
+        given_alpha = None if grad_alpha is None else grad_alpha.contiguous()
+        results = [torch.zeros_like(tensor) for tensor in (means, quats, scales, opacities, colors)]
+        offsets = means.new_zeros(means.shape[0], 2) if ctx.tracked else None
+        native_library().sgs_raster_backward(
+            ctx.state.pointer,
+            ctypes.c_int64(means.shape[0]),
+            *(_pointer(t) for t in (means, quats, scales, opacities, colors, background, image, alpha)),
+            *(_pointer(t) for t in (given, given_alpha, *results, offsets)),
+            ctypes.c_int(torch.get_num_threads()),
+        )
+        return *results, offsets, None, None, None, None, None
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    background: Tensor | None = None,
+    screen_offsets: Tensor | None = None,
+) -> RasterOutput:
+    """Render Gaussians, see ``kernels.reference_raster.rasterize``.
+
+    Repeated calls give the same bits, whatever the number of threads. Cameras and the background get no gradient.
+
+    Raises:
+        BackendError: a tensor is not float32 on the CPU.
+    """
+    gaussians = (means, quats, scales, opacities, colors)
+    n = means.shape[0]
+    assert [tuple(t.shape) for t in gaussians] == [(n, 3), (n, 4), (n, 3), (n,), (n, 3)], [t.shape for t in gaussians]
+    for tensor in gaussians:
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            raise BackendError(
+                f"The cpu back-end draws float32 tensors on the CPU, got {tensor.dtype} on {tensor.device}; "
+                "convert them or take the reference back-end."
+            )
+    camera = [None if t is None else t.detach().float().contiguous() for t in (viewmat, K, background)]
+    offsets = None if screen_offsets is None else screen_offsets.contiguous()
+    image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
+        *(tensor.contiguous() for tensor in gaussians), offsets, *camera, (width, height), near
+    )
+    return RasterOutput(image, alpha, radii)

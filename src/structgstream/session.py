@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop: frames in, packets out, and the decoded scene is where the next frame starts (Note [Closed loop])."""
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import torch
+
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
+from structgstream.codec.reader import StreamReader
+from structgstream.data.source import FrameSource
+from structgstream.errors import ConfigError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.presets import StreamConfig, to_json
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import FieldName, scene_of, state_of
+from structgstream.similarity import normalising_similarity
+from structgstream.training.initial import fit_first_frame
+from structgstream.training.online import fit_next_frame
+from structgstream.training.result import FitResult, StepListener
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What happened to one frame."""
+
+    index: int
+    pts_seconds: float
+    kind: PacketKind
+    bytes: int
+    field_bytes: Mapping[str, int]
+    train_psnr: float
+    anchors: int
+    free: int
+    spawned: int
+    pruned: int
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    peak_memory_bytes: int | None = None
+
+
+def peak_memory_bytes() -> int | None:
+    """The process's largest resident size so far; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def frame_seed(seed: int, index: int) -> int:
+    """A seed of its own for each frame, so that a frame can be repeated alone."""
+    return (seed * 1_000_003 + index) % 2**63
+
+
+class Session:
+    """Reconstructs a capture into a sink, frame by frame.
+
+    Args:
+        source: the capture.
+        sink: where packets go.
+        config: everything that decides the result.
+        backend: what computes.
+        resumed: the reader of what the sink already holds, to continue after it.
+        metadata: plain JSON values for the header (nothing that differs between runs: resuming is exact).
+        on_step: called after every optimisation step.
+
+    Raises:
+        ConfigError: the stream to resume was made with another configuration or from another capture.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        sink: PacketSink,
+        config: StreamConfig,
+        backend: Backend,
+        *,
+        resumed: StreamReader | None = None,
+        metadata: Mapping[str, object] | None = None,
+        on_step: StepListener | None = None,
+    ) -> None:
+        self._source = source
+        self._sink = sink
+        self._config = config
+        self._backend = backend
+        self._resumed = resumed
+        self._metadata = {"capture": source.name, **(metadata or {})}
+        self._on_step = on_step
+        self._similarity = normalising_similarity(source.rig, radius=config.normalised_radius)
+        self._rig = self._similarity.rig(source.rig)
+        if resumed is not None:
+            self._check_resumable(resumed.header)
+
+    def run(self) -> Iterator[FrameReport]:
+        """Fit, encode and write every frame that the sink does not hold yet; yields a report for each.
+
+        The sink is closed, with its index, however the loop ends.
+        """
+        try:
+            yield from self._frames()
+        finally:
+            self._sink.close()
+
+    def _frames(self) -> Iterator[FrameReport]:
+        encoder: SceneEncoder | None = None
+        scene: Scene | None = None
+        start = 0
+        if self._resumed is not None:
+            encoder = SceneEncoder(self._resumed.header)
+            self._sink.open(self._resumed.header)
+            start = len(self._resumed)
+            scene = self._resumed.scene(start - 1) if start else None
+        if start >= len(self._source):
+            return
+        frames = self._source.frames(start)
+        while True:
+            started = time.perf_counter()
+            frame = next(frames, None)
+            if frame is None:
+                return
+            read = time.perf_counter()
+            fit = self._fit(scene, frame)
+            fitted = time.perf_counter()
+            if encoder is None:
+                header = self._header(fit.scene)
+                encoder = SceneEncoder(header)
+                self._sink.open(header)
+            kind = PacketKind.KEY if frame.index % self._key_interval == 0 else PacketKind.DELTA
+            encoded = encoder.encode(fit.scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
+            scene = encoded.reconstruction
+            coded = time.perf_counter()
+            size = self._sink.write(encoded.packet)
+            done = time.perf_counter()
+            yield FrameReport(
+                index=frame.index,
+                pts_seconds=frame.pts_seconds,
+                kind=kind,
+                bytes=size,
+                field_bytes=encoded.packet.field_bytes,
+                train_psnr=fit.train_psnr,
+                anchors=len(scene.anchors),
+                free=len(scene.free),
+                spawned=fit.spawned,
+                pruned=fit.pruned,
+                seconds={
+                    "read": read - started,
+                    **fit.seconds,
+                    "fit": fitted - read,
+                    "encode": coded - fitted,
+                    "write": done - coded,
+                    "total": done - started,
+                },
+                peak_memory_bytes=peak_memory_bytes(),
+            )
+
+    @property
+    def _key_interval(self) -> int:
+        return max(1, round(self._source.fps * self._config.key_interval_seconds))
+
+    def _fit(self, scene: Scene | None, frame: MultiViewFrame) -> FitResult:
+        seed = frame_seed(self._config.seed, frame.index)
+        if scene is None:
+            points = self._initial_points(frame)
+            return fit_first_frame(
+                frame,
+                self._rig,
+                points,
+                config=self._config.initial,
+                backend=self._backend,
+                seed=seed,
+                on_step=self._on_step,
+            )
+        return fit_next_frame(
+            on_device(scene, self._backend.device),
+            frame,
+            self._rig,
+            config=self._config.online,
+            backend=self._backend,
+            seed=seed,
+            on_step=self._on_step,
+        )
+
+    def _initial_points(self, frame: MultiViewFrame) -> torch.Tensor:
+        """Points of the capture or made from its first frame, normalised, after a look at the poses."""
+        from structgstream.data.points import initial_points
+        from structgstream.data.pose_check import check_poses
+
+        check_poses(frame, self._source.rig)
+        given = self._source.points
+        if given is None:
+            given = initial_points(
+                frame, self._source.rig, config=self._config.points, seed=self._config.seed
+            ).positions
+        return self._similarity.points(torch.from_numpy(given))
+
+    def _header(self, scene: Scene) -> StreamHeader:
+        dynamic = self._config.online.dynamic
+        state = state_of(scene)
+        return StreamHeader(
+            rig=self._source.rig,
+            similarity=self._similarity,
+            fps=self._source.fps,
+            codec="raw",
+            dynamic=dynamic,
+            static={name: value.cpu() for name, value in state.items() if name not in dynamic},
+            distance_input=scene.distance_input,
+            config=to_json(self._config),
+            metadata=self._metadata,
+        )
+
+    def _check_resumable(self, header: StreamHeader) -> None:
+        """Refuse to continue a stream with another configuration or capture: its frames would not fit together."""
+        differing = list(_differences(dict(header.config), to_json(self._config)))
+        if differing:
+            raise ConfigError(
+                f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
+                "Resume with the same preset and options, or start again with --overwrite."
+            )
+        same_cameras = [*header.rig] == [*self._source.rig] and all(
+            torch.equal(header.rig[name].viewmat, self._source.rig[name].viewmat)
+            and torch.equal(header.rig[name].K, self._source.rig[name].K)
+            for name in header.rig
+        )
+        if (
+            not same_cameras
+            or header.rig.held_out != self._source.rig.held_out
+            or dict(header.metadata) != self._metadata
+        ):
+            raise ConfigError(
+                "The stream was made from another capture, another part of it, or with other held-out cameras. "
+                "Resume with the same capture and options, or start again with --overwrite."
+            )
+
+
+def _differences(old: object, new: object, path: str = "") -> Iterator[str]:
+    """Paths at which two trees of plain JSON values differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _differences(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+    elif old != new:
+        yield path
+
+
+def on_device(scene: Scene, device: torch.device) -> Scene:
+    """The scene with its tensors on ``device``."""
+    if device.type == "cpu":
+        return scene
+    state: dict[FieldName, torch.Tensor] = {name: value.to(device) for name, value in state_of(scene).items()}
+    return scene_of(state, distance_input=scene.distance_input)

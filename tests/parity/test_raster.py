@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every rasteriser against the float64 reference, forward and gradient.
+
+The scene stays away from where the definition jumps: depths are far apart, and pixels in which an alpha comes close to
+1/255 or 0.999, or the transmittance to 1e-4, carry no cotangent. There a rounding error of the seventh digit would
+decide which branch is taken, and the comparison would measure that instead of the kernel.
+"""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from structgstream.kernels import cpu_raster, cuda, reference_raster
+from structgstream.kernels._load import ISA_NAMES, native_library, native_reason
+from structgstream.kernels.reference_raster import rasterize as reference
+
+native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+WIDTH, HEIGHT, NEAR = 75, 53, 0.2  # No multiple of the tile.
+NAMES = ("means", "quats", "scales", "opacities", "colors", "screen_offsets")
+
+
+def camera() -> tuple[Tensor, Tensor]:
+    angle = torch.tensor(0.2, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 0] = viewmat[2, 2] = angle.cos()
+    viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
+    viewmat[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
+    K = torch.tensor([[60.0, 0, 36.0], [0, 58.0, 27.0], [0, 0, 1]], dtype=torch.float64)
+    return viewmat, K
+
+
+def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
+    g = torch.Generator().manual_seed(7)
+    depths = torch.linspace(1.0, 5.0, count, dtype=torch.float64)[torch.randperm(count, generator=g)]
+    spread = torch.rand(count, 2, generator=g, dtype=torch.float64) * 2.0 - 1.0
+    means = torch.cat([spread * depths[:, None] * 0.8, depths[:, None]], dim=1)
+    viewmat, _ = camera()
+    means = (means - viewmat[:3, 3]) @ viewmat[:3, :3]  # Depths are the camera's, so they stay far apart.
+    return (
+        means,
+        torch.randn(count, 4, generator=g, dtype=torch.float64),
+        torch.exp(torch.randn(count, 3, generator=g, dtype=torch.float64) * 0.5 - 2.5),
+        torch.rand(count, generator=g, dtype=torch.float64) * opaque + 0.05,
+        torch.rand(count, 3, generator=g, dtype=torch.float64),
+        torch.zeros(count, 2, dtype=torch.float64),
+    )
+
+
+def run(rasterize, inputs: tuple[Tensor, ...], *, background: Tensor | None = None, device: str = "cpu"):
+    """Image, alpha and the gradients for fixed cotangents."""
+    dtype = inputs[0].dtype
+    leaves = [value.to(device).clone().requires_grad_() for value in inputs]
+    viewmat, K = (value.to(device, dtype) for value in camera())
+    output = rasterize(
+        *leaves[:5],
+        viewmat,
+        K,
+        width=WIDTH,
+        height=HEIGHT,
+        near=NEAR,
+        screen_offsets=leaves[5],
+        background=None if background is None else background.to(device, dtype),
+    )
+    g = torch.Generator().manual_seed(11)
+    away = safe_pixels(inputs)
+    v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * away[..., None]
+    v_alpha = torch.randn(HEIGHT, WIDTH, generator=g, dtype=torch.float64) * away
+    total = (output.image * v_image.to(device, dtype)).sum() + (output.alpha * v_alpha.to(device, dtype)).sum()
+    gradients = torch.autograd.grad(total, leaves)
+    return output.image.detach().cpu(), output.alpha.detach().cpu(), [x.cpu() for x in gradients], output.radii.cpu()
+
+
+def safe_pixels(inputs: tuple[Tensor, ...]) -> Tensor:
+    """Mask ``[H, W]``: pixels that do not change when the definition's limits move by a little."""
+    values = [value.double() for value in inputs]
+    viewmat, K = camera()
+    pictures = []
+    saved = reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE
+    try:
+        for factor in (1 - 1e-3, 1 + 1e-3):
+            reference_raster.MIN_ALPHA = saved[0] * factor
+            reference_raster.MAX_ALPHA = 1 - (1 - saved[1]) * factor
+            reference_raster.MIN_TRANSMITTANCE = saved[2] * factor
+            pictures.append(reference(*values[:5], viewmat, K, width=WIDTH, height=HEIGHT, near=NEAR).image)
+    finally:
+        reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE = saved
+    return ((pictures[0] - pictures[1]).abs().amax(-1) < 1e-7).double()
+
+
+def relative_errors(got: Tensor, truth: Tensor) -> Tensor:
+    """Error of each Gaussian's gradient, relative to its own size plus a thousandth of the typical size."""
+    got, truth = got.double().reshape(len(truth), -1), truth.double().reshape(len(truth), -1)
+    size = truth.norm(dim=1)
+    return (got - truth).norm(dim=1) / (size + 1e-3 * size.median() + 1e-12)
+
+
+def check_against_reference(rasterize, *, background: Tensor | None, device: str = "cpu") -> None:
+    inputs = gaussians()
+    away = safe_pixels(inputs).bool()
+    assert away.float().mean() > 0.5
+    image, alpha, gradients, radii = run(reference, inputs, background=background)
+    image32, alpha32, gradients32, radii32 = run(
+        rasterize, tuple(v.float() for v in inputs), background=background, device=device
+    )
+    # Float32 sums of some tens of terms of size one: 1e-5 is 80 units in the last place.
+    assert (image32 - image).abs()[away].max() < 1e-5
+    assert (alpha32 - alpha).abs()[away].max() < 1e-5
+    assert ((radii32 > 0) == (radii > 0)).float().mean() > 0.99  # A box may miss the picture by a rounding.
+    _, _, torch32, _ = run(reference, tuple(v.float() for v in inputs), background=background)
+    for name, got, single, truth in zip(NAMES, gradients32, torch32, gradients):
+        errors, autograd = relative_errors(got, truth), relative_errors(single, truth)
+        # As good as torch's own float32 autograd on the same input, give or take the order of its sums.
+        assert errors.median() < max(2e-5, 3 * autograd.median()), name
+        assert errors.quantile(0.95) < max(2e-4, 3 * autograd.quantile(0.95)), name
+
+
+@pytest.fixture(params=range(len(ISA_NAMES)), ids=ISA_NAMES)
+def isa(request: pytest.FixtureRequest) -> Iterator[int]:
+    library = native_library()
+    if request.param > library.sgs_best_isa():
+        pytest.skip(f"this processor or build has no {ISA_NAMES[request.param]}")
+    library.sgs_use_isa(request.param)
+    yield request.param
+    library.sgs_use_isa(len(ISA_NAMES))
+
+
+@native
+@pytest.mark.parametrize("background", [None, torch.tensor([0.3, 0.6, 0.1])], ids=["black", "coloured"])
+def test_cpu(isa: int, background: Tensor | None) -> None:
+    check_against_reference(cpu_raster.rasterize, background=background)
+
+
+@pytest.mark.needs_cuda
+def test_cuda() -> None:
+    check_against_reference(cuda.rasterize, background=None, device="cuda")
+
+
+@native
+def test_repeated_runs_and_thread_counts_give_the_same_bits(isa: int) -> None:
+    inputs = tuple(v.float() for v in gaussians(2000))
+    results = []
+    for threads in (1, 2, 2, 3):
+        torch.set_num_threads(threads)
+        image, alpha, gradients, radii = run(cpu_raster.rasterize, inputs)
+        results.append([image, alpha, *gradients, radii])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+@native
+def test_nothing_to_draw(isa: int) -> None:
+    empty = tuple(v[:0].float() for v in gaussians())
+    image, alpha, gradients, radii = run(cpu_raster.rasterize, empty, background=torch.tensor([0.5, 0.25, 1.0]))
+    assert torch.equal(image, torch.tensor([0.5, 0.25, 1.0]).expand(HEIGHT, WIDTH, 3))
+    assert alpha.abs().sum() == 0
+    assert [len(g) for g in gradients] == [0] * 6
+    assert len(radii) == 0
+
+
+@native
+def test_broken_and_hidden_gaussians_are_not_drawn(isa: int) -> None:
+    inputs = [v[:6].float().clone() for v in gaussians()]
+    inputs[0][0] = torch.nan
+    inputs[0][1] = torch.tensor([0.0, 0.0, -5.0])
+    inputs[1][2] = torch.inf
+    inputs[2][3] = torch.tensor([1e9, 1e9, 1e9])
+    image, _, gradients, radii = run(cpu_raster.rasterize, tuple(inputs))
+    assert radii[:4].tolist() == [0.0] * 4
+    assert torch.isfinite(image).all()
+    assert all(torch.isfinite(g[4:]).all() for g in gradients)
+    assert all((g[:4] == 0).all() for g in gradients)
+
+
+@native
+def test_a_gaussian_larger_than_the_picture(isa: int) -> None:
+    inputs = [v[:1].float().clone() for v in gaussians()]
+    inputs[0][:] = torch.tensor([[0.0, 0.0, 2.0]])
+    inputs[2][:] = 50.0
+    image, _, gradients, _ = run(cpu_raster.rasterize, tuple(inputs))
+    truth, _, truth_gradients, _ = run(reference, tuple(v.double() for v in inputs))
+    assert (image - truth).abs().max() < 1e-5
+    assert torch.allclose(gradients[4].double(), truth_gradients[4], rtol=1e-4)
+
+
+@native
+def test_the_state_is_freed_without_a_backward_pass() -> None:
+    import resource
+
+    inputs = tuple(v.float().requires_grad_() for v in gaussians(3000)[:5])
+    viewmat, K = camera()
+    peaks = []
+    for _ in range(3):
+        for _ in range(40):
+            cpu_raster.rasterize(*inputs, viewmat, K, width=320, height=240, near=NEAR)
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    assert peaks[2] - peaks[0] < 20_000  # kB; 80 states that leaked would hold more than 60,000
+
+
+def test_another_precision_is_refused_with_a_way_out() -> None:
+    from structgstream.errors import BackendError
+
+    viewmat, K = camera()
+    with pytest.raises(BackendError, match="reference back-end"):
+        cpu_raster.rasterize(*gaussians(3)[:5], viewmat, K, width=8, height=8, near=NEAR)
