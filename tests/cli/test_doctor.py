@@ -19,6 +19,8 @@ def test_everything_is_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     text = capsys.readouterr().out
     assert "reference" in text
     assert "cores" in text
+    for entry in found["packages"]:
+        assert entry["version"] or f"structgstream[{entry['extra']}]" in text
 
 
 def test_what_is_missing_comes_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:

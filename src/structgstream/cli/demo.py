@@ -11,7 +11,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, parsed_with_rest, resolved_config
-from structgstream.cli.tables import grid, report_tables
+from structgstream.cli.tables import report_tables
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> None:
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
     from structgstream.cli.evaluate import scored
-    from structgstream.cli.reconstruct import reconstructed
+    from structgstream.cli.reconstruct import check_output, reconstructed
     from structgstream.cli.render import camera_pictures, path_pictures, write_pictures
     from structgstream.codec.reader import open_stream
     from structgstream.data.clip import bundled_clip_path
@@ -49,11 +49,11 @@ def main(arguments: list[str]) -> None:
 
     began = time.perf_counter()
     console = Console()
-    preset = options.preset or DEMO_PRESET
-    config = resolved_config(preset, rest, command="demo", seed=None)
+    config, preset = resolved_config(options.preset or DEMO_PRESET, rest, command="demo", seed=None)
     source = open_capture(bundled_clip_path(), scale=options.scale, frames=options.frames)
     backend = select_backend(options.device)
     stream = options.output / "clip.sgs"
+    check_output(stream, may_exist=True)
     camera = source.rig.testing[0]
     width, height = source.rig[camera].width, source.rig[camera].height
     console.print(
@@ -67,7 +67,6 @@ def main(arguments: list[str]) -> None:
         output=stream,
         backend=backend,
         metadata={"preset": preset, "start": 0, "scale": options.scale},
-        overwrite=True,
     )
     reader = open_stream(stream)
     report_folder = options.output / "report"
@@ -77,14 +76,16 @@ def main(arguments: list[str]) -> None:
     write_pictures(orbit, path_pictures(reader, backend, path="orbit", camera=camera), fps=source.fps)
     console.print(report_tables(report, title="bundled clip, held-out camera"))
     console.print()
-    places = grid()
-    places.add_row("stream", str(stream))
-    places.add_row("pictures", str(report_folder / "contact_sheet.png"))
-    places.add_row("plots", str(report_folder / "over_time.png"))
-    places.add_row("numbers", str(report_folder / "report.json"))
-    places.add_row("held-out view", str(held_out))
-    places.add_row("moving camera", str(orbit))
-    console.print(places)
+    places = {
+        "stream": stream,
+        "pictures": report_folder / "contact_sheet.png",
+        "plots": report_folder / "over_time.png",
+        "numbers": report_folder / "report.json",
+        "held-out view": held_out,
+        "moving camera": orbit,
+    }
+    for name, path in places.items():
+        console.print(f"{name:<14}  {path}", highlight=False, markup=False, soft_wrap=True)
     console.print(
         f"\nHeld-out PSNR {report.mean.psnr:.2f} dB over {len(report.frames)} frames, "
         f"everything in {time.perf_counter() - began:.0f} s.",

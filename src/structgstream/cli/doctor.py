@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from structgstream.cli.options import JsonPath, parsed
-from structgstream.cli.tables import grid
+from structgstream.cli.tables import columns, grid, plain
 
 # Import name, distribution, extra, what it is for.
 OPTIONAL = (
@@ -44,7 +44,7 @@ def main(arguments: list[str]) -> None:
     console = Console()
     machine = grid()
     for name, value in found["environment"].items():
-        machine.add_row(name, "-" if value is None else str(value))
+        machine.add_row(*plain(name, "-" if value is None else str(value)))
     console.print(machine)
     console.print()
     console.print(_table(("back-end", "state", ""), [(e["name"], e["state"], e["advice"]) for e in found["backends"]]))
@@ -80,9 +80,9 @@ def examination() -> dict[str, Any]:
 
 
 def _table(names: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
-    table = Table(header_style="bold", box=None, padding=(0, 2, 0, 0))
+    table = columns()
     for name in names:
         table.add_column(name)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*plain(*row))
     return table

@@ -67,7 +67,7 @@ def main(arguments: list[str]) -> None:
     console = Console()
     console.print(report_tables(report, title=options.stream.name))
     if options.report is not None:
-        console.print(f"Report: {options.report}", highlight=False, soft_wrap=True)
+        console.print(f"Report: {options.report}", highlight=False, markup=False, soft_wrap=True)
 
 
 def capture_of(reader: "StreamReader", scene: Path) -> "FrameSource":

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from structgstream.cli.options import JsonPath, StreamFile, parsed
 from structgstream.cli.progress import human_bytes
-from structgstream.cli.tables import SHOWN_FRAMES, grid
+from structgstream.cli.tables import SHOWN_FRAMES, columns, grid, plain
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -113,10 +113,10 @@ def _facts(content: dict[str, Any]) -> Table:
     seconds = len(packets) / header["fps"]
     table = grid()
     for name, value in header["metadata"].items():
-        table.add_row(name, str(value))
+        table.add_row(*plain(name, str(value)))
     table.add_row("codec", header["codec"])
     table.add_row("frames", f"{len(packets)} at {header['fps']:g} a second, {seconds:.2f} s")
-    table.add_row("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}")
+    table.add_row(*plain("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}"))
     table.add_row("size", f"{human_bytes(header['total_bytes'])}, header {human_bytes(header['header_bytes'])}")
     table.add_row("static", ", ".join(f"{n} {human_bytes(f['bytes'])}" for n, f in header["static"].items()) or "-")
     table.add_row("dynamic", ", ".join(header["dynamic"]))
@@ -125,15 +125,17 @@ def _facts(content: dict[str, Any]) -> Table:
 
 
 def _packets(packets: list[dict[str, Any]]) -> Table:
-    table = Table(header_style="bold")
+    table = columns()
+    table.title = "packets, kB"
     names = sorted({name for packet in packets for name in packet["fields"]})
     table.add_column("packet", justify="right")
     table.add_column("kind")
-    for name in ("seconds", "bytes", *(name.replace("_", " ") for name in names)):
-        table.add_column(name, justify="right")
+    for name in ("seconds", "all", *(name.replace("_", " ") for name in names)):
+        # Field names break between words, never inside one.
+        table.add_column(name, justify="right", min_width=max(len(word) for word in name.split()))
     step = max(-(-len(packets) // SHOWN_FRAMES), 1)
     for packet in packets[::step]:
-        sizes = [human_bytes(packet["fields"].get(name, 0)) for name in names]
-        pts = f"{packet['pts_seconds']:.3f}"
-        table.add_row(str(packet["index"]), packet["kind"], pts, human_bytes(packet["bytes"]), *sizes)
+        sizes = [packet["bytes"], *(packet["fields"].get(name, 0) for name in names)]
+        row = (str(packet["index"]), packet["kind"], f"{packet['pts_seconds']:.3f}")
+        table.add_row(*row, *(f"{size / 1000:.1f}" for size in sizes))
     return table

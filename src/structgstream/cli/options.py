@@ -49,8 +49,10 @@ def parsed_with_rest(kind: type[Options], command: str, *, arguments: list[str])
     return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True)
 
 
-def resolved_config(preset: str | None, overrides: list[str], *, command: str, seed: int | None) -> "StreamConfig":
-    """The preset with the fields that the command line sets by their path (``--online.iterations 50``).
+def resolved_config(
+    preset: str | None, overrides: list[str], *, command: str, seed: int | None
+) -> tuple["StreamConfig", str]:
+    """The preset with the fields that the command line sets by their path (``--online.iterations 50``), and its name.
 
     Raises:
         UsageError: there is no such preset.
@@ -69,7 +71,7 @@ def resolved_config(preset: str | None, overrides: list[str], *, command: str, s
         args=overrides,
         config=(tyro.conf.FlagConversionOff,),
     )
-    return config if seed is None else replace(config, seed=seed)
+    return (config if seed is None else replace(config, seed=seed)), name
 
 
 def opened_capture(scene: Path, options: CaptureOptions) -> "FrameSource":

@@ -25,7 +25,7 @@ class Display(AbstractContextManager["Display"], Protocol):
         """An iteration of the running frame is done."""
         ...
 
-    def frame(self, report: "FrameReport", *, seconds: float) -> None:
+    def frame(self, report: "FrameReport") -> None:
         """A frame is stored."""
         ...
 
@@ -42,11 +42,12 @@ def display(frames: int, *, done: int = 0, console: Console | None = None) -> Di
     return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
 
 
-def summary(report: "FrameReport", frames: int, *, seconds: float) -> str:
+def summary(report: "FrameReport", frames: int) -> str:
     """One frame in one line."""
     return (
         f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
-        f"{human_bytes(report.bytes):>9}  {seconds:6.1f} s  {report.anchors:,} anchors  {report.free:,} free"
+        f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
+        f"{report.anchors:,} anchors  {report.free:,} free"
     )
 
 
@@ -82,13 +83,13 @@ class Lines:
                 f"loss {step.loss:.4f}, {step.anchors:,} anchors"
             )
 
-    def frame(self, report: "FrameReport", *, seconds: float) -> None:
+    def frame(self, report: "FrameReport") -> None:
         """Prints the frame's line."""
         self._current = report.index + 1
-        self._print(summary(report, self._frames, seconds=seconds))
+        self._print(summary(report, self._frames))
 
     def _print(self, text: str) -> None:
-        self._console.print(text, highlight=False, soft_wrap=True)
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
         self._console.file.flush()
         self._spoken = time.monotonic()
 
@@ -127,9 +128,9 @@ class Bars:
         note = f"loss {step.loss:.4f}  {step.anchors:,} anchors  {step.free:,} free"
         self._progress.update(self._one, completed=step.iteration, total=step.iterations, note=note)
 
-    def frame(self, report: "FrameReport", *, seconds: float) -> None:
+    def frame(self, report: "FrameReport") -> None:
         """Moves the bar of frames and begins the next frame's."""
-        note = f"{seconds:.1f} s a frame"
+        note = f"{report.seconds['total']:.1f} s a frame"
         self._progress.update(self._all, completed=report.index + 1, note=note)
         self._progress.reset(self._one, total=None, description=f"frame {report.index + 2}", note="")
-        self._last.plain = summary(report, self._frames, seconds=seconds)
+        self._last.plain = summary(report, self._frames)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream reconstruct``."""
 
-import time
+import os
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -20,11 +21,13 @@ from structgstream.cli.options import (
     resolved_config,
 )
 from structgstream.cli.progress import display
+from structgstream.errors import StorageError, StructGStreamError
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
+    from structgstream.session import FrameReport
 
 
 @dataclass(frozen=True)
@@ -62,26 +65,109 @@ class Reconstruct:
 def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
     if "--help-config" in arguments:
-        _print_config_help(arguments)
+        _print_config(arguments)
     options, rest = parsed_with_rest(Reconstruct, "reconstruct", arguments=arguments)
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
-    config = resolved_config(options.preset, rest, command="reconstruct", seed=options.seed)
+    config, preset = resolved_config(options.preset, rest, command="reconstruct", seed=options.seed)
+    check_output(options.output, may_exist=options.resume or options.overwrite)
     from structgstream.kernels.backend import select_backend
 
     source = opened_capture(options.scene, options.capture)
     backend = select_backend(options.device)
+    console = Console()
+    console.print(
+        f"{source.name}: {len(source.rig.training)} training cameras, held out: "
+        f"{', '.join(source.rig.testing) or 'none'}; {len(source)} frames; preset {preset}, back-end {backend.name}.",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+    reconstructed(
+        source,
+        config,
+        output=options.output,
+        backend=backend,
+        metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
+        resume=options.resume,
+    )
+    console.print(f"Wrote {options.output}", highlight=False, markup=False, soft_wrap=True)
+
+
+def reconstructed(
+    source: "FrameSource",
+    config: "StreamConfig",
+    *,
+    output: Path,
+    backend: "Backend",
+    metadata: Mapping[str, object],
+    resume: bool = False,
+) -> None:
+    """Reconstructs ``source`` into the file ``output``, replacing what is there unless it is resumed.
+
+    Raises:
+        Interrupted: the user pressed Ctrl-C; whole frames are in the file.
+        StructGStreamError: whatever goes wrong; whole frames are in the file.
+    """
+    from structgstream.codec.sinks import FileSink
+    from structgstream.data.prefetch import Prefetch
+    from structgstream.evaluation.run_log import append_log, begin_log
+    from structgstream.session import Session
+
+    sink, resumed = FileSink.resume(output) if resume else (FileSink(output, overwrite=True), None)
+    done = 0 if resumed is None else len(resumed)
     try:
-        reconstructed(
-            source,
-            config,
-            output=options.output,
-            backend=backend,
-            metadata={"preset": options.preset, "start": options.capture.start, "scale": options.capture.scale},
-            resume=options.resume,
-            overwrite=options.overwrite,
-        )
+        with display(len(source), done=done) as progress:
+            try:
+                session = Session(
+                    Prefetch(source),
+                    sink,
+                    config,
+                    backend,
+                    resumed=resumed,
+                    metadata=metadata,
+                    on_step=progress.step,
+                )
+                begin_log(output, frames=done)
+            except StructGStreamError:
+                sink.close()  # resuming took the index off the file
+                raise
+            with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
+                for report in reports:
+                    append_log(output, log_entry(report))
+                    progress.frame(report)
+                    done = report.index + 1
     except KeyboardInterrupt:
-        raise Interrupted(
-            f"The frames that are done are in {options.output}; go on with the same command and --resume."
-        ) from None
+        kept = f"{output} has {done} of {len(source)} frames; go on with the same command and --resume."
+        raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None
+
+
+def check_output(output: Path, *, may_exist: bool) -> None:
+    """Whether the stream can be written is found out before the first frame takes its minutes.
+
+    Raises:
+        StorageError: the file exists, its folder cannot be made, or nothing may be written there.
+    """
+    if output.is_dir():
+        raise StorageError(f"{output} is a folder; give the name of a file, such as {output / 'scene.sgs'}.")
+    if output.exists() and not may_exist:
+        raise StorageError(
+            f"{output} exists; continue it with --resume, replace it with --overwrite, or choose another name."
+        )
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"The folder {output.parent} cannot be made ({error.strerror}).") from None
+    if not os.access(output if output.exists() else output.parent, os.W_OK):
+        raise StorageError(f"{output} cannot be written (no permission).")
+
+
+def log_entry(report: "FrameReport") -> dict[str, Any]:
+    """One line of the log: the frame's report as plain values."""
+    return asdict(report) | {"kind": report.kind.name.lower(), "total_seconds": report.seconds["total"]}
+
+
+def _print_config(arguments: list[str]) -> None:
+    given = arguments.index("--preset") + 1 if "--preset" in arguments else len(arguments)
+    preset = arguments[given] if given < len(arguments) else None
+    resolved_config(preset, ["--help"], command="reconstruct SCENE -o OUT.sgs", seed=None)

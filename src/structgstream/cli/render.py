@@ -92,7 +92,7 @@ def main(arguments: list[str]) -> None:
         pictures = camera_pictures(reader, backend, camera=chosen_camera(reader, options.camera), frame=options.frame)
     single = output.suffix.lower() == ".png"
     write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
-    Console().print(f"Wrote {output}", highlight=False, soft_wrap=True)
+    Console().print(f"Wrote {output}", highlight=False, markup=False, soft_wrap=True)
 
 
 def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
@@ -121,10 +121,11 @@ def camera_pictures(
 ) -> "Iterator[NDArray[np.uint8]]":
     """What a camera of the rig sees, frame by frame."""
     from structgstream.evaluation.evaluate import rendered
+    from structgstream.session import on_device
 
     view = reader.header.similarity.camera(reader.header.rig[camera])
     for scene in scenes_of(reader, frame):
-        yield rendered(scene, view, backend)[0]
+        yield rendered(on_device(scene, backend.device), view, backend)[0]
 
 
 def path_pictures(
@@ -140,6 +141,7 @@ def path_pictures(
     """What a moving camera sees while time runs, to and fro when the path takes longer than the stream."""
     from structgstream.evaluation.camera_path import arc, orbit
     from structgstream.evaluation.evaluate import rendered
+    from structgstream.session import on_device
 
     header = reader.header
     length = max(len(reader.packets) / header.fps, LEAST_PATH_SECONDS) if seconds is None else seconds
@@ -147,7 +149,7 @@ def path_pictures(
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
     for view, scene in zip(views, _to_and_fro(reader, frame, count=count), strict=True):
-        yield rendered(scene, header.similarity.camera(view), backend)[0]
+        yield rendered(on_device(scene, backend.device), header.similarity.camera(view), backend)[0]
 
 
 def compared_pictures(

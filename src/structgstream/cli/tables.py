@@ -3,6 +3,7 @@
 
 from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -28,10 +29,21 @@ def grid() -> Table:
     return table
 
 
+def plain(*cells: str) -> tuple[Text, ...]:
+    """Cells whose square brackets are letters, not markup: names and paths come from the user."""
+    return tuple(Text(cell) for cell in cells)
+
+
+def columns() -> Table:
+    """A table that ten columns of numbers fit into on a terminal of 80 characters."""
+    return Table(box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False)
+
+
 def _frames(report: "Report", title: str) -> Table:
-    table = Table(title=title, title_justify="left", header_style="bold")
+    table = columns()
+    table.title = Text(title)
     for name in ("frame", "PSNR", "SSIM", "affine", "changed", "still", "bytes", "anchors", "free", "seconds"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     frames = report.frames
     step = -(-len(frames) // SHOWN_FRAMES)
     for frame in frames[::step] if (len(frames) - 1) % step == 0 else [*frames[::step], frames[-1]]:
@@ -51,11 +63,11 @@ def _frames(report: "Report", title: str) -> Table:
 
 
 def _cameras(report: "Report") -> Table:
-    table = Table(header_style="bold")
+    table = columns()
     for name in ("camera", "", "PSNR", "SSIM", "affine", "changed", "still"):
         table.add_column(name, justify="left" if name in ("camera", "") else "right")
     for name, scores in report.cameras.items():
-        table.add_row(name, report.stream["cameras"][name], *_scores(scores))
+        table.add_row(*plain(name, report.stream["cameras"][name]), *_scores(scores))
     return table
 
 
@@ -80,16 +92,17 @@ def _facts(report: "Report") -> Table:
     fields = sorted(s["field_bytes"].items(), key=lambda item: -item[1])
     table.add_row("bytes by field", ", ".join(f"{name} {human_bytes(size)}" for name, size in fields if size))
     if "peak_memory_bytes" in s:
+        memory = human_bytes(s["peak_memory_bytes"]) if s["peak_memory_bytes"] else "-"
         first = "-" if s["seconds_first"] is None else f"{s['seconds_first']:.1f} s"
         online = "-" if s["seconds_online_mean"] is None else f"{s['seconds_online_mean']:.2f} s"
         table.add_row(
             "training",
-            f"first frame {first}, each further one {online}, peak memory {human_bytes(s['peak_memory_bytes'])}",
+            f"first frame {first}, each further one {online}, peak memory {memory}",
         )
     table.add_row("rendering", f"{1 / max(report.mean.render_seconds, 1e-9):.1f} pictures a second")
     e = report.environment
     machine = f"{e['gpu'] or e['cpu']}, {e['cores']} cores, back-end {e['backend']}, torch {e['torch']}"
-    table.add_row("machine", machine)
+    table.add_row("machine", Text(machine))
     return table
 
 

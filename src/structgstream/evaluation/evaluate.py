@@ -22,6 +22,7 @@ from structgstream.evaluation.report import FrameScores, Report, Scores, course,
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
+from structgstream.session import on_device
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import PacketInfo, StreamReader
@@ -80,10 +81,11 @@ def evaluate(
     frames = []
     for frame, (info, scene) in zip(source.frames(), reader.scenes(0)):
         compared = []
+        placed = on_device(scene, backend.device)
         for name in names:
             truth = frame.images[name]
             first.setdefault(name, truth)
-            picture, seconds = rendered(scene, views[name], backend)
+            picture, seconds = rendered(placed, views[name], backend)
             compared.append(Compared(name, truth, picture, score(picture, truth, first[name], seconds=seconds)))
             if observer is not None:
                 observer(info.index, compared[-1])
@@ -199,7 +201,7 @@ def compared_frames(
     check_same_rig(reader.header, source, (camera,))
     view = reader.header.similarity.camera(reader.header.rig[camera])
     for frame, (_, scene) in zip(source.frames(), reader.scenes(0)):
-        yield frame.images[camera], rendered(scene, view, backend)[0]
+        yield frame.images[camera], rendered(on_device(scene, backend.device), view, backend)[0]
 
 
 def _frame_scores(info: "PacketInfo", scene: Scene, compared: list[Compared], log: dict[str, Any]) -> FrameScores:
@@ -209,7 +211,7 @@ def _frame_scores(info: "PacketInfo", scene: Scene, compared: list[Compared], lo
         pts_seconds=info.pts_seconds,
         kind=PacketKind(info.kind).name.lower(),
         bytes=info.bytes,
-        field_bytes=dict(info.field_bytes),
+        field_bytes={name: size for name, size in info.field_bytes.items()},  # noqa: C416 -- widens the key type
         anchors=len(scene.anchors),
         free=len(scene.free),
         cameras=scores,
@@ -226,5 +228,5 @@ def _training_facts(frames: list[FrameScores]) -> dict[str, Any]:
     return {
         "seconds_first": next((log["total_seconds"] for log in logs if log["index"] == 0), None),
         "seconds_online_mean": float(np.mean(online)) if online else None,
-        "peak_memory_bytes": max(log["peak_memory_bytes"] for log in logs),
+        "peak_memory_bytes": max(log["peak_memory_bytes"] or 0 for log in logs) or None,
     }

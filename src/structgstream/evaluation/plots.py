@@ -2,6 +2,7 @@
 """A report over time, as one picture: quality, bytes, counts, seconds."""
 
 from collections.abc import Callable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Okabe and Ito's colours, which all common kinds of colour vision tell apart.
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#999999")
-INK, FAINT = "#222222", "#dddddd"
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#222222")
+INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
 
 def write_plots(path: Path, report: Report, *, title: str) -> None:
@@ -112,11 +113,17 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
     whole = sum(array.sum() for array in values.values())
     shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
-    for number, name in enumerate(shown):
-        colour = COLOURS[number % len(COLOURS)]
+    colours = cycle(COLOURS)
+    for name in shown:
+        colour = OTHER if name == "other" else next(colours)
         axis.bar(index, values[name], bottom=base, width=0.85, color=colour, label=name.replace("_", " "))
         base = base + values[name]
 
 
 def _stages(frame: FrameScores) -> dict[str, float]:
-    return frame.log.get("seconds", {})
+    """Seconds by stage, and what no stage accounts for: the log's sums are left out, so that bars add up to them."""
+    seconds = dict(frame.log.get("seconds", {}))
+    total = seconds.pop("total", 0.0)
+    seconds.pop("fit", None)
+    rest = total - sum(seconds.values())
+    return seconds | {"other": rest} if rest > 0.0 else seconds

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plain lines for files, bars for terminals, the same numbers in both."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from structgstream.cli import progress
+from structgstream.cli.progress import Bars, Lines, display, human_bytes
+from structgstream.codec.packets import PacketKind
+from structgstream.session import FrameReport
+from structgstream.training.result import Step
+
+REPORT = FrameReport(
+    index=1,
+    pts_seconds=1 / 30,
+    kind=PacketKind.DELTA,
+    bytes=812_345,
+    field_bytes={},
+    train_psnr=31.204,
+    anchors=34_512,
+    free=2_301,
+    spawned=5,
+    pruned=1,
+    seconds={"total": 5.12},
+)
+
+
+def console(*, terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=120, height=20, color_system=None)
+
+
+def text(of: Console) -> str:
+    assert isinstance(of.file, io.StringIO)
+    return of.file.getvalue()
+
+
+def test_the_place_decides_how_progress_looks() -> None:
+    assert isinstance(display(3, console=console(terminal=False)), Lines)
+    assert isinstance(display(3, console=console(terminal=True)), Bars)
+
+
+def test_a_line_for_each_frame() -> None:
+    out = console(terminal=False)
+    with display(20, done=1, console=out) as shown:
+        shown.step(Step(1, 100, 0.5, 34_512, 0))
+        shown.frame(REPORT)
+    assert text(out) == "frame  2/20  train 31.20 dB   812.3 kB     5.1 s  34,512 anchors  2,301 free\n"
+
+
+def test_a_long_frame_speaks_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "QUIET_SECONDS", -1.0)
+    out = console(terminal=False)
+    with display(20, done=4, console=out) as shown:
+        shown.step(Step(7, 100, 0.25, 1_000, 0))
+    assert text(out) == "frame 5/20: iteration 7/100, loss 0.2500, 1,000 anchors\n"
+
+
+def test_bars_show_frames_iterations_and_the_last_frame() -> None:
+    out = console(terminal=True)
+    with display(20, done=1, console=out) as shown:
+        shown.step(Step(40, 100, 0.25, 34_512, 7))
+        shown.frame(REPORT)
+        shown.step(Step(10, 100, 0.25, 34_512, 7))
+    final = text(out).splitlines()
+    assert any("frames" in line and " 2/20" in line and "5.1 s a frame" in line for line in final)
+    assert "frame  2/20  train 31.20 dB" in text(out).splitlines()[-2]
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (999_400, "999.4 kB"), (999_600, "1.0 MB"), (3.2e9, "3.20 GB")],
+)
+def test_bytes_for_reading(count: float, words: str) -> None:
+    assert human_bytes(count) == words
