@@ -12,7 +12,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <vector>
 
 #include "vec.h"
 
@@ -44,28 +43,28 @@ struct Sizes {
     }
 };
 
-// A weight matrix in the order in which `dense` reads it: tiles of kTile outputs, inputs within a tile.
+// A weight matrix in the order in which `apply` reads it: tiles of kTile outputs, in a tile one input after another.
+// Memory is not a std::vector's: what the compiler does not inline of that would be shared between instruction sets.
 class Packed {
   public:
     template <typename Weight>
-    Packed(int outputs, int inputs, Weight weight) : tiles_(padded(outputs) / kTile), inputs_(inputs) {
-        weights_.assign(static_cast<size_t>(tiles_) * kTile * inputs, 0.0f);
-        for (int o = 0; o < outputs; ++o)
+    Packed(int outputs, int inputs, const float* bias, Weight weight)
+        : tiles_(padded(outputs) / kTile), inputs_(inputs),
+          memory_(static_cast<size_t>(tiles_) * kTile * (inputs + 1)) {
+        float* w = memory_.get();
+        for (int t = 0; t < tiles_ * kTile; t += kTile)
             for (int i = 0; i < inputs; ++i)
-                weights_[(static_cast<size_t>(o / kTile) * inputs + i) * kTile + o % kTile] = weight(o, i);
-        bias_.assign(static_cast<size_t>(tiles_) * kTile, 0.0f);
-    }
-    Packed& with_bias(const float* bias, int outputs) {
-        std::copy(bias, bias + outputs, bias_.begin());
-        return *this;
+                for (int o = t; o < t + kTile; ++o) *w++ = o < outputs ? weight(o, i) : 0.0f;
+        for (int o = 0; o < tiles_ * kTile; ++o) *w++ = o < outputs && bias != nullptr ? bias[o] : 0.0f;
     }
     // y = W x + b for one block; rows of x and y are kBlock floats.
     [[gnu::noinline]] void apply(const float* x, float* y) const {
-        const float* w = weights_.data();
+        const float* w = memory_.get();
+        const float* bias = w + static_cast<size_t>(tiles_) * kTile * inputs_;
         for (int t = 0; t < tiles_; ++t) {
             vf sums[kTile][2];
 #pragma GCC unroll 8
-            for (int o = 0; o < kTile; ++o) sums[o][0] = sums[o][1] = splat(bias_[t * kTile + o]);
+            for (int o = 0; o < kTile; ++o) sums[o][0] = sums[o][1] = splat(bias[t * kTile + o]);
             for (int i = 0; i < inputs_; ++i, w += kTile) {
                 const vf x0 = load(x + i * kBlock), x1 = load(x + i * kBlock + kLanes);
 #pragma GCC unroll 8
@@ -84,19 +83,21 @@ class Packed {
 
   private:
     int tiles_, inputs_;
-    std::vector<float> weights_, bias_;
+    Buffer memory_;
 };
 
 Packed first_layer(const sgs_head& head, const Sizes& s) {
-    return Packed(s.hidden, s.inputs, [&](int o, int i) { return head.w1[o * s.inputs + i]; })
-        .with_bias(head.b1, s.hidden);
+    return Packed(s.hidden, s.inputs, head.b1, [&](int o, int i) { return head.w1[o * s.inputs + i]; });
 }
 
 Packed second_layer(const sgs_head& head, const Sizes& s, int h) {
-    return Packed(
-               s.outputs[h], s.hidden_padded,
-               [&](int o, int i) { return i < s.hidden ? head.w2[o * s.hidden + i] : 0.0f; })
-        .with_bias(head.b2, s.outputs[h]);
+    return Packed(s.outputs[h], s.hidden_padded, head.b2, [&](int o, int i) {
+        return i < s.hidden ? head.w2[o * s.hidden + i] : 0.0f;
+    });
+}
+
+Packed second_layer_backwards(const sgs_head& head, const Sizes& s, int h) {
+    return Packed(s.hidden, s.outputs[h], nullptr, [&](int o, int i) { return head.w2[i * s.hidden + o]; });
 }
 
 // hidden = max(hidden, 0); bits[word * kBlock + lane] tells which units were positive.
@@ -247,6 +248,10 @@ void add_sums(const float* a, int rows, size_t stride, int blocks, float* out) {
     }
 }
 
+int32_t* bits_of(const sgs_selection& selection, const Sizes& s, int row, int head) {
+    return selection.relu_bits + (static_cast<size_t>(row) * kHeads + head) * s.words;
+}
+
 Block active_block(const sgs_anchors& a, const sgs_selection& selection, int begin, int count) {
     Block block{count, {}};
     for (int l = 0; l < kBlock; ++l) block.anchors[l] = a.visible[selection.active[begin + std::min(l, count - 1)]];
@@ -261,7 +266,8 @@ void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
     const int m = a.visible_count, chunks = (m + kChunk - 1) / kChunk;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
     for (int chunk = 0; chunk < chunks; ++chunk) {
-        const Buffer memory(static_cast<size_t>(s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[0] + s.words) * kBlock);
+        const int rows = s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[0] + s.words;
+        const Buffer memory(static_cast<size_t>(rows) * kBlock);
         const Inputs x{memory.get(), memory.get() + s.inputs_padded * kBlock};
         float* hidden = x.distance + kBlock;
         float* raw = hidden + s.hidden_padded * kBlock;
@@ -276,9 +282,9 @@ void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
             second.apply(hidden, raw);
             for (int i = 0; i < s.k * kBlock; i += kLanes) store(raw + i, hyperbolic_tangent(load(raw + i)));
             for (int l = 0; l < count; ++l) {
-                for (int j = 0; j < s.k; ++j) out.raw_opacities[static_cast<size_t>(row + l) * s.k + j] = raw[j * kBlock + l];
-                for (int w = 0; w < s.words; ++w)
-                    out.relu_bits[(static_cast<size_t>(row + l) * kHeads) * s.words + w] = bits[w * kBlock + l];
+                float* opacities = out.raw_opacities + static_cast<size_t>(row + l) * s.k;
+                for (int j = 0; j < s.k; ++j) opacities[j] = raw[j * kBlock + l];
+                for (int w = 0; w < s.words; ++w) bits_of(out, s, row + l, 0)[w] = bits[w * kBlock + l];
             }
         }
     }
@@ -304,10 +310,8 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
     const int k = s.k;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
     for (int chunk = 0; chunk < chunks; ++chunk) {
-        const Buffer memory(
-            static_cast<size_t>(
-                s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[1] + s.outputs_padded[2] + k + 6 + s.words) *
-            kBlock);
+        const int rows = s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[1] + s.outputs_padded[2];
+        const Buffer memory(static_cast<size_t>(rows + k + 6 + s.words) * kBlock);
         const Inputs x{memory.get(), memory.get() + s.inputs_padded * kBlock};
         float* hidden = x.distance + kBlock;
         float* color = hidden + s.hidden_padded * kBlock;
@@ -325,8 +329,7 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
                 rectify(hidden, s.hidden_padded, bits, s.words);
                 for (int l = 0; l < count; ++l)
                     for (int w = 0; w < s.words; ++w)
-                        selection.relu_bits[(static_cast<size_t>(selection.active[begin + l]) * kHeads + h) * s.words + w] =
-                            bits[w * kBlock + l];
+                        bits_of(selection, s, selection.active[begin + l], h)[w] = bits[w * kBlock + l];
                 second[h - 1].apply(hidden, h == 1 ? color : covariance);
             }
             read_exponentials(a.log_offset_scales, block, reach);
@@ -488,33 +491,34 @@ struct Backward {
 }  // namespace
 
 void anchors_backward(
-    const sgs_anchors& a, const sgs_selection& selection, const sgs_gaussians& drawn, const sgs_gaussian_gradients& from,
-    const sgs_anchor_gradients& to, int threads) {
+    const sgs_anchors& a, const sgs_selection& selection, const sgs_gaussians& drawn,
+    const sgs_gaussian_gradients& from, const sgs_anchor_gradients& to, int threads) {
     const Backward b(a, selection, drawn, from, to);
     const Sizes& s = b.s;
-    std::vector<Packed> first, to_hidden;
-    for (int h = 0; h < kHeads; ++h) {
-        const sgs_head& head = a.heads[h];
-        first.push_back(first_layer(head, s));
-        to_hidden.emplace_back(s.hidden, s.outputs[h], [&](int o, int i) { return head.w2[i * s.hidden + o]; });
-    }
-    const Packed to_input(s.inputs - b.input_first, kHeads * s.hidden_padded, [&](int o, int i) {
+    const Packed first[kHeads] = {first_layer(a.heads[0], s), first_layer(a.heads[1], s), first_layer(a.heads[2], s)};
+    const Packed to_hidden[kHeads] = {
+        second_layer_backwards(a.heads[0], s, 0), second_layer_backwards(a.heads[1], s, 1),
+        second_layer_backwards(a.heads[2], s, 2)};
+    const Packed to_input(s.inputs - b.input_first, kHeads * s.hidden_padded, nullptr, [&](int o, int i) {
         const int h = i / s.hidden_padded, unit = i % s.hidden_padded;
         return unit < s.hidden ? a.heads[h].w1[unit * s.inputs + b.input_first + o] : 0.0f;
     });
     const int total = static_cast<int>(selection.active_count), chunks = (total + kChunk - 1) / kChunk;
     const int groups = std::min(chunks, kGroups);
     const size_t sums_size = b.partial[kHeads];
-    std::vector<float> sums(groups * sums_size, 0.0f);
+    const Buffer memory_of_sums(std::max(1, groups) * sums_size);
+    float* sums = memory_of_sums.get();
+    std::memset(sums, 0, sizeof(float) * std::max(1, groups) * sums_size);
     // Rows of one block: inputs, distance, outputs of the heads, their hidden layers' gradients, hidden values.
     const int outputs_rows = s.outputs_padded[0] + s.outputs_padded[1] + s.outputs_padded[2];
-    const size_t block_size = static_cast<size_t>(s.inputs_padded + 1 + outputs_rows + 2 * kHeads * s.hidden_padded) * kBlock;
+    const int block_rows = s.inputs_padded + 1 + outputs_rows + 2 * kHeads * s.hidden_padded;
+    const size_t block_size = static_cast<size_t>(block_rows) * kBlock;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
     for (int group = 0; group < groups; ++group) {
-        const Buffer memory(kChunkBlocks * block_size + (s.inputs_padded + 3) * kBlock);
+        const Buffer memory(kChunkBlocks * block_size + (s.inputs_padded + 3 + s.words) * kBlock);
         float* input_gradient = memory.get() + kChunkBlocks * block_size;
         float* means = input_gradient + s.inputs_padded * kBlock;
-        std::vector<int32_t> bits(static_cast<size_t>(s.words) * kBlock);
+        int32_t* bits = reinterpret_cast<int32_t*>(means + 3 * kBlock);
         for (int chunk = static_cast<int>(static_cast<int64_t>(chunks) * group / groups);
              chunk < static_cast<int>(static_cast<int64_t>(chunks) * (group + 1) / groups); ++chunk) {
             const int end = std::min(total, (chunk + 1) * kChunk);
@@ -535,16 +539,16 @@ void anchors_backward(
                     if (!b.uses(h)) continue;
                     float* gradient = hidden_gradient + h * s.hidden_padded * kBlock;
                     to_hidden[h].apply(outputs[h], gradient);
-                    std::fill(bits.begin(), bits.end(), 0);
-                    for (int l = 0; l < count; ++l)
-                        for (int w = 0; w < s.words; ++w)
-                            bits[w * kBlock + l] =
-                                selection.relu_bits[(static_cast<size_t>(selection.active[begin + l]) * kHeads + h) * s.words + w];
-                    mask(gradient, s.hidden_padded, bits.data());
+                    for (int l = 0; l < kBlock; ++l) {
+                        const int row = selection.active[begin + std::min(l, count - 1)];
+                        const int32_t* kept = bits_of(selection, s, row, h);
+                        for (int w = 0; w < s.words; ++w) bits[w * kBlock + l] = kept[w];
+                    }
+                    mask(gradient, s.hidden_padded, bits);
                     if (b.trained[h]) {
                         float* values = hidden + h * s.hidden_padded * kBlock;
                         first[h].apply(x.rows, values);
-                        mask(values, s.hidden_padded, bits.data());
+                        mask(values, s.hidden_padded, bits);
                     }
                 }
                 if (b.to_inputs) {
@@ -558,7 +562,7 @@ void anchors_backward(
                 const float* gradient = rows + (s.inputs_padded + 1 + outputs_rows + h * s.hidden_padded) * kBlock;
                 const float* hidden = gradient + kHeads * s.hidden_padded * kBlock;
                 if (b.trained[h]) {
-                    float* w1 = sums.data() + group * sums_size + b.partial[h];
+                    float* w1 = sums + group * sums_size + b.partial[h];
                     float* b1 = w1 + s.hidden_padded * s.inputs_padded;
                     float* w2 = b1 + s.hidden_padded;
                     float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
@@ -573,10 +577,9 @@ void anchors_backward(
     }
     for (int group = 1; group < groups; ++group)
         for (size_t i = 0; i < sums_size; ++i) sums[i] += sums[group * sums_size + i];
-    sums.resize(sums_size);
     for (int h = 0; h < kHeads; ++h) {
         if (!b.trained[h]) continue;
-        const float* w1 = sums.data() + b.partial[h];
+        const float* w1 = sums + b.partial[h];
         const float* b1 = w1 + s.hidden_padded * s.inputs_padded;
         const float* w2 = b1 + s.hidden_padded;
         const float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;

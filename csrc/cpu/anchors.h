@@ -2,9 +2,7 @@
 // Arguments of the generation of structured Gaussians; the layouts are those of the C interface.
 #pragma once
 
-#include <cstdint>
-
-extern "C" {
+#include <stdint.h>
 
 // One MLP with one hidden ReLU layer, row-major: w1 [hidden, inputs], b1, w2 [outputs, hidden], b2.
 struct sgs_head {
@@ -29,7 +27,7 @@ struct sgs_anchors {
     const float* offsets;            // [M, K, 3]
     const float* features;           // [M, D]
     const int64_t* visible;          // [m] ascending
-    sgs_head heads[3];               // opacity (K, tanh), color (3 K, sigmoid), covariance (7 K)
+    struct sgs_head heads[3];        // opacity (K, tanh), color (3 K, sigmoid), covariance (7 K)
     float camera_center[3];
     int32_t visible_count;           // m
     int32_t offsets_per_anchor;      // K
@@ -73,6 +71,5 @@ struct sgs_anchor_gradients {
     float* log_base_scales;
     float* offsets;
     float* features;
-    sgs_head_gradient heads[3];
+    struct sgs_head_gradient heads[3];
 };
-}

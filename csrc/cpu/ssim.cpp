@@ -269,7 +269,10 @@ void l1_ssim(
     double* row_l1, double* row_ssim, int threads) {
     Picture p{image, target, target_u8, gradient, row_l1, row_ssim, {}, height, width};
     double weights[kTaps], total = 0.0;
-    for (int k = 0; k < kTaps; ++k) total += weights[k] = std::exp(-(k - kHalf) * (k - kHalf) / (2.0 * kSigma * kSigma));
+    for (int k = 0; k < kTaps; ++k) {
+        weights[k] = std::exp(-(k - kHalf) * (k - kHalf) / (2.0 * kSigma * kSigma));
+        total += weights[k];
+    }
     for (int k = 0; k < kTaps; ++k) p.weights[k] = static_cast<float>(weights[k] / total);
     std::fill(row_l1, row_l1 + height, 0.0);
     std::fill(row_ssim, row_ssim + height, 0.0);

@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <new>
+#include <utility>
 
 #ifndef SGS_ISA
 #define SGS_ISA native
@@ -73,16 +74,22 @@ inline vf hyperbolic_tangent(vf x) {
     return size < 0.625f ? small : with_sign;
 }
 
-// Lanes of `a` and `b` interleaved by groups of `step`: low takes the groups with an even number, high the odd ones.
+#if defined(__clang__)
+#define SGS_SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define SGS_SHUFFLE(a, b, ...) __builtin_shuffle(a, b, vi{__VA_ARGS__})
+#endif
+
+// Lanes of `a` and `b` in turns, by groups of Step: low takes the groups with an even number, high the odd ones.
+template <int Step, int... Lane>
+inline void interleave(vf a, vf b, vf& low, vf& high, std::integer_sequence<int, Lane...>) {
+    low = SGS_SHUFFLE(a, b, (Lane & Step ? kLanes + Lane - Step : Lane)...);
+    high = SGS_SHUFFLE(a, b, (Lane & Step ? kLanes + Lane : Lane + Step)...);
+}
+
 template <int Step>
 inline void interleave(vf a, vf b, vf& low, vf& high) {
-    vi from_low, from_high;
-    for (int i = 0; i < kLanes; ++i) {
-        from_low[i] = i & Step ? kLanes + i - Step : i;
-        from_high[i] = i & Step ? kLanes + i : i + Step;
-    }
-    low = __builtin_shuffle(a, b, from_low);
-    high = __builtin_shuffle(a, b, from_high);
+    interleave<Step>(a, b, low, high, std::make_integer_sequence<int, kLanes>{});
 }
 
 template <int Step = 1>
