@@ -7,6 +7,9 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_adam, reference_adam
+from structgstream.kernels._load import native_reason
+
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
 OPTIONS = {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-15}
 
@@ -19,7 +22,7 @@ def steps(module, param: Tensor, gradients: list[Tensor], rows: Tensor | None = 
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (50, 5, 3), (9001, 4)])
-def test_steps(shape: tuple[int, ...]) -> None:
+def test_steps(isa: int, shape: tuple[int, ...]) -> None:
     param = torch.randn(shape)
     # Gradients of a mean over pixels are tiny, and those of unseen rows are zero.
     gradients = [torch.randn(shape) * 1e-6 * (torch.rand(shape) < 0.8) for _ in range(10)]
@@ -52,7 +55,7 @@ def test_selected_rows_move_and_others_stay() -> None:
     assert all(torch.allclose(a[rows], b[rows], atol=1e-6) for a, b in zip(some, every, strict=True))
 
 
-def test_bitwise_equal_for_any_number_of_threads() -> None:
+def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     param, rows = torch.randn(30_000, 3), torch.arange(0, 30_000, 2)
     gradients = [torch.randn(30_000, 3) for _ in range(2)]
     for selected in (None, rows):

@@ -7,7 +7,10 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
+from structgstream.kernels._load import native_reason
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
+
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
 # Positions of the tensors that online training moves: x_v, l_v, the covariance head.
 ONLINE = {0, 1, 13, 14, 15, 16}
@@ -85,7 +88,7 @@ def relative_error(value: Tensor, exact: Tensor) -> float:
         (1, 5, True, 32, 32),
     ],
 )
-def test_attributes_and_gradients(m: int, k: int, distance_input: bool, d: int, hidden: int) -> None:
+def test_attributes_and_gradients(isa: int, m: int, k: int, distance_input: bool, d: int, hidden: int) -> None:
     values = tensors(m, k, distance_input=distance_input, d=d, hidden=hidden)
     if m == 1:
         values[8].fill_(0.5)  # the opacity head's last bias: the only anchor draws something
@@ -125,7 +128,7 @@ def test_attributes_that_no_loss_uses(used: tuple[int, ...]) -> None:
         assert relative_error(ours[index], wanted) < 5e-6, index
 
 
-def test_bitwise_equal_for_any_number_of_threads() -> None:
+def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     values, visible = tensors(3000, 5, distance_input=True), torch.arange(0, 3000, 2)
     cotangents = cotangents_of(values, visible, True)
     results = []
@@ -167,7 +170,7 @@ def test_anchors_out_of_sight_get_no_gradient() -> None:
         assert (gradients[index][10:30] != 0).any()
 
 
-def test_extreme_outputs_stay_finite() -> None:
+def test_extreme_outputs_stay_finite(isa: int) -> None:
     values, visible = tensors(64, 5, distance_input=True), torch.arange(64)
     for index in (7, 11, 15):
         values[index] *= 1e4

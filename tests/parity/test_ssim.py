@@ -8,6 +8,9 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_ssim, reference_ssim
+from structgstream.kernels._load import native_reason
+
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
 
 def pictures(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -27,7 +30,7 @@ def value_and_gradient(module, image: Tensor, target: Tensor, weights: tuple[flo
 # One row, one pixel, less than a window, an odd size, more than one strip of columns.
 @pytest.mark.parametrize("size", [(1, 23), (1, 1), (7, 5), (37, 29), (24, 600)])
 @pytest.mark.parametrize("as_bytes", [False, True])
-def test_value_and_gradient(size: tuple[int, int], as_bytes: bool) -> None:
+def test_value_and_gradient(isa: int, size: tuple[int, int], as_bytes: bool) -> None:
     image, target = pictures(*size)
     if as_bytes:
         target = (target * 255).round().to(torch.uint8)
@@ -59,7 +62,7 @@ def test_inside_the_border_it_is_the_published_ssim() -> None:
     assert cpu_ssim.ssim(padded[0], padded[1]).item() == pytest.approx(theirs.mean(), abs=1e-6)
 
 
-def test_bitwise_equal_for_any_number_of_threads() -> None:
+def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     image, target = pictures(45, 320)
     results = []
     for threads in (1, 2, 3, 2):
