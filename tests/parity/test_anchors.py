@@ -180,6 +180,14 @@ def test_extreme_outputs_stay_finite(isa: int) -> None:
     assert ours.colors.min() >= 0.0
 
 
+@pytest.mark.parametrize("module", [cpu_anchors, reference_anchors])
+def test_an_anchor_in_the_camera_spoils_nothing(module) -> None:
+    values, visible = tensors(8, 5, distance_input=True), torch.arange(8)
+    values[0][3] = torch.tensor([0.3, 0.2, -5.0])
+    ours, gradients = run(module, values, visible, True, cotangents_of(values, visible, True))
+    assert all(torch.isfinite(x).all() for x in [*attributes(ours), *gradients.values()])
+
+
 def test_what_it_cannot_generate_from() -> None:
     values, visible = tensors(10, 5, distance_input=True), torch.arange(10)
     with pytest.raises(BackendError, match="float64"):

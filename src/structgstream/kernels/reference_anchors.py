@@ -41,7 +41,7 @@ def generate_structured(
     """
     k = offsets.shape[1]
     to_anchor = positions[visible] - camera_center
-    distance = to_anchor.norm(dim=1, keepdim=True)
+    distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)  # An anchor may sit in the camera.
     parts = [features[visible], to_anchor / distance]
     inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
     opacity = torch.tanh(_head(mlps.opacity, inputs))  # [m, K]
