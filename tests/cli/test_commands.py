@@ -149,7 +149,7 @@ def test_demo_leaves_everything_to_look_at(
     assert main(["demo", "--output", str(out), "--frames", "2", "--scale", "0.25", *QUICK]) == 0
     made = {str(entry.relative_to(out)) for entry in out.rglob("*") if entry.is_file()}
     report = {"report/report.json", "report/over_time.png", "report/contact_sheet.png"}
-    assert made == {"clip.sgs", "clip.log.jsonl", "camera-cam00.mp4", "orbit.mp4"} | report
+    assert made == {"clip.sgs", "clip.log.jsonl", "held-out.mp4", "orbit.mp4"} | report
     text = capsys.readouterr().out
     assert "Held-out PSNR" in text
     assert all(name.split("/")[-1] in text for name in made - {"clip.log.jsonl"})
@@ -249,3 +249,14 @@ def test_the_check_before_the_first_frame_sees_a_folder_without_permission(
 ) -> None:
     monkeypatch.setattr(reconstruct.os, "access", lambda path, mode: False)  # root may write anywhere
     assert "permission" in error_of(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs")], capsys, status=1)
+
+
+@pytest.mark.parametrize(("count", "frames"), [(6, [0, 1, 1, 2, 1, 1]), (2, [0, 1])])
+def test_time_on_a_path_runs_forth_and_back(count: int, frames: list[int]) -> None:
+    class Reader:
+        packets = (0, 1, 2)
+
+        def scenes(self, start: int) -> list[tuple[int, int]]:
+            return [(i, i) for i in self.packets[start:]]
+
+    assert list(render._forth_and_back(Reader(), None, count=count)) == frames  # pyright: ignore

@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import cycle, islice
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
     from structgstream.scene.scene import Scene
 
-LEAST_PATH_SECONDS = 4.0  # a shorter stream runs to and fro while the camera moves
+LEAST_PATH_SECONDS = 4.0  # a shorter stream runs forth and back, slowed, while the camera moves
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Render:
     between: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="CAMERA CAMERA", help_behavior_hint="")] = None
     """Ends of the arc. Default: two cameras well apart on the same side."""
     seconds: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Length of a path. Default: that of the stream, at least 4 s; a shorter stream runs to and fro."""
+    """Length of a path. Default: that of the stream, at least 4 s. A shorter stream runs forth and back, slowed."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """This frame only; on a path, time stands still. Default: all frames."""
     compare: bool = False
@@ -138,7 +138,7 @@ def path_pictures(
     seconds: float | None = None,
     frame: int | None = None,
 ) -> "Iterator[NDArray[np.uint8]]":
-    """What a moving camera sees while time runs, to and fro when the path takes longer than the stream."""
+    """What a moving camera sees while time runs; forth and back, slowed, when the path takes longer than the stream."""
     from structgstream.evaluation.camera_path import arc, orbit
     from structgstream.evaluation.evaluate import rendered
     from structgstream.session import on_device
@@ -148,7 +148,7 @@ def path_pictures(
     count = max(round(length * header.fps), 1)
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
-    for view, scene in zip(views, _to_and_fro(reader, frame, count=count), strict=True):
+    for view, scene in zip(views, _forth_and_back(reader, frame, count=count), strict=True):
         yield rendered(on_device(scene, backend.device), header.similarity.camera(view), backend)[0]
 
 
@@ -209,13 +209,14 @@ def default_output(options: Render, reader: "StreamReader") -> Path:
     return options.stream.with_name(f"{options.stream.stem}-{name}{ending}{suffix}")
 
 
-def _to_and_fro(reader: "StreamReader", frame: int | None, *, count: int) -> "Iterator[Scene]":
+def _forth_and_back(reader: "StreamReader", frame: int | None, *, count: int) -> "Iterator[Scene]":
     if frame is None and len(reader.packets) >= count:
         yield from islice(scenes_of(reader, None), count)
         return
     # A stream shorter than the path is short enough to keep: scenes share what does not change.
     scenes = list(scenes_of(reader, frame))
-    yield from islice(cycle(scenes + scenes[-2:0:-1]), count)
+    for number in range(count):
+        yield scenes[round((len(scenes) - 1) * (1.0 - abs(1.0 - 2.0 * number / count)))]
 
 
 def _check_frame(reader: "StreamReader", frame: int | None) -> None:

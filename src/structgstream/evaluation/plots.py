@@ -88,7 +88,7 @@ def _seconds(axis: "Axes", report: Report) -> None:
     if online and first > 3 * max(online):
         axis.set_ylim(0, 1.3 * max(online))
         axis.annotate(
-            f"first frame: {first:.0f} s", (report.frames[0].index, 1.2 * max(online)), xytext=(8, 0),
+            f"first frame: {first:.0f} s", (report.frames[0].index + 0.5, 1.2 * max(online)), xytext=(8, 0),
             textcoords="offset points", fontsize=8, color=INK, va="center",
         )  # fmt: skip
     axis.set_ylabel("seconds", fontsize=9)
