@@ -53,11 +53,12 @@ PAPER = StreamConfig()
 RIG = StreamConfig(
     initial=InitialConfig(
         iterations=4000,
+        voxel_size=0.0067,
         schedule_iterations=4000,
         camera_color=True,
         coarse_iterations=2500,
         rates=decayed(InitialRates(), 0.05),
-        growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=60_000),
+        growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=45_000),
         losses=LossWeights(offset_distance=0.005),
     ),
 )

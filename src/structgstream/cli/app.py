@@ -34,6 +34,9 @@ class Interrupted(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; the exit status is 0 done, 1 a problem, 2 wrong usage, 130 interrupted."""
+    # Two threads that spin while they wait for each other are slower than one on a machine that does anything else.
+    # OpenMP reads this once, when torch is loaded, so it is set before any command imports it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
