@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import UsageError
+from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, parsed_with_rest, resolved_config
 from structgstream.cli.tables import report_tables
 
@@ -65,13 +65,16 @@ def main(arguments: list[str]) -> None:
         f"{len(source)} frames, preset {preset}, back-end {backend.name}.",
         highlight=False,
     )
-    reconstructed(
-        source,
-        config,
-        output=stream,
-        backend=backend,
-        metadata={"preset": preset, "start": 0, "scale": options.scale},
-    )
+    try:
+        reconstructed(
+            source,
+            config,
+            output=stream,
+            backend=backend,
+            metadata={"preset": preset, "start": 0, "scale": options.scale},
+        )
+    except Interrupted:
+        raise Interrupted(f"What was done is in {options.output}; the demo starts again from the beginning.") from None
     reader = open_stream(stream)
     report_folder = options.output / "report"
     report = scored(reader, source, stream=stream, backend=backend, cameras=None, folder=report_folder)
