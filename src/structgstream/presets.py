@@ -81,9 +81,9 @@ FAST = replace(
             max_anchors=40_000,
         ),
     ),
-    online=replace(RIG.online, iterations=60, patching=replace(RIG.online.patching, iteration=30)),
+    online=replace(RIG.online, rates=replace(RIG.online.rates, anchor_positions=1e-3)),
 )
-"""A try in minutes on a laptop."""
+"""A try in minutes on a laptop: a shorter frame 0, and anchors that follow fast motion (docs/method.md)."""
 
 TINY = replace(
     FAST,

@@ -17,7 +17,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, scene_of, state_of
+from structgstream.scene.state import on_device, state_of
 from structgstream.similarity import normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame
@@ -244,11 +244,3 @@ def _differences(old: object, new: object, path: str = "") -> Iterator[str]:
             yield from _differences(old.get(key), new.get(key), f"{path}.{key}" if path else key)
     elif old != new:
         yield path
-
-
-def on_device(scene: Scene, device: torch.device) -> Scene:
-    """The scene with its tensors on ``device``."""
-    if device.type == "cpu":
-        return scene
-    state: dict[FieldName, torch.Tensor] = {name: value.to(device) for name, value in state_of(scene).items()}
-    return scene_of(state, distance_input=scene.distance_input)

@@ -121,7 +121,7 @@ def camera_pictures(
 ) -> "Iterator[NDArray[np.uint8]]":
     """What a camera of the rig sees, frame by frame."""
     from structgstream.evaluation.evaluate import rendered
-    from structgstream.session import on_device
+    from structgstream.scene.state import on_device
 
     view = reader.header.similarity.camera(reader.header.rig[camera])
     for scene in scenes_of(reader, frame):
@@ -141,7 +141,7 @@ def path_pictures(
     """What a moving camera sees while time runs; forth and back, slowed, when the path takes longer than the stream."""
     from structgstream.evaluation.camera_path import arc, orbit
     from structgstream.evaluation.evaluate import rendered
-    from structgstream.session import on_device
+    from structgstream.scene.state import on_device
 
     header = reader.header
     length = max(len(reader.packets) / header.fps, LEAST_PATH_SECONDS) if seconds is None else seconds

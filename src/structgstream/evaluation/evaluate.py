@@ -22,7 +22,7 @@ from structgstream.evaluation.report import FrameScores, Report, Scores, course,
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
-from structgstream.session import on_device
+from structgstream.scene.state import on_device
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import PacketInfo, StreamReader

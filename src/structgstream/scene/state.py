@@ -121,3 +121,11 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
         camera_color=CameraColor(gains, biases),
         distance_input=distance_input,
     )
+
+
+def on_device(scene: Scene, device: torch.device) -> Scene:
+    """The scene with its tensors on ``device``."""
+    if device.type == "cpu":
+        return scene
+    state: dict[FieldName, Tensor] = {name: value.to(device) for name, value in state_of(scene).items()}
+    return scene_of(state, distance_input=scene.distance_input)
