@@ -5,6 +5,7 @@
 functions. A back-end that lacks an operation of its own names another's, visibly, where the value is built.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -15,6 +16,8 @@ from torch import Tensor
 from structgstream.errors import BackendError
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.raster_types import RasterOutput
+
+_log = logging.getLogger(__name__)
 
 BackendName = Literal["auto", "cpu", "cuda", "reference"]
 
@@ -114,4 +117,6 @@ def select_backend(name: BackendName) -> Backend:
     if name != "auto":
         return builders[name]()
     reasons = backend_reasons()
+    if reasons["cuda"] is not None and reasons["cpu"] is not None:
+        _log.warning("Running on the torch reference, which is many times slower. %s", reasons["cpu"])
     return next(builders[candidate]() for candidate in builders if reasons[candidate] is None)

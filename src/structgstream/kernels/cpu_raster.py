@@ -63,7 +63,8 @@ class _Rasterize(torch.autograd.Function):
         return image, alpha, radii
 
     @staticmethod
-    def backward(ctx: Any, grad_image: Tensor | None, grad_alpha: Tensor | None, _: None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        grad_image, grad_alpha, _ = gradients
         means, quats, scales, opacities, colors, background, image, alpha = ctx.saved_tensors
         given = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         given_alpha = None if grad_alpha is None else grad_alpha.contiguous()

@@ -158,7 +158,7 @@ def fit_next_frame(
                     adam,
                     scene=scene,
                     statistics=statistics,
-                    views=[view, *(other for other in views if other is not view)],
+                    views=[view, *(other for other in views if other.index != view.index)],
                     frame_index=frame.index,
                     config=patching,
                     backend=backend,

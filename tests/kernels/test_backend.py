@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+import logging
+
+import pytest
+
+from structgstream.errors import BackendError
+from structgstream.kernels import _load, backend
+
+
+def test_the_reference_is_always_there() -> None:
+    assert backend.backend_reasons()["reference"] is None
+    assert backend.select_backend("reference").name == "reference"
+
+
+def test_without_a_native_library_it_says_so_once_and_works(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(_load, "_loaded", lambda: (None, "The CPU kernels were not built; install a compiler."))
+    monkeypatch.setattr(backend, "backend_reasons", lambda: {"cuda": "no GPU", "cpu": "not built", "reference": None})
+    with caplog.at_level(logging.WARNING):
+        assert backend.select_backend("auto").name == "reference"
+    assert [record.getMessage() for record in caplog.records] == [
+        "Running on the torch reference, which is many times slower. not built"
+    ]
+    with pytest.raises(BackendError, match="install a compiler"):
+        backend.select_backend("cpu")
+
+
+def test_a_named_backend_that_is_missing_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(BackendError, match="sees no NVIDIA GPU"):
+        backend.select_backend("cuda")
