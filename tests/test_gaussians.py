@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
-from rigs import arc_rig, random_scene
 
+from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import reference_backend
 

@@ -4,20 +4,22 @@
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import torch
 
+from structgstream.cameras import CameraRig
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.data.source import FrameSource
-from structgstream.errors import ConfigError
+from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import on_device, state_of
+from structgstream.scene.state import FieldName, on_device, state_of
 from structgstream.similarity import normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame
@@ -32,7 +34,7 @@ class FrameReport:
     pts_seconds: float
     kind: PacketKind
     bytes: int
-    field_bytes: Mapping[str, int]
+    field_bytes: Mapping[FieldName, int]
     train_psnr: float
     anchors: int
     free: int
@@ -103,8 +105,11 @@ class Session:
         """
         try:
             yield from self._frames()
-        finally:
-            self._sink.close()
+        except BaseException:
+            with suppress(StorageError):  # What went wrong first is what the user must see.
+                self._sink.close()
+            raise
+        self._sink.close()
 
     def _frames(self) -> Iterator[FrameReport]:
         encoder: SceneEncoder | None = None
@@ -221,20 +226,30 @@ class Session:
                 f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
                 "Resume with the same preset and options, or start again with --overwrite."
             )
-        same_cameras = [*header.rig] == [*self._source.rig] and all(
-            torch.equal(header.rig[name].viewmat, self._source.rig[name].viewmat)
-            and torch.equal(header.rig[name].K, self._source.rig[name].K)
-            for name in header.rig
-        )
-        if (
-            not same_cameras
-            or header.rig.held_out != self._source.rig.held_out
-            or dict(header.metadata) != self._metadata
-        ):
+        differing = list(_differences(_capture_facts(header.rig, header.fps, header.metadata), self._facts()))
+        if differing:
             raise ConfigError(
-                "The stream was made from another capture, another part of it, or with other held-out cameras. "
+                f"The stream was made from another capture or another part of it: {', '.join(differing[:5])} differ. "
                 "Resume with the same capture and options, or start again with --overwrite."
             )
+
+    def _facts(self) -> dict[str, object]:
+        return _capture_facts(self._source.rig, self._source.fps, self._metadata)
+
+
+def _capture_facts(rig: CameraRig, fps: float, metadata: Mapping[str, object]) -> dict[str, object]:
+    """What two captures must have in common for their frames to fit into one stream, as plain values."""
+    cameras = {
+        name: {
+            "viewmat": rig[name].viewmat.tolist(),
+            "K": rig[name].K.tolist(),
+            "size": [rig[name].width, rig[name].height],
+            "near": rig[name].near,
+            "held out": name in rig.held_out,
+        }
+        for name in rig
+    }
+    return {"order of cameras": [*rig], "cameras": cameras, "fps": fps, **metadata}
 
 
 def _differences(old: object, new: object, path: str = "") -> Iterator[str]:

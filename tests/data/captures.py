@@ -165,9 +165,7 @@ def write_shared_intrinsics(path: Path, *, cameras: int = 3, frames: int = 4) ->
     return rig
 
 
-def write_n3dv(
-    path: Path, *, cameras: int = 4, frames: int = 6, size: float = 1.0, skip: int = 2
-) -> CameraRig:
+def write_n3dv(path: Path, *, cameras: int = 4, frames: int = 6, size: float = 1.0, skip: int = 2) -> CameraRig:
     """The N3DV layout, without a video numbered ``skip``; poses are for ``size`` times the videos' pixels."""
     rig = small_rig(cameras)
     names = [f"cam{number:02d}" for number in range(cameras + 1) if number != skip]
@@ -177,9 +175,7 @@ def write_n3dv(
         pose = camera.viewmat.inverse().numpy()
         right, down, forward, center = pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3]
         hwf = np.array([HEIGHT * size, WIDTH * size, float(camera.K[0, 0]) * size])
-        rows.append(
-            np.concatenate([np.stack([down, right, -forward, center, hwf], axis=1).ravel(), [0.5, 9.0]])
-        )
+        rows.append(np.concatenate([np.stack([down, right, -forward, center, hwf], axis=1).ravel(), [0.5, 9.0]]))
     np.save(path / "poses_bounds.npy", np.array(rows))
     return CameraRig({name: rig[old] for name, old in zip(names, rig)}, frozenset({"cam00"}))
 
@@ -218,8 +214,5 @@ def write_text_model(
             "" if number % 2 else "1.5 2.5 -1",
         ]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = [
-        f"{i} {x} {y} {z} 9 9 9 0.5 1 0 2 0"
-        for i, (x, y, z) in enumerate(points if points is not None else [])
-    ]
+    rows = [f"{i} {x} {y} {z} 9 9 9 0.5 1 0 2 0" for i, (x, y, z) in enumerate(points if points is not None else [])]
     (folder / "points3D.txt").write_text("\n".join(["# points", *rows]) + "\n")

@@ -14,9 +14,7 @@ WHERE = Path("take/cameras.json")
 K = np.array([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]])
 
 
-def camera(
-    viewmat: object = np.eye(4), intrinsics: object = K, *, width: int = 64, height: int = 48
-) -> Camera:
+def camera(viewmat: object = np.eye(4), intrinsics: object = K, *, width: int = 64, height: int = 48) -> Camera:
     return calibrated_camera("c7", viewmat=viewmat, K=intrinsics, width=width, height=height, where=WHERE)  # type: ignore[arg-type]
 
 

@@ -21,9 +21,7 @@ def write_binary_model(folder: Path) -> None:
     for number, camera in enumerate(RIG.cameras.values(), start=1):
         fx, fy, cx, cy = (float(camera.K[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
         params = (fx, cx, cy) if number == 2 else (fx, fy, cx, cy)
-        cameras += struct.pack(
-            f"<iiQQ{len(params)}d", number, number != 2, camera.width, camera.height, *params
-        )
+        cameras += struct.pack(f"<iiQQ{len(params)}d", number, number != 2, camera.width, camera.height, *params)
     images = struct.pack("<Q", len(IMAGES))
     ids = {name: number for number, name in enumerate(RIG, start=1)}
     for number, (file, name) in enumerate(IMAGES, start=1):
@@ -32,9 +30,7 @@ def write_binary_model(folder: Path) -> None:
         images += struct.pack("<Q", number) + struct.pack("<ddq", 1.5, 2.5, -1) * number
     points = struct.pack("<Q", len(POINTS))
     for number, point in enumerate(POINTS):
-        points += (
-            struct.pack("<Q3d3BdQ", number, *point, 9, 9, 9, 0.5, number) + struct.pack("<ii", 1, 0) * number
-        )
+        points += struct.pack("<Q3d3BdQ", number, *point, 9, 9, 9, 0.5, number) + struct.pack("<ii", 1, 0) * number
     (folder / "cameras.bin").write_bytes(cameras)
     (folder / "images.bin").write_bytes(images)
     (folder / "points3D.bin").write_bytes(points)

@@ -65,9 +65,7 @@ def test_videos_beside_a_model(tmp_path: Path, folder: str) -> None:
 def test_a_camera_without_calibration(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in list(RIG)[1:]])
-    with pytest.raises(
-        CalibrationError, match=r"pictures of camera 'cam00', for which .*sparse has no calibration"
-    ):
+    with pytest.raises(CalibrationError, match=r"pictures of camera 'cam00', for which .*sparse has no calibration"):
         open_colmap(tmp_path)
 
 
@@ -82,9 +80,7 @@ def test_a_camera_that_moves(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     images = [(f"{name}/000000.png", name) for name in RIG] + [("cam01/000001.png", "cam02")]
     write_text_model(tmp_path / "sparse", RIG, images)
-    with pytest.raises(
-        CalibrationError, match=r"'cam01' moves in .*'cam01/000000.png' and 'cam01/000001.png'"
-    ):
+    with pytest.raises(CalibrationError, match=r"'cam01' moves in .*'cam01/000000.png' and 'cam01/000001.png'"):
         open_colmap(tmp_path)
 
 

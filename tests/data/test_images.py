@@ -68,18 +68,14 @@ def test_an_unreadable_picture_is_named_after_the_frames_before_it(
     if damage == "gone":
         path.unlink()
     else:
-        path.write_bytes(
-            {"cut": data[: len(data) // 2], "empty": b"", "junk": b"\xff\xd8hello\xff\xd9"}[damage]
-        )
+        path.write_bytes({"cut": data[: len(data) // 2], "empty": b"", "junk": b"\xff\xd8hello\xff\xd9"}[damage])
     frames = source.frames()
     assert [next(frames).index for _ in range(3)] == [0, 1, 2]
     with pytest.raises(CaptureError, match=r"cam02/3\.jpg cannot be (decoded|read)"):
         next(frames)
 
 
-def test_the_extra_is_named_when_opencv_is_absent(
-    source: ImageSource, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_extra_is_named_when_opencv_is_absent(source: ImageSource, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
         next(source.frames())

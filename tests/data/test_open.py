@@ -51,9 +51,7 @@ def test_every_option_works_on_every_layout(tmp_path: Path, write: Callable[[Pat
     last = list(open_capture(tmp_path).rig)[-1]
     source = open_capture(tmp_path, held_out=(last,), scale=0.5, start=1, frames=2, near=0.7)
     assert source.rig.testing == (last,)
-    assert {(camera.width, camera.height, camera.near) for camera in source.rig.cameras.values()} == {
-        (32, 24, 0.7)
-    }
+    assert {(camera.width, camera.height, camera.near) for camera in source.rig.cameras.values()} == {(32, 24, 0.7)}
     assert len(source) == 2
     frames = list(source.frames())
     assert [frame.index for frame in frames] == [0, 1]

@@ -15,14 +15,10 @@ RIG = small_rig(3)
 
 
 def read(folder: Path, fps: float | None = None) -> VideoSource:
-    return synchronised(
-        scan_videos({name: folder / f"{name}.mp4" for name in RIG}), RIG, where=folder, fps=fps
-    )
+    return synchronised(scan_videos({name: folder / f"{name}.mp4" for name in RIG}), RIG, where=folder, fps=fps)
 
 
-def rewrite(
-    folder: Path, name: str, frames: list[int], instants: list[float] | None = None, fps: float = 30
-) -> None:
+def rewrite(folder: Path, name: str, frames: list[int], instants: list[float] | None = None, fps: float = 30) -> None:
     """Another video for one camera: these frames at these times, both counted in frames."""
     camera = list(RIG).index(name)
     images = [picture(camera, frame) for frame in frames]
@@ -59,14 +55,10 @@ def test_cameras_are_matched_by_time_not_by_count(tmp_path: Path, caplog: pytest
     with caplog.at_level(logging.WARNING):
         source = read(tmp_path)
     assert "'cam01' starts with the instant 0.067 s; 2 earlier" in caplog.text
-    assert [[frame for _, frame in row] for row in all_numbers(source.frames())] == [
-        [n] * 3 for n in range(2, 8)
-    ]
+    assert [[frame for _, frame in row] for row in all_numbers(source.frames())] == [[n] * 3 for n in range(2, 8)]
 
 
-def test_a_shorter_video_cuts_the_range_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_shorter_video_cuts_the_range_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_videos(tmp_path, list(RIG), frames=8)
     rewrite(tmp_path, "cam02", [0, 1, 2, 3, 4])
     with caplog.at_level(logging.WARNING):
@@ -111,9 +103,7 @@ def test_a_camera_of_another_rate_is_refused(tmp_path: Path) -> None:
 def test_no_frames_in_common(tmp_path: Path) -> None:
     write_videos(tmp_path, list(RIG), frames=4)
     rewrite(tmp_path, "cam01", [20, 21, 22])
-    with pytest.raises(
-        CaptureError, match=r"no frames in common: .*'cam01' starts with the instant 0\.667 s"
-    ):
+    with pytest.raises(CaptureError, match=r"no frames in common: .*'cam01' starts with the instant 0\.667 s"):
         read(tmp_path)
 
 
@@ -155,9 +145,7 @@ def test_a_truncated_video_is_found_at_once(tmp_path: Path, kept: float) -> None
 
 def test_a_damaged_video_names_file_and_time_after_the_good_frames(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    noise = [
-        rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(12)
-    ]  # large, so that damage hits data
+    noise = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(12)]  # large, so that damage hits data
     for name in RIG:
         write_video(tmp_path / f"{name}.mp4", noise)
     data = bytearray((tmp_path / "cam01.mp4").read_bytes())
@@ -178,9 +166,7 @@ def test_colours_follow_the_matrix_and_range_of_the_file(
     tmp_path: Path, matrix: int | None, color_range: int | None, pixels: str
 ) -> None:
     """Without a statement: BT.601 at this size, limited range."""
-    colors = np.array(
-        [(230, 40, 60), (20, 200, 90), (30, 60, 220), (250, 250, 250), (5, 5, 5), (240, 200, 30)]
-    )
+    colors = np.array([(230, 40, 60), (20, 200, 90), (30, 60, 220), (250, 250, 250), (5, 5, 5), (240, 200, 30)])
     flat = [np.broadcast_to(color, (48, 64, 3)).astype(np.uint8) for color in colors]
     for name in RIG:
         write_video(tmp_path / f"{name}.mp4", flat, matrix=matrix, color_range=color_range, pixels=pixels)
@@ -213,9 +199,7 @@ def test_closing_releases_the_files(tmp_path: Path) -> None:
     assert not open_files()
 
 
-def test_the_extra_is_named_when_the_reader_is_absent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_extra_is_named_when_the_reader_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
         scan_videos({"a": tmp_path / "a.mp4"})

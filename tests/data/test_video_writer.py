@@ -32,9 +32,7 @@ def test_a_player_sees_every_frame_in_its_colours(tmp_path: Path) -> None:
         )
         assert stream.average_rate == 24
         frames = [
-            frame.reformat(
-                format="rgb24", src_colorspace=1, src_color_range=1, dst_color_range=2
-            ).to_ndarray()
+            frame.reformat(format="rgb24", src_colorspace=1, src_color_range=1, dst_color_range=2).to_ndarray()
             for frame in container.decode(video=0)
         ]
     assert len(frames) == 5

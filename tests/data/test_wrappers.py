@@ -23,9 +23,7 @@ def source(request: pytest.FixtureRequest, tmp_path: Path) -> FrameSource:
 
 
 @pytest.mark.parametrize(("scale", "size"), [(0.5, (32, 24)), (0.33, (21, 16)), (0.01, (1, 1))])
-def test_pictures_and_intrinsics_shrink_together(
-    source: FrameSource, scale: float, size: tuple[int, int]
-) -> None:
+def test_pictures_and_intrinsics_shrink_together(source: FrameSource, scale: float, size: tuple[int, int]) -> None:
     small = resized(source, scale)
     for name in small.rig:
         before, after = source.rig[name], small.rig[name]

@@ -59,9 +59,7 @@ def all_surfaces() -> dict[str, Surface]:
             roughness=0.35,
             specular=0.4,
         ),
-        "paper": painted(
-            image(tx.foliage(1024, 190, leaves, ground=ground, seed=5)), roughness=0.8, specular=0.2
-        ),
+        "paper": painted(image(tx.foliage(1024, 190, leaves, ground=ground, seed=5)), roughness=0.8, specular=0.2),
         "plaster": painted(
             image(tx.marble(512, (0.72, 0.66, 0.56), (0.90, 0.86, 0.78), seed=6)), roughness=0.9, specular=0.1
         ),
@@ -86,9 +84,7 @@ def all_surfaces() -> dict[str, Surface]:
             image(tx.playball(512, (BRIGHT[2], (0.95, 0.52, 0.14), BRIGHT[2], BRIGHT[0]), seed=13)),
             roughness=0.3,
         ),
-        "chest": painted(
-            image(tx.wood(512, (0.16, 0.30, 0.30), (0.36, 0.56, 0.54), seed=14, planks=4)), roughness=0.5
-        ),
+        "chest": painted(image(tx.wood(512, (0.16, 0.30, 0.30), (0.36, 0.56, 0.54), seed=14, planks=4)), roughness=0.5),
         "jelly": painted((0.50, 0.035, 0.05), roughness=0.12, specular=0.6, coat=1.0),
         "juice": painted((0.86, 0.26, 0.015), roughness=0.12, specular=0.6, coat=1.0),
         "plate": painted(

@@ -38,9 +38,7 @@ def soft_things(t: float) -> Parts:
         + 0.006 * np.sin(34 * u),
         0.45 + 0.40 * (v - 1) + 0.012 * loose * np.sin(6 * u + 13 * t),
     ], -1)  # fmt: skip
-    dome = revolved(
-        smooth_profile([(0, 0), (0.080, 0), (0.078, 0.03), (0.060, 0.075), (0.030, 0.09), (0, 0.092)])
-    )
+    dome = revolved(smooth_profile([(0, 0), (0.080, 0), (0.078, 0.03), (0.060, 0.075), (0.030, 0.09), (0, 0.092)]))
     squash = 0.24 * np.sin(26 * t) * np.exp(-1.5 * t)
     jelly = dome.vertices * [1 - 0.45 * squash, 1 - 0.45 * squash, 1 + squash]
     high = (dome.vertices[:, 2] / 0.09) ** 2

@@ -77,9 +77,7 @@ def shelf_goods() -> Parts:
     return parts
 
 
-def _plant(
-    at: tuple[float, float, float], *, leaves: int, length: tuple[float, float], seed: int, name: str
-) -> Parts:
+def _plant(at: tuple[float, float, float], *, leaves: int, length: tuple[float, float], seed: int, name: str) -> Parts:
     """Bent leaves that spring from one point."""
     rng = np.random.default_rng(seed)
     parts: Parts = {}

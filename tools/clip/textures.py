@@ -53,9 +53,7 @@ def wood(n: int, dark: Color, light: Color, *, seed: int, planks: int = 1) -> Te
     return mixed(dark, light, value) * np.where(value < -0.2, 0.5, 1.0)[..., None]
 
 
-def tiles(
-    n: int, count: int, palette: Sequence[Color], *, seed: int, grout: Color = (0.78, 0.75, 0.7)
-) -> Texture:
+def tiles(n: int, count: int, palette: Sequence[Color], *, seed: int, grout: Color = (0.78, 0.75, 0.7)) -> Texture:
     """Hand-glazed square tiles: each its own colour and clouding, pillowed edges, pale joints."""
     rng = np.random.default_rng(seed)
     v, u = _unit_grid(n)
@@ -81,9 +79,7 @@ def terrazzo(n: int, chips: int, palette: Sequence[Color], *, base: Color, seed:
     distance, cell = tree.query(np.mod(np.stack([v, u], -1) + warp, 1.0), k=2)
     shade = rng.uniform(0.75, 1.15, (chips, 1))
     color = np.asarray(palette)[rng.integers(len(palette), size=chips)] * shade
-    gap = (distance[..., 1] - distance[..., 0]) * np.sqrt(chips) < rng.uniform(0.05, 0.55, chips)[
-        cell[..., 0]
-    ]
+    gap = (distance[..., 1] - distance[..., 0]) * np.sqrt(chips) < rng.uniform(0.05, 0.55, chips)[cell[..., 0]]
     out = np.where(gap[..., None], np.asarray(base), color[cell[..., 0]])
     return np.clip(out * (1 + 0.05 * noise(n, slope=0.6, seed=seed + 3))[..., None], 0, 1)
 
@@ -100,18 +96,13 @@ def kilim(n: int, count: int, palette: Sequence[Color], *, seed: int) -> Texture
     pick = np.argsort(rng.uniform(size=(count, count, len(palette))), axis=-1)[..., :4]
     color = np.asarray(palette)[pick[row, column, ring]]
     threads = np.sin(2 * np.pi * 110 * u) * np.sin(2 * np.pi * 110 * v)
-    return np.clip(
-        color * (0.93 + 0.06 * threads + 0.07 * noise(n, slope=0.8, seed=seed + 1))[..., None], 0, 1
-    )
+    return np.clip(color * (0.93 + 0.06 * threads + 0.07 * noise(n, slope=0.8, seed=seed + 1))[..., None], 0, 1)
 
 
 def foliage(n: int, leaves: int, palette: Sequence[Color], *, ground: Color, seed: int) -> Texture:
     """Wallpaper of leaves strewn at random, each with a midrib; later leaves lie over earlier ones."""
     rng = np.random.default_rng(seed)
-    out = (
-        np.broadcast_to(np.asarray(ground), (n, n, 3))
-        * (1 + 0.05 * noise(n, slope=1.2, seed=seed))[..., None]
-    )
+    out = np.broadcast_to(np.asarray(ground), (n, n, 3)) * (1 + 0.05 * noise(n, slope=1.2, seed=seed))[..., None]
     v, u = _unit_grid(n)
     for _ in range(leaves):
         cv, cu, angle, length = *rng.uniform(size=2), rng.uniform(0, 2 * np.pi), rng.uniform(0.05, 0.11)

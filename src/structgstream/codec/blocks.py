@@ -6,6 +6,8 @@ Coding 0 (``raw``) stores the little-endian numbers as they are: float32, or int
 
 import math
 import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,9 +19,25 @@ from structgstream.scene.state import STATE_TABLE, FieldName
 BLOCK = struct.Struct("<BBBB")  # field code, coding, dtype, number of dimensions
 RAW = 0
 MAX_DIMENSIONS = 4
+MAX_ELEMENTS = 2**31 - 1
 _DTYPES = {0: np.dtype("<f4"), 1: np.dtype("<i8")}
 _NAMES: dict[int, FieldName] = {field.code: field.name for field in STATE_TABLE}
 _CODES: dict[FieldName, int] = {field.name: field.code for field in STATE_TABLE}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Where one field is in a payload: its first byte, its first number's, and the byte after it.
+
+    Nothing is copied or allocated; everything stated has been checked against the payload.
+    """
+
+    name: FieldName
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    start: int
+    data: int
+    end: int
 
 
 def packed_block(name: FieldName, value: Tensor) -> bytes:
@@ -31,34 +49,45 @@ def packed_block(name: FieldName, value: Tensor) -> bytes:
     return head + struct.pack(f"<{array.ndim}I", *array.shape) + array.tobytes()
 
 
-def unpacked_blocks(payload: bytes, start: int, *, where: str) -> tuple[dict[FieldName, Tensor], dict[FieldName, int]]:
-    """All blocks from byte ``start`` to the end: their tensors and their lengths in bytes.
+def blocks_in(payload: bytes, start: int, *, where: str) -> Iterator[Block]:
+    """Every block from byte ``start`` to the end.
 
     Raises:
-        StreamError: an unknown field or coding, or a size that does not fit the payload.
+        StreamError: an unknown field or coding, a field that comes twice, or a size that does not fit the payload.
     """
-    values: dict[FieldName, Tensor] = {}
-    lengths: dict[FieldName, int] = {}
-    offset = start
-    while offset < len(payload):
-        if offset + BLOCK.size > len(payload):
+    seen: set[int] = set()
+    while start < len(payload):
+        if start + BLOCK.size > len(payload):
             raise StreamError(f"{where} ends within the head of a field block.")
-        code, coding, dtype, dimensions = BLOCK.unpack_from(payload, offset)
+        code, coding, dtype, dimensions = BLOCK.unpack_from(payload, start)
         if code not in _NAMES or coding != RAW or dtype not in _DTYPES or dimensions > MAX_DIMENSIONS:
             raise StreamError(
                 f"{where} holds a field block (field {code}, coding {coding}, type {dtype}, {dimensions} dimensions) "
                 "that this version does not know; install a newer structgstream."
             )
-        data_start = offset + BLOCK.size + 4 * dimensions
-        if data_start > len(payload):
+        if code in seen:
+            raise StreamError(f"{where} holds field {_NAMES[code]} twice.")
+        seen.add(code)
+        data = start + BLOCK.size + 4 * dimensions
+        if data > len(payload):
             raise StreamError(f"{where} ends within the shape of field {_NAMES[code]}.")
-        shape = struct.unpack_from(f"<{dimensions}I", payload, offset + BLOCK.size)
-        count = math.prod(shape)
-        end = data_start + count * _DTYPES[dtype].itemsize
-        if end > len(payload):
+        shape = struct.unpack_from(f"<{dimensions}I", payload, start + BLOCK.size)
+        end = data + math.prod(shape) * _DTYPES[dtype].itemsize
+        # An empty tensor has no bytes to be checked against, so its other sizes get a bound of their own.
+        if end > len(payload) or math.prod(max(size, 1) for size in shape) > MAX_ELEMENTS:
             raise StreamError(f"{where} states {shape} numbers for field {_NAMES[code]}, more than it holds.")
-        array = np.frombuffer(payload, dtype=_DTYPES[dtype], count=count, offset=data_start).reshape(shape)
-        values[_NAMES[code]] = torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))
-        lengths[_NAMES[code]] = end - offset
-        offset = end
-    return values, lengths
+        yield Block(_NAMES[code], _DTYPES[dtype], shape, start, data, end)
+        start = end
+
+
+def unpacked_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName, Tensor]:
+    """The tensors of all blocks from byte ``start`` to the end.
+
+    Raises:
+        StreamError: as :func:`blocks_in`.
+    """
+    values: dict[FieldName, Tensor] = {}
+    for block in blocks_in(payload, start, where=where):
+        array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
+        values[block.name] = torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))
+    return values

@@ -7,16 +7,13 @@ The scene that the next frame starts from is the one the decoder will hold, bit 
 decodes the bytes it has just made and returns that. Without it trainer and viewers drift apart.
 """
 
-import struct
 from dataclasses import dataclass
 
 from structgstream.codec.blocks import packed_block
-from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.decoder import FRAME, SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
-
-FRAME = struct.Struct("<Id")  # index, presentation time in seconds
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,11 @@ class SceneEncoder:
         self._decoder = SceneDecoder(header)
 
     def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded:
-        """The packet of one frame."""
+        """The packet of one frame.
+
+        Raises:
+            StreamError: the scene's shapes are not those that the header's static fields have.
+        """
         state = state_of(scene)
         lengths: dict[FieldName, int] = {}
         parts = [FRAME.pack(index, pts_seconds)]

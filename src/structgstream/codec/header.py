@@ -2,22 +2,28 @@
 """The init record: what a receiver knows before the first frame (docs/bitstream.md, section Init record)."""
 
 import json
+import math
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import torch
-import zstandard
+from torch import Tensor
+from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.blocks import packed_block, unpacked_blocks
 from structgstream.codec.packets import StreamHeader
+from structgstream.codec.shapes import check_shapes
 from structgstream.errors import CalibrationError, StreamError
-from structgstream.scene.state import STATE_TABLE
+from structgstream.scene.state import STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
 
 MAX_JSON_BYTES = 16 * 2**20
+MAX_IMAGE_SIDE = 65_535
 LENGTH = struct.Struct("<I")
 _ZSTD_LEVEL = 19
+_FIELDS = frozenset(field.name for field in STATE_TABLE)
 
 
 def packed_header(header: StreamHeader) -> bytes:
@@ -44,7 +50,7 @@ def packed_header(header: StreamHeader) -> bytes:
         "metadata": header.metadata,
     }
     text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
-    packed = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
+    packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
     static = [packed_block(f.name, header.static[f.name]) for f in STATE_TABLE if f.name not in header.dynamic]
     return LENGTH.pack(len(packed)) + packed + b"".join(static)
 
@@ -60,33 +66,72 @@ def unpacked_header(payload: bytes) -> StreamHeader:
     (length,) = LENGTH.unpack_from(payload)
     if LENGTH.size + length > len(payload):
         raise StreamError("The init record states a longer description than it holds.")
+    static = unpacked_blocks(payload, LENGTH.size + length, where="The init record")
     try:
-        packed = payload[LENGTH.size : LENGTH.size + length]
-        text = zstandard.ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES)
-        description: dict[str, Any] = json.loads(text)
-        static, _ = unpacked_blocks(payload, LENGTH.size + length, where="The init record")
-        cameras = {
-            entry["name"]: Camera(
-                viewmat=torch.tensor(entry["viewmat"], dtype=torch.float64).reshape(4, 4),
-                K=torch.tensor(entry["K"], dtype=torch.float64).reshape(3, 3),
-                width=entry["width"],
-                height=entry["height"],
-                near=entry["near"],
-            )
-            for entry in description["cameras"]
-        }
-        held_out = frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])
-        center = description["similarity"]["center"]
-        return StreamHeader(
-            rig=CameraRig(cameras, held_out),
-            similarity=Similarity((center[0], center[1], center[2]), description["similarity"]["scale"]),
-            fps=description["fps"],
-            codec=description["codec"],
-            dynamic=frozenset(description["dynamic"]),
-            static=static,
-            distance_input=description["distance_input"],
-            config=description["config"],
-            metadata=description["metadata"],
-        )
-    except (ValueError, KeyError, TypeError, RuntimeError, zstandard.ZstdError, CalibrationError) as error:
-        raise StreamError(f"The init record does not follow the format ({error}).") from error
+        header = _header(_description(payload[LENGTH.size : LENGTH.size + length]), static)
+    except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, ZstdError, CalibrationError) as error:
+        raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
+    if header.dynamic | header.static.keys() != _FIELDS or header.dynamic & header.static.keys():
+        raise StreamError("The init record does not hold every field that packets leave out, and only those.")
+    check_shapes(
+        header.static,
+        distance_input=header.distance_input,
+        training_cameras=len(header.rig.training),
+        where="The init record",
+    )
+    return header
+
+
+def _description(packed: bytes) -> dict[str, Any]:
+    """The JSON text, whose stated size is looked at before anything is unpacked."""
+    size = frame_content_size(packed)
+    if not 0 <= size <= MAX_JSON_BYTES:
+        raise ValueError(f"its description unpacks to {size} bytes, at most {MAX_JSON_BYTES} are allowed")
+    return json.loads(ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES))
+
+
+def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> StreamHeader:
+    cameras = {entry["name"]: _camera(entry) for entry in description["cameras"]}
+    if len(cameras) != len(description["cameras"]) or not all(isinstance(name, str) for name in cameras):
+        raise ValueError("camera names must be texts, each used once")
+    x, y, z = (_number(value) for value in description["similarity"]["center"])
+    plain = [description["config"], description["metadata"]]
+    if not all(isinstance(value, dict) for value in plain) or not isinstance(description["distance_input"], bool):
+        raise TypeError("config and metadata must be objects, distance_input true or false")
+    return StreamHeader(
+        rig=CameraRig(cameras, frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])),
+        similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),
+        fps=_positive(description["fps"]),
+        codec=str(description["codec"]),
+        dynamic=frozenset(description["dynamic"]),
+        static=static,
+        distance_input=description["distance_input"],
+        config=description["config"],
+        metadata=description["metadata"],
+    )
+
+
+def _camera(entry: dict[str, Any]) -> Camera:
+    width, height = entry["width"], entry["height"]
+    if not all(type(size) is int and 0 < size <= MAX_IMAGE_SIDE for size in (width, height)):
+        raise ValueError(f"a picture of {width}x{height} pixels; each side must be 1 to {MAX_IMAGE_SIDE}")
+    return Camera(
+        viewmat=torch.tensor([_number(value) for value in entry["viewmat"]], dtype=torch.float64).reshape(4, 4),
+        K=torch.tensor([_number(value) for value in entry["K"]], dtype=torch.float64).reshape(3, 3),
+        width=width,
+        height=height,
+        near=_positive(entry["near"]),
+    )
+
+
+def _number(value: object) -> float:
+    """A finite number; JSON readers differ in what else they let through."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{value!r} where a finite number belongs")
+    return float(value)
+
+
+def _positive(value: object) -> float:
+    if (number := _number(value)) <= 0:
+        raise ValueError(f"{value!r} where a positive number belongs")
+    return number

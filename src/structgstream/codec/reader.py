@@ -8,7 +8,16 @@ from pathlib import Path
 from structgstream.codec.decoder import SceneDecoder, packet_of
 from structgstream.codec.header import unpacked_header
 from structgstream.codec.packets import PacketKind
-from structgstream.codec.records import PREFIX, Record, RecordType, check_prefix, record_at, scanned
+from structgstream.codec.records import (
+    PREFIX,
+    Record,
+    RecordType,
+    check_prefix,
+    prefix,
+    record_at,
+    scanned,
+    why_stopped,
+)
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName
@@ -29,15 +38,19 @@ class PacketInfo:
 
 
 class StreamReader:
-    """A stream in memory.
+    """A stream in memory. Every record's checksum is verified once, on opening; what comes after damage is not read.
 
-    ``complete`` says that the index was written, ``cut_reason`` what stopped reading otherwise.
+    Attributes:
+        header: what the init record says.
+        packets: every whole packet before the first cut or damage, in order.
+        complete: whether the index was written, so that the run that made the stream had come to its end.
+        cut_reason: what stopped reading otherwise.
 
     Raises:
-        StreamError: not a stream, another major version, or no whole init record.
+        StreamError: not a stream, another major version, no whole init record, or records that contradict each other.
     """
 
-    def __init__(self, data: bytes, *, name: str = "The stream") -> None:
+    def __init__(self, data: bytes | memoryview, *, name: str = "The stream") -> None:
         check_prefix(data, name)
         self._data = data
         self._name = name
@@ -46,35 +59,36 @@ class StreamReader:
         self.packets: list[PacketInfo] = []
         records = scanned(data)
         init = next(records, None)
-        if init is None or init.type != RecordType.INIT:
-            raise StreamError(f"{name} ends before its init record is whole; nothing of it can be shown.")
+        if init is None:
+            raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
+        if init.type != RecordType.INIT:
+            raise StreamError(f"{name} begins with a record of type {init.type}; an init record was expected.")
         self.header = unpacked_header(init.payload)
-        self.header_bytes = init.end
-        end = init.end
+        self.header_bytes = end = init.end
         for record in records:
             end = record.end
             if record.type == RecordType.INDEX:
                 self.complete = True
                 break
             self._add(record)
-        self.cut_reason = None if self.complete else f"the last whole record ends at byte {end} of {len(data)}"
+        self.cut_reason = None if self.complete else why_stopped(data, end)
         self._decoder = SceneDecoder(self.header)
 
     def _add(self, record: Record) -> None:
+        if record.type == RecordType.INIT:
+            raise StreamError(f"{self._name} has a second init record, at byte {record.offset}.")
         if record.type not in _KINDS:
             return
         packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
         if packet.index != len(self.packets):
-            raise StreamError(f"{self._name} jumps from packet {len(self.packets) - 1} to {packet.index}.")
+            raise StreamError(f"{self._name} has packet {packet.index} where packet {len(self.packets)} belongs.")
+        if packet.index == 0 and packet.kind is not PacketKind.KEY:
+            raise StreamError(f"{self._name} begins with a delta packet; the first must be a key packet.")
+        if packet.index and packet.pts_seconds <= self.packets[-1].pts_seconds:
+            raise StreamError(f"In {self._name} packet {packet.index} is not presented after the one before it.")
+        size = record.end - record.offset
         self.packets.append(
-            PacketInfo(
-                packet.kind,
-                packet.index,
-                packet.pts_seconds,
-                record.offset,
-                record.end - record.offset,
-                packet.field_bytes,
-            )
+            PacketInfo(packet.kind, packet.index, packet.pts_seconds, record.offset, size, packet.field_bytes)
         )
 
     def __len__(self) -> int:
@@ -86,8 +100,9 @@ class StreamReader:
         Raises:
             StreamError: there is no such frame.
         """
-        if not 0 <= index < len(self.packets):
-            raise StreamError(f"{self._name} has frames 0 to {len(self.packets) - 1}; there is no frame {index}.")
+        if not 0 <= index < len(self):
+            have = f"frames 0 to {len(self) - 1}" if self.packets else "no whole frame"
+            raise StreamError(f"{self._name} has {have}; there is no frame {index}.")
         info = self.packets[index]
         record = record_at(self._data, info.offset)
         if record is None:
@@ -106,23 +121,42 @@ def open_stream(path: Path | str) -> StreamReader:
     Raises:
         StreamError: there is no such file, or it is not a stream.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise StreamError(f"Cannot read {path} ({error.strerror}).") from error
+    data = stored_bytes(path)
     if not data:
-        raise StreamError(f"{path} is empty.")
+        raise StreamError(f"{path} is empty; expected a stream made by structgstream reconstruct.")
     return StreamReader(data, name=str(path))
 
 
-def readable_part(data: bytes) -> int | None:
-    """Where the last whole packet ends, the index and what follows left out; None without a whole init record."""
-    if len(data) < PREFIX.size:
-        return None
-    check_prefix(data, "The file to resume")
-    end = None
+def stored_bytes(path: Path | str) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        StreamError: it cannot be read.
+    """
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise StreamError(f"Cannot read {path} ({error.strerror}); expected a stream file.") from error
+
+
+def readable_part(data: bytes, *, name: str) -> int | None:
+    """Where the last whole packet ends, the index and what follows left out; None when the init record was cut.
+
+    Raises:
+        StreamError: not a stream, another major version, or an init record that is there and damaged: starting again
+            would throw away what follows it.
+    """
+    if prefix().startswith(data):
+        return None  # Cut within the prefix, or empty.
+    check_prefix(data, name)
+    end = PREFIX.size
     for record in scanned(data):
         if record.type == RecordType.INDEX:
             break
         end = record.end
-    return end
+    if end > PREFIX.size:
+        return end
+    reason = why_stopped(data, end)
+    if "damaged" in reason:
+        raise StreamError(f"Cannot continue {name}: {reason}. Start again with --overwrite.")
+    return None

@@ -67,8 +67,10 @@ def check_prefix(data: bytes | memoryview, name: str) -> None:
     Raises:
         StreamError: with what was found and what to do.
     """
-    if len(data) < PREFIX.size or bytes(data[:8]) != MAGIC:
+    if not prefix().startswith(bytes(data[: len(MAGIC)])):
         raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
+    if len(data) < PREFIX.size:
+        raise StreamError(f"{name} is cut at byte {len(data)}, before anything that can be shown.")
     _, major, minor = PREFIX.unpack_from(data)
     if major != MAJOR:
         raise StreamError(
@@ -85,9 +87,20 @@ def record_at(data: bytes | memoryview, offset: int) -> Record | None:
     if end + CHECKSUM.size > len(data):
         return None
     (stated,) = CHECKSUM.unpack_from(data, end)
-    if zlib.crc32(data[offset:end]) != stated:
+    if zlib.crc32(memoryview(data)[offset:end]) != stated:
         return None
     return Record(kind, bytes(data[offset + RECORD.size : end]), offset)
+
+
+def why_stopped(data: bytes | memoryview, offset: int) -> str:
+    """What is at ``offset``, where :func:`record_at` found no whole record."""
+    if offset == len(data):
+        return f"it ends at byte {offset} without an index"
+    if offset + RECORD.size <= len(data):
+        length = RECORD.unpack_from(data, offset)[3]
+        if offset + RECORD.size + length + CHECKSUM.size <= len(data):
+            return f"the record at byte {offset} of {len(data)} is damaged"
+    return f"it is cut at byte {len(data)}, within the record that begins at byte {offset}"
 
 
 def scanned(data: bytes | memoryview) -> Iterator[Record]:

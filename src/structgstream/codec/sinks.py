@@ -4,74 +4,79 @@
 import io
 import os
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.codec.header import packed_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.reader import StreamReader, readable_part
+from structgstream.codec.reader import StreamReader, readable_part, stored_bytes
 from structgstream.codec.records import RecordType, packed, prefix
 from structgstream.errors import StorageError
 
 INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 FOOTER = struct.Struct("<Q8s")
 FOOTER_MAGIC = b"SGSINDEX"
+_TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 
 
 class _Writer:
-    """Appends records to a binary file and keeps the index."""
+    """Appends records to an unbuffered binary file and keeps the index.
+
+    ``_end`` moves only once a record is whole and on the disk, in one step, so that an exception at any instant,
+    Ctrl-C included, leaves at most bytes behind it, which the next write or :meth:`finish` replaces.
+    """
 
     def __init__(self, file: BinaryIO, name: str) -> None:
         self._file = file
         self._name = name
         self._end = 0
-        self._entries: list[tuple[int, int, int]] = []
+        self._entries: dict[int, tuple[int, int]] = {}  # by offset; those from _end on did not come to be
+        self._failed = False
 
-    def continue_at(self, end: int, entries: list[tuple[int, int, int]]) -> None:
-        self._end, self._entries = end, list(entries)
+    def continue_at(self, end: int, reader: StreamReader) -> None:
+        """Go on after byte ``end`` of a file that holds the packets of ``reader``."""
+        self._entries = {info.offset: (info.index, int(_TYPES[info.kind])) for info in reader.packets}
+        self._end = end
+        self._file.truncate(end)
 
-    def append(self, data: bytes) -> int:
+    def open(self, header: StreamHeader) -> int:
+        return self._append(prefix() + packed(RecordType.INIT, packed_header(header)))
+
+    def write(self, packet: Packet) -> int:
+        kind = _TYPES[packet.kind]
+        self._entries[self._end] = (packet.index, int(kind))
+        return self._append(packed(kind, packet.payload))
+
+    def finish(self) -> None:
+        """Write index and footer and cut what an interrupted write left; nothing after a failed write."""
+        if self._failed:
+            return
+        offset = self._end
+        entries = [(*entry, at) for at, entry in self._entries.items() if at < offset]
+        index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
+        self._append(packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC))
+        self._file.truncate(self._end)
+
+    def _append(self, data: bytes) -> int:
         try:
             self._file.seek(self._end)
-            self._file.write(data)
-            self._file.flush()
-            self._sync()
+            rest = memoryview(data)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            with suppress(io.UnsupportedOperation):  # A file in memory has nothing to sync.
+                os.fsync(self._file.fileno())
         except OSError as error:
-            self._restore()
+            self._failed = True
+            with suppress(OSError):  # If even this fails, readers stop at the record that is not whole.
+                self._file.truncate(self._end)
+            whole = sum(at < self._end for at in self._entries)
             raise StorageError(
-                f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). The {len(self._entries)} "
-                "frames before are safe in it; make room and continue with --resume."
+                f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). The {whole} frames "
+                "before are safe in it; make room and continue with --resume."
             ) from error
         self._end += len(data)
         return len(data)
-
-    def _sync(self) -> None:
-        try:
-            os.fsync(self._file.fileno())
-        except io.UnsupportedOperation:
-            pass  # A file in memory has nothing to sync.
-
-    def _restore(self) -> None:
-        """Cut what a failed write left behind; if even that fails, readers stop at the damaged record anyway."""
-        try:
-            self._file.truncate(self._end)
-        except OSError:
-            pass
-
-    def open(self, header: StreamHeader) -> int:
-        return self.append(prefix() + packed(RecordType.INIT, packed_header(header)))
-
-    def write(self, packet: Packet) -> int:
-        kind = RecordType.KEY if packet.kind is PacketKind.KEY else RecordType.DELTA
-        offset = self._end
-        size = self.append(packed(kind, packet.payload))
-        self._entries.append((packet.index, int(kind), offset))
-        return size
-
-    def finish(self) -> int:
-        offset = self._end
-        index = b"".join(INDEX_ENTRY.pack(*entry) for entry in self._entries)
-        return self.append(packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC))
 
 
 class FileSink:
@@ -80,44 +85,51 @@ class FileSink:
     def __init__(self, path: Path | str, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
+        self._resumed: tuple[int, StreamReader] | None = None
         self._writer: _Writer | None = None
         self._file: BinaryIO | None = None
-
-    def open(self, header: StreamHeader) -> int:
-        """Create the file and write the init record.
-
-        Raises:
-            StorageError: it exists and may not be overwritten, or cannot be written.
-        """
-        if self._writer is not None:
-            return 0  # Resumed: the header is in the file.
-        if self.path.exists() and not self._overwrite:
-            raise StorageError(
-                f"{self.path} exists; continue it with --resume, replace it with --overwrite, or choose another name."
-            )
-        self._file = _opened(self.path, "wb+")
-        self._writer = _Writer(self._file, str(self.path))
-        return self._writer.open(header)
 
     @classmethod
     def resume(cls, path: Path | str) -> tuple["FileSink", StreamReader | None]:
         """A sink that continues a file after its last whole packet, and the reader of what is there.
 
-        The reader is None when not even the init record is whole: the stream then starts again from nothing.
+        The reader is None when not even the init record is whole: the stream then starts again from nothing. The file
+        stays as it is until :meth:`open`.
+
+        Raises:
+            StreamError: the file is something else, or damaged where nothing can be saved.
         """
         sink = cls(path, overwrite=True)
-        if not sink.path.exists():
-            return sink, None
-        data = sink.path.read_bytes()
-        end = readable_part(data)
+        data = stored_bytes(path) if sink.path.exists() else b""
+        end = readable_part(data, name=str(path))
         if end is None:
             return sink, None
-        reader = StreamReader(data[:end], name=str(path))
-        sink._file = _opened(sink.path, "rb+")
-        sink._file.truncate(end)
-        sink._writer = _Writer(sink._file, str(path))
-        sink._writer.continue_at(end, [(p.index, int(p.kind) + 1, p.offset) for p in reader.packets])
+        reader = StreamReader(memoryview(data)[:end], name=str(path))
+        sink._resumed = (end, reader)
         return sink, reader
+
+    def open(self, header: StreamHeader) -> int:
+        """Create the file and write the init record, or go on with a resumed one, which holds its header already.
+
+        Raises:
+            StorageError: it exists and may not be overwritten, or cannot be written.
+        """
+        if self.path.exists() and not self._overwrite:
+            raise StorageError(
+                f"{self.path} exists; continue it with --resume, replace it with --overwrite, or choose another name."
+            )
+        mode = "wb" if self._resumed is None else "rb+"
+        try:
+            self._file = self.path.open(mode, buffering=0)  # type: ignore[assignment]
+            self._writer = _Writer(self._file, str(self.path))  # type: ignore[arg-type]
+            if self._resumed is not None:
+                self._writer.continue_at(*self._resumed)
+                return 0
+        except OSError as error:
+            raise StorageError(
+                f"Cannot open {self.path} for writing ({error.strerror}); choose another place or mend its permissions."
+            ) from error
+        return self._writer.open(header)
 
     def write(self, packet: Packet) -> int:
         """Append one packet; returns the bytes it took.
@@ -129,14 +141,17 @@ class FileSink:
         return self._writer.write(packet)
 
     def close(self) -> None:
-        """Write the index and close the file."""
+        """Write the index, unless a write had failed, and close the file. A second call does nothing.
+
+        Raises:
+            StorageError: no room for the index; all frames are safe.
+        """
         if self._writer is None or self._file is None:
             return
-        try:
-            self._writer.finish()
-        finally:
-            self._file.close()
-            self._writer = self._file = None
+        writer, file = self._writer, self._file
+        self._writer = self._file = None
+        with file:
+            writer.finish()
 
 
 class MemorySink:
@@ -145,6 +160,7 @@ class MemorySink:
     def __init__(self) -> None:
         self._buffer = io.BytesIO()
         self._writer = _Writer(self._buffer, "memory")
+        self._open = False
 
     @property
     def data(self) -> bytes:
@@ -153,19 +169,16 @@ class MemorySink:
 
     def open(self, header: StreamHeader) -> int:
         """Write the init record."""
-        return self._writer.open(header)
+        size = self._writer.open(header)
+        self._open = True
+        return size
 
     def write(self, packet: Packet) -> int:
         """Append one packet; returns the bytes it took."""
         return self._writer.write(packet)
 
     def close(self) -> None:
-        """Write the index."""
-        self._writer.finish()
-
-
-def _opened(path: Path, mode: str) -> BinaryIO:
-    try:
-        return path.open(mode)  # type: ignore[return-value]
-    except OSError as error:
-        raise StorageError(f"Cannot open {path} for writing ({error.strerror}).") from error
+        """Write the index. A second call does nothing."""
+        if self._open:
+            self._open = False
+            self._writer.finish()

@@ -16,9 +16,7 @@ from structgstream.similarity import rig_radius
 NEAR_IN_RIG_RADII = 0.12  # cameras of a dome stand in the wall that the others see: it must not be drawn
 
 
-def calibrated_camera(
-    name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, where: Path
-) -> Camera:
+def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, where: Path) -> Camera:
     """One camera of the calibration file ``where``.
 
     Args:
@@ -77,9 +75,7 @@ def with_near(rig: CameraRig, near: float) -> CameraRig:
     return rig.mapped({name: replace(rig[name], near=near) for name in rig})
 
 
-def check_names(
-    calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path
-) -> None:
+def check_names(calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path) -> None:
     """Every calibrated camera must have pictures, and the reverse.
 
     Raises:

@@ -53,8 +53,7 @@ def find_model(path: Path) -> Path | None:
     """The folder of the model that belongs to a capture, or None."""
     for folder in (path / "sparse" / "0", path / "sparse", path):
         if any(
-            (folder / f"cameras{end}").is_file() and (folder / f"images{end}").is_file()
-            for end in (".bin", ".txt")
+            (folder / f"cameras{end}").is_file() and (folder / f"images{end}").is_file() for end in (".bin", ".txt")
         ):
             return folder
     return None

@@ -54,9 +54,7 @@ def open_colmap(path: Path) -> FrameSource:
     for root in (path / "frames", path / "images", path / "videos", path):
         if videos := _videos(root):
             rig = _rig(_poses(model, videos), videos, root, model, path)
-            return synchronised(
-                scan_videos({name: videos[name] for name in rig}), rig, where=path, points=points
-            )
+            return synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, points=points)
         if folders := _folders(root):
             files, poses = _layout(folders, model, root)
             rig = _rig(poses, files, root, model, path)
@@ -81,9 +79,7 @@ def _folders(root: Path) -> dict[str, dict[str, Path]]:
     folders = {}
     for folder in root.iterdir():
         if folder.is_dir() and folder.name not in ("images", "frames", "videos"):
-            pictures = {
-                file.stem: file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES
-            }
+            pictures = {file.stem: file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES}
             if pictures:
                 folders[folder.name] = pictures
     return folders

@@ -62,9 +62,7 @@ def open_json_videos(path: Path) -> VideoSource:
 def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
     width, height = int(content["width"]), int(content["height"])
     cameras = {
-        name: calibrated_camera(
-            name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file
-        )
+        name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
         for name, entry in content["cameras"].items()
     }
     near = float(content["near"]) if "near" in content else None

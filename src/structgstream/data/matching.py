@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cameras see the same things, and which of their pixels are the same point.
 
-Everything rests on known poses: neighbours are chosen by the cameras' geometry, and a keypoint is only compared with
-keypoints near its epipolar line (Hartley and Zisserman, Multiple View Geometry, chapters 9 and 12). Pixels follow the
-package's convention, the top-left pixel's centre at (0.5, 0.5).
+Everything rests on known poses: neighbours are chosen by the cameras' geometry, and a keypoint is only
+compared with keypoints near its epipolar line (Hartley and Zisserman, Multiple View Geometry, chapters 9
+and 12). Pixels follow the package's convention, the top-left pixel's centre at (0.5, 0.5).
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _BEST_ANGLES_DEGREES = (7.0, 20.0)
 
 @dataclass(frozen=True)
 class Features:
-    """Keypoints of one picture: ``pixels [S, 2]`` float64 and unit ``descriptors [S, 128]`` float32 (RootSIFT)."""
+    """Keypoints of a picture: ``pixels [S, 2]`` float64, unit ``descriptors [S, 128]`` float32 (RootSIFT)."""
 
     pixels: Floats
     descriptors: NDArray[np.float32]
@@ -39,10 +40,7 @@ def sift_features(image: NDArray[np.uint8], *, count: int, contrast: float = 0.0
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
+    cv2 = load_cv2()
     # Without the precise upscale every keypoint would sit a quarter of a pixel off.
     sift = cv2.SIFT.create(
         nfeatures=count,
@@ -60,8 +58,21 @@ def sift_features(image: NDArray[np.uint8], *, count: int, contrast: float = 0.0
     return Features(pixels, rooted)
 
 
+def load_cv2() -> ModuleType:
+    """OpenCV, which only capturing needs.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", "capture") from None
+    return cv2
+
+
 def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
-    """Pixels ``[P, 2]`` and depths ``[P]`` of world points ``[P, 3]``; pixels behind the camera mean nothing."""
+    """Pixels ``[P, 2]`` and depths ``[P]`` of points ``[P, 3]``; pixels behind the camera mean nothing."""
     viewmat, K = camera.viewmat.numpy(), camera.K.numpy()
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = local[:, 2]
@@ -71,7 +82,7 @@ def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
 
 def back_project(camera: Camera, pixels: Floats, depths: Floats) -> Floats:
     """World points ``[P, 3]`` at ``depths [P]`` (along z) behind ``pixels [P, 2]``."""
-    return camera.center.numpy() + _rays(camera, pixels) * depths[:, None]
+    return camera.center.numpy() + rays(camera, pixels) * depths[:, None]
 
 
 def inside(camera: Camera, pixels: Floats, depths: Floats, *, near: float) -> NDArray[np.bool_]:
@@ -83,8 +94,8 @@ def inside(camera: Camera, pixels: Floats, depths: Floats, *, near: float) -> ND
 def viewing_distance(cameras: Mapping[str, Camera]) -> float:
     """Typical distance from a camera to what the rig looks at, from the poses alone.
 
-    The point nearest to all optical axes, if it lies in front of most cameras; for axes that do not meet (a flat
-    forward-facing array), five times the rig's radius.
+    The point nearest to all optical axes, if it lies in front of most cameras; for axes that do not meet (a
+    flat forward-facing array), five times the rig's radius.
     """
     centers = np.stack([camera.center.numpy() for camera in cameras.values()])
     axes = np.stack([camera.viewmat.numpy()[2, :3] for camera in cameras.values()])
@@ -100,8 +111,8 @@ def viewing_distance(cameras: Mapping[str, Camera]) -> float:
 def level_normal(cameras: Mapping[str, Camera]) -> Floats:
     """The unit normal ``[3]`` of level planes, pointing up: square to the cameras' horizontal axes.
 
-    Holds for cameras that are not rolled. Where their horizontal axes are all parallel, the mean up of the pictures
-    decides among the directions square to them.
+    Holds for cameras that are not rolled. Where their horizontal axes are all parallel, the mean up of the
+    pictures decides among the directions square to them.
     """
     axes = np.stack([camera.viewmat.numpy()[0, :3] for camera in cameras.values()])
     upwards = -np.mean([camera.viewmat.numpy()[1, :3] for camera in cameras.values()], axis=0)
@@ -114,8 +125,8 @@ def level_normal(cameras: Mapping[str, Camera]) -> Floats:
 def neighbour_views(cameras: Mapping[str, Camera], *, count: int, distance: float) -> dict[str, tuple[str, ...]]:
     """For each camera the ``count`` others that see most of its volume under a useful parallax, best first.
 
-    The volume is sampled around ``distance`` (see :func:`viewing_distance`); too small a parallax measures no depth,
-    too large a one changes the look of things.
+    The volume is sampled around ``distance`` (see :func:`viewing_distance`); too small a parallax measures no
+    depth, too large a one changes the look of things.
     """
     low, high = _BEST_ANGLES_DEGREES
     chosen: dict[str, tuple[str, ...]] = {}
@@ -134,8 +145,10 @@ def neighbour_views(cameras: Mapping[str, Camera], *, count: int, distance: floa
             seen = inside(other, *project(other, points), near=0.05 * distance)
             if not seen.any():
                 continue
-            angle = np.degrees(np.median(_angles(points[seen] - camera.center.numpy(), points[seen] - other.center.numpy())))
-            scores[other_name] = float(seen.mean() * min(angle / low, 1.0) * min(high / max(angle, 1e-9), 1.0) ** 2)
+            rays_here, rays_there = (points[seen] - view.center.numpy() for view in (camera, other))
+            angle = float(np.degrees(np.median(angles(rays_here, rays_there))))
+            useful = min(angle / low, 1.0) * min(high / max(angle, 1e-9), 1.0) ** 2
+            scores[other_name] = float(seen.mean()) * useful
         ranked = sorted((other for other in scores if scores[other] > 0.02), key=lambda other: -scores[other])
         chosen[name] = tuple(ranked[:count])
     return chosen
@@ -169,15 +182,17 @@ def epipolar_errors(F: Floats, first: Floats, second: Floats) -> Floats:
 
 
 def triangulate(first: Camera, second: Camera, pixels1: Floats, pixels2: Floats) -> tuple[Floats, Floats]:
-    """Points ``[S, 3]`` halfway between two rays where they pass closest, and their depths ``[S, 2]`` along z."""
-    rays1, rays2 = _rays(first, pixels1), _rays(second, pixels2)
+    """Points ``[S, 3]`` halfway between two rays where they pass closest, and depths ``[S, 2]`` along z."""
+    rays1, rays2 = rays(first, pixels1), rays(second, pixels2)
     base = second.center.numpy() - first.center.numpy()
     a, b, c = (rays1 * rays1).sum(1), (rays1 * rays2).sum(1), (rays2 * rays2).sum(1)
     d, e = rays1 @ base, rays2 @ base
-    # Parallel rays meet at infinity; the floor on the determinant sends them there instead of dividing by zero.
+    # Parallel rays meet at infinity; the floor on the determinant sends them there, not into a division by
+    # zero.
     determinant = np.maximum(a * c - b * b, 1e-12 * a * c)
     along1, along2 = (c * d - b * e) / determinant, (b * d - a * e) / determinant
-    points1, points2 = first.center.numpy() + rays1 * along1[:, None], second.center.numpy() + rays2 * along2[:, None]
+    points1 = first.center.numpy() + rays1 * along1[:, None]
+    points2 = second.center.numpy() + rays2 * along2[:, None]
     return (points1 + points2) / 2, np.stack([along1, along2], 1)
 
 
@@ -193,12 +208,12 @@ def guided_matches(
 ) -> NDArray[np.intp]:
     """Mutually best matches ``[S, 2]`` (indices into the two sets) among keypoints near the epipolar line.
 
-    A match survives if no other candidate, further than ``distinct_pixels`` from it, comes within ``ratio`` of its
-    descriptor distance: along a line repeating texture is the main danger. Candidates outside ``depth_range``
-    of either camera are not considered.
+    A match survives if no other candidate, further than ``distinct_pixels`` from it, comes within ``ratio``
+    of its descriptor distance: along a line repeating texture is the main danger. Candidates outside
+    ``depth_range`` of either camera are not considered.
     """
     F = fundamental_matrix(*cameras)
-    lines = (_homogeneous(first.pixels) @ F.T).astype(np.float64)
+    lines = _homogeneous(first.pixels) @ F.T
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-300)
     distances = lines.astype(np.float32) @ _homogeneous(second.pixels).astype(np.float32).T
     row, column = np.nonzero(np.abs(distances) < line_pixels)
@@ -228,13 +243,14 @@ def _distinct_best(
     starts = np.flatnonzero(np.diff(query_sorted, prepend=-1))
     best = order[starts]
     group = np.cumsum(np.diff(query_sorted, prepend=-1) != 0) - 1
-    rival = np.linalg.norm(pixels[candidate[order]] - pixels[candidate[best]][group], axis=1) > distinct_pixels
+    apart = np.linalg.norm(pixels[candidate[order]] - pixels[candidate[best]][group], axis=1)
+    rival = apart > distinct_pixels
     rival_cost = np.full(len(starts), np.inf)
     np.minimum.at(rival_cost, group[rival], cost[order][rival])
     return best[cost[best] < ratio * rival_cost]
 
 
-def _rays(camera: Camera, pixels: Floats) -> Floats:
+def rays(camera: Camera, pixels: Floats) -> Floats:
     """World directions ``[P, 3]`` through pixels, of length one along the camera's z."""
     return _homogeneous(pixels) @ np.linalg.inv(camera.K.numpy()).T @ camera.viewmat.numpy()[:3, :3]
 
@@ -243,6 +259,7 @@ def _homogeneous(pixels: Floats) -> Floats:
     return np.concatenate([pixels, np.ones((len(pixels), 1))], 1)
 
 
-def _angles(first: Floats, second: Floats) -> Floats:
+def angles(first: Floats, second: Floats) -> Floats:
+    """Angles ``[P]`` in radians between directions ``[P, 3]``."""
     cosine = (first * second).sum(1) / (np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1))
     return np.arccos(np.clip(cosine, -1, 1))

@@ -53,17 +53,13 @@ def _read_poses(file: Path) -> NDArray[np.float64]:
     except (OSError, ValueError, EOFError) as error:
         raise CalibrationError(f"{file} cannot be read as an array of numbers ({error}).") from None
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise CalibrationError(
-            f"{file} has shape {rows.shape}; expected (cameras, 17): 3x5 poses and two bounds."
-        )
+        raise CalibrationError(f"{file} has shape {rows.shape}; expected (cameras, 17): 3x5 poses and two bounds.")
     return rows[:, :15].reshape(-1, 3, 5)
 
 
 def _camera(name: str, pose: NDArray[np.float64], track: VideoTrack, where: Path) -> Camera:
     if not np.isfinite(pose).all():
-        raise CalibrationError(
-            f"Camera {name!r} of {where} has a number that is not finite (NaN or infinity)."
-        )
+        raise CalibrationError(f"Camera {name!r} of {where} has a number that is not finite (NaN or infinity).")
     down, right, backward, center, (height, width, focal) = pose.T
     rotation = np.stack([right, down, -backward])  # rows of world to camera: x right, y down, z forward
     camera = calibrated_camera(

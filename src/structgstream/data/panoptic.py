@@ -74,8 +74,7 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         known = first.setdefault(name, (K, viewmat))
         if known != (K, viewmat) and not _same(known, (K, viewmat)):
             raise CalibrationError(
-                f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; "
-                "expected cameras that stand still."
+                f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
             )
         files.setdefault(name, {})[Path(file).stem] = meta.parent / "ims" / file
     cameras = {

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small plane sweep: depth maps of the training cameras from zero-mean normalised cross-correlation.
 
-Each neighbour's picture is warped by the homographies of planes parallel to the reference picture, spaced evenly in
-inverse depth (Collins, CVPR 1996); the best half of the neighbours scores a plane, which tolerates occlusion (Kang,
-Szeliski and Chai, CVPR 2001). Correlation, because cameras of one rig may differ in exposure by half.
+Each neighbour's picture is warped by the homographies of planes, spaced evenly in inverse depth (Collins,
+CVPR 1996); the best half of the neighbours scores a plane, which tolerates occlusion (Kang, Szeliski and
+Chai, CVPR 2001). Correlation, because cameras of one rig may differ in exposure by half.
 """
 
 import math
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.matching import Floats, back_project, inside, project
-from structgstream.errors import MissingExtraError
+from structgstream.data.matching import Floats, back_project, inside, load_cv2, project
 
 FloatImage = NDArray[np.float32]
 
@@ -35,7 +34,8 @@ class SweepConfig:
         noise: grey-level noise (of 1) added to the variances: flat windows then correlate with nothing.
         min_score: least correlation.
         min_margin: least lead of the best plane over any other that is not its neighbour.
-        agreement: largest disagreement with another view's depth, in planes or as a share of depth (the larger one).
+        agreement: largest disagreement with another view's depth, in planes and as a share of depth; the
+            looser of the two counts.
         views: further views that must agree.
         level_planes: also sweep level planes, for floors and tables seen at a slant.
     """
@@ -51,8 +51,8 @@ class SweepConfig:
     level_planes: bool = False
 
 
-# Fine windows for texture and outlines; then wide ones, of pictures so reduced that their noise is averaged away,
-# for what is nearly plain.
+# Fine windows for texture and outlines; then wide ones, of pictures so reduced that their noise is averaged
+# away, for what is nearly plain.
 DEFAULT_LEVELS = (
     SweepConfig(),
     SweepConfig(width=96, window=7, noise=0.001, min_margin=0.03, level_planes=True),
@@ -93,7 +93,7 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class SweepView:
-    """A picture ready for the sweep: reduced camera, grey values ``[H, W]`` in [0, 1] and colours ``[H, W, 3]``."""
+    """A picture ready for the sweep: reduced camera, grey ``[H, W]`` in [0, 1] and colours ``[H, W, 3]``."""
 
     camera: Camera
     grey: FloatImage
@@ -102,7 +102,7 @@ class SweepView:
 
 def sweep_view(camera: Camera, image: NDArray[np.uint8], *, width: int) -> SweepView:
     """The picture averaged down to at most ``width`` pixels, with its camera."""
-    cv2 = _cv2()
+    cv2 = load_cv2()
     width = min(width, camera.width)
     height = max(1, round(camera.height * width / camera.width))
     colors = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -135,20 +135,23 @@ def sweep_depth(
 def consistent_pixels(
     depth_map: DepthMap, others: Sequence[DepthMap], *, config: SweepConfig
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """The points ``[P, 3]`` of the believed pixels on whose depth enough of the other maps agree, and those pixels.
+    """The points ``[P, 3]`` of the believed pixels on whose depth enough of the other maps agree.
 
-    A point is the mean of its own estimate and of those of the views that agree. The mask is ``[H, W]`` and names the
-    points' pixels in row order.
+    A point is the mean of its own estimate and of those of the views that agree. The mask ``[H, W]`` names
+    the points' pixels, in row order.
     """
     row, column = np.nonzero(depth_map.believed)
-    pixels = np.stack([column, row], 1) + 0.5
+    pixels = np.stack([column, row], 1).astype(np.float64) + 0.5
     points = back_project(depth_map.camera, pixels, 1 / depth_map.inverse_depth[row, column])
-    total, agreeing = points.copy(), np.zeros(len(points), np.intp)
+    total = points.copy()
+    agreeing, looking = np.zeros(len(points), np.intp), np.zeros(len(points), np.intp)
     for other in others:
         seen, estimate = _agreement(points, depth_map, pixels, other, config)
         agreeing[seen] += 1
         total[seen] += estimate
-    kept = agreeing >= config.views
+        looking += inside(other.camera, *project(other.camera, points), near=0.0)
+    # At the edge of the common volume, where a single other camera looks, it suffices.
+    kept = agreeing >= np.clip(looking, 1, config.views)
     mask = np.zeros(depth_map.believed.shape, bool)
     mask[row[kept], column[kept]] = True
     return total[kept] / (agreeing[kept, None] + 1), mask
@@ -163,14 +166,15 @@ def sweep_points(
     workers: int,
     levels: Sequence[SweepConfig] = DEFAULT_LEVELS,
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` as ``[H, W, 3]`` uint8.
+    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8.
 
-    A later level adds only what the earlier ones left blank around its pixels: wide windows grow over outlines.
+    A later level adds only what the earlier ones left blank around its pixels: wide windows grow over
+    outlines.
 
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cv2 = _cv2()
+    cv2 = load_cv2()
     names = [name for name in cameras if neighbours[name]]
     positions: list[Floats] = [np.empty((0, 3))]
     colors: list[NDArray[np.uint8]] = [np.empty((0, 3), np.uint8)]
@@ -178,17 +182,23 @@ def sweep_points(
     with ThreadPoolExecutor(workers) as pool:
         for config in levels:
             views = {name: sweep_view(camera, images[name], width=config.width) for name, camera in cameras.items()}
-
-            def depth_map(name: str, views: Mapping[str, SweepView] = views, config: SweepConfig = config) -> DepthMap:
-                others = [views[other] for other in neighbours[name]]
-                return sweep_depth(views[name], others, bounds=bounds[name], config=config)
-
-            maps = dict(zip(names, pool.map(depth_map, names), strict=True))
+            pending = {
+                name: pool.submit(
+                    sweep_depth,
+                    views[name],
+                    [views[other] for other in neighbours[name]],
+                    bounds=bounds[name],
+                    config=config,
+                )
+                for name in names
+            }
+            maps = {name: future.result() for name, future in pending.items()}
             for name in names:
                 others = [other for other_name, other in maps.items() if other_name != name]
                 points, mask = consistent_pixels(maps[name], others, config=config)
                 height, width = mask.shape
-                before = cv2.resize(covered.get(name, mask * 0.0), (width, height), interpolation=cv2.INTER_AREA)
+                before = covered.get(name, np.zeros(mask.shape, np.float32))
+                before = cv2.resize(before, (width, height), interpolation=cv2.INTER_AREA)
                 reach = config.window // 2 | 1
                 blank = cv2.boxFilter(before, -1, (reach, reach)) < 0.02
                 positions.append(points[blank[mask]])
@@ -224,12 +234,10 @@ class _Family:
     inverse_offsets: Floats
 
 
-def _families(
-    camera: Camera, others: Sequence[Camera], bounds: SweepBounds, config: SweepConfig
-) -> list[_Family]:
+def _families(camera: Camera, others: Sequence[Camera], bounds: SweepBounds, config: SweepConfig) -> list[_Family]:
     """Planes parallel to the picture, then level planes under and over the camera (Gallup et al., CVPR 2007).
 
-    Floors and tables are seen at a slant: on planes parallel to the picture a large window does not match there.
+    Floors and tables are seen at a slant: on planes parallel to the picture wide windows do not match there.
     """
     near, far = bounds.depth_range
     pixels_per_inverse = float(camera.K[0, 0]) * _base_across(camera, others)
@@ -244,9 +252,9 @@ def _families(
         # A plane near the lens' own height is seen edge on.
         close = math.copysign(0.1 * far, offset)
         if abs(offset) > 1.5 * abs(close):
-            inverse = (1 / offset, 1 / close)
-            count = int(np.clip(math.ceil(pixels_per_inverse * slant * abs(inverse[1] - inverse[0])), 8, config.planes[1]))
-            families.append(_Family(normal, np.linspace(*inverse, count)))
+            span = pixels_per_inverse * slant * abs(1 / close - 1 / offset)
+            count = int(np.clip(math.ceil(span), 8, config.planes[1]))
+            families.append(_Family(normal, np.linspace(1 / offset, 1 / close, count)))
     return families
 
 
@@ -263,14 +271,14 @@ def _search(
     family: _Family,
     limits: tuple[float, float],
     config: SweepConfig,
-) -> tuple[Floats, FloatImage, FloatImage]:
-    """Inverse depth, score and lead over the best rival ``[H, W]`` of one family; a lead of -1 where there is no peak.
+) -> tuple[Floats, Floats, Floats]:
+    """Inverse depth, score and lead over the best rival ``[H, W]`` of one family; lead -1 without a peak.
 
     The plane is refined by a parabola through the scores around it.
     """
     offsets = family.inverse_offsets
     tilt = _rays_of_pixels(reference.camera) @ family.normal
-    scores = np.stack([_plane_score(reference, neighbours, family.normal * inverse, config) for inverse in offsets])
+    scores = np.stack([_plane_score(reference, neighbours, family.normal * each, config) for each in offsets])
     inverse_depths = tilt * offsets[:, None, None]
     margin = 0.01 * limits[1]
     scores[(inverse_depths < limits[0] - margin) | (inverse_depths > limits[1] + margin)] = -1
@@ -297,15 +305,17 @@ def _rays_of_pixels(camera: Camera) -> Floats:
 def _plane_score(
     reference: SweepView, neighbours: Sequence[SweepView], plane: Floats, config: SweepConfig
 ) -> FloatImage:
-    """Mean correlation ``[H, W]`` of the better half of the neighbours on one plane; -1 where none sees it."""
+    """Mean correlation ``[H, W]`` of the better half of the neighbours on a plane; -1 where none sees it."""
     scores = np.stack([_correlation(reference, view, plane, config) for view in neighbours])
     half = max(1, (len(neighbours) + 1) // 2)
-    return np.partition(scores, len(scores) - half, axis=0)[-half:].mean(0)
+    best = np.partition(scores, len(scores) - half, axis=0)[-half:]
+    # A view that does not see the plane counts half of the best one: a single match is more likely chance.
+    return np.where(best == -1, best.max(0) / 2, best).mean(0, dtype=np.float32)
 
 
 def _correlation(reference: SweepView, other: SweepView, plane: Floats, config: SweepConfig) -> FloatImage:
-    """Correlation ``[H, W]`` of the reference with another picture seen through ``plane . x = 1``; -1 outside it."""
-    cv2 = _cv2()
+    """Correlation ``[H, W]`` of the reference with a picture seen through ``plane . x = 1``, else -1."""
+    cv2 = load_cv2()
     height, width = reference.grey.shape
     homography, facing = _plane_homography(reference.camera, other.camera, plane)
     if not facing.any():
@@ -332,23 +342,16 @@ def _correlation(reference: SweepView, other: SweepView, plane: Floats, config: 
     variances = (mean(grey * grey) - mean_own**2 + noise) * (mean(warped * warped) - mean_other**2 + noise)
     score = covariance / np.sqrt(np.maximum(variances, noise**2))
     score[outside] = -1
-    return score
+    return score.astype(np.float32, copy=False)
 
 
 def _plane_homography(reference: Camera, other: Camera, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """From the reference's pixel indices to the other's by ``plane . x = 1``; which pixels meet it before the other."""
+    """From the reference's pixel indices to the other's; which pixels it shows in front of the other."""
     relative = other.viewmat.numpy() @ np.linalg.inv(reference.viewmat.numpy())
     induced = relative[:3, :3] + relative[:3, 3:] * plane
     # cv2 puts the first pixel's centre at 0, the cameras at 0.5.
     centred = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    homography = np.linalg.inv(centred) @ other.K.numpy() @ induced @ np.linalg.inv(reference.K.numpy()) @ centred
+    to_ray = np.linalg.inv(reference.K.numpy()) @ centred
+    homography = np.linalg.inv(centred) @ other.K.numpy() @ induced @ to_ray
     row, column = np.mgrid[: reference.height, : reference.width]
     return homography, homography[2, 0] * column + homography[2, 1] * row + homography[2, 2] > 1e-6
-
-
-def _cv2():  # noqa: ANN202 - a module
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
-    return cv2

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Initial points from the first frame with known poses, for captures that bring none.
 
-Points from nothing but chance overfit: the scene they grow into has floaters that held-out cameras see. Matched
-keypoints are precise but sparse, the plane sweep covers floors, walls and people; both are kept only where further
-views agree.
+Points from nothing but chance overfit: the scene they grow into has floaters that held-out cameras see.
+Matched keypoints are precise but sparse, the plane sweep covers floors, walls and people; both are kept
+only where further views agree.
 """
 
 import logging
@@ -53,7 +53,8 @@ class PointsConfig:
         far_share: far limit of matching, as a multiple of the viewing distance.
         cell_share: side of the cells, as a share of the viewing distance, that keep one point each
             (grown where that leaves more than ``max_points``).
-        isolation_share: side of the cells, as a share of the viewing distance, in which a point needs company.
+        isolation_share: side of the cells, as a share of the viewing distance, in which a point needs
+            company.
         sweep_levels: the plane sweeps, fine to coarse; none leaves the sweep out.
     """
 
@@ -97,10 +98,11 @@ def initial_points(
 ) -> InitialPoints:
     """Points of one frame from the training cameras' pictures and poses; held-out pictures are never read.
 
+    The result does not depend on the number of threads; ``seed`` only matters when random points stand in.
+
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    rng = np.random.default_rng(seed)
     cameras = {name: rig[name] for name in rig.training}
     images = {name: frame.images[name] for name in rig.training}
     distance = viewing_distance(cameras)
@@ -119,13 +121,15 @@ def initial_points(
     kept = kept[_thinned(positions[kept], cell=config.cell_share * distance, count=config.max_points)]
     if len(kept) < config.min_points:
         _log.warning(
-            "Only %d initial points could be triangulated from frame %d (too little texture or overlap); starting from "
-            "%d random points in the volume that the cameras see instead, expect a worse reconstruction.",
+            "Only %d initial points could be triangulated from frame %d (too little texture or overlap); "
+            "starting from %d random points in the volume that the cameras see: expect a worse result.",
             len(kept),
             frame.index,
             config.random_points,
         )
-        positions, colors = _random_points(cameras, images, distance=distance, rng=rng, config=config)
+        positions, colors = _random_points(
+            cameras, images, distance=distance, rng=np.random.default_rng(seed), config=config
+        )
         return InitialPoints(positions, colors, {"random": len(positions)})
     counts = {"sift": int((sources[kept] == 0).sum()), "sweep": int((sources[kept] == 1).sum())}
     return InitialPoints(positions[kept], colors[kept], counts)
@@ -250,8 +254,8 @@ def _has_company(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.b
 def _thinned(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:
     """Indices of one point per cell, of cells grown until at most ``count`` points remain.
 
-    Cells rather than a random subset: plain places, where points are few, keep theirs. The earlier point of a cell
-    stays, so a keypoint before a fine window and a fine window before a wide one.
+    Cells rather than a random subset: plain places, where points are few, keep theirs. The earlier point of a
+    cell stays, so a keypoint before a fine window and a fine window before a wide one.
     """
     if len(points) == 0:
         return np.zeros(0, np.intp)
@@ -278,7 +282,7 @@ def _random_points(
     rng: np.random.Generator,
     config: PointsConfig,
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Points spread over the cameras' views, even in inverse depth, each with the colour its camera sees there."""
+    """Points spread over the cameras' views, even in inverse depth, in the colour its camera sees there."""
     positions: list[Floats] = []
     colors: list[NDArray[np.uint8]] = []
     each = -(-config.random_points // len(cameras))

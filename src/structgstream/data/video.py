@@ -165,9 +165,7 @@ def measured_fps(tracks: Mapping[str, VideoTrack]) -> float | None:
     return usual if abs(usual / rate - 1) < 3e-4 else rate
 
 
-def _slots(
-    tracks: Mapping[str, VideoTrack], fps: float, *, where: Path
-) -> tuple[dict[str, list[int]], float]:
+def _slots(tracks: Mapping[str, VideoTrack], fps: float, *, where: Path) -> tuple[dict[str, list[int]], float]:
     """Each frame's place on the common timeline, and the time of place 0 in seconds."""
     positions = {name: np.array(track.stamps) * (track.tick_seconds * fps) for name, track in tracks.items()}
     origin = min(float(own[0]) for own in positions.values())
@@ -222,9 +220,7 @@ def _scan(path: Path) -> VideoTrack:
         try:
             packets = [packet for packet in container.demux(stream) if packet.size]
         except av.error.FFmpegError as error:
-            raise CaptureError(
-                f"The video {path} is damaged ({error.strerror}); copy or record it again."
-            ) from None
+            raise CaptureError(f"The video {path} is damaged ({error.strerror}); copy or record it again.") from None
         if not packets or any(packet.is_corrupt for packet in packets) or len(packets) < stream.frames:
             raise CaptureError(
                 f"The video {path} is truncated: its index announces {stream.frames or 'some'} frames, "
@@ -279,9 +275,7 @@ def _damage(track: VideoTrack, wanted: int, reason: str) -> str:
     )
 
 
-def _srgb(
-    frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int
-) -> NDArray[np.uint8]:
+def _srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:
     """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
 
     A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+
+from streams import header_for, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.header import packed_header
+from structgstream.codec.packets import PacketKind
+from structgstream.codec.reader import StreamReader, open_stream, readable_part
+from structgstream.codec.records import PREFIX, RecordType, packed, prefix, scanned
+from structgstream.codec.sinks import MemorySink
+from structgstream.errors import StreamError
+
+
+def packet_record(index: int, kind: PacketKind, *, pts_seconds: float | None = None) -> bytes:
+    pts = index / 30 if pts_seconds is None else pts_seconds
+    scene = small_scene()
+    encoded = SceneEncoder(header_for(scene)).encode(scene, index=index, pts_seconds=pts, kind=kind)
+    return packed(RecordType.KEY if kind is PacketKind.KEY else RecordType.DELTA, encoded.packet.payload)
+
+
+def with_records(*records: bytes) -> bytes:
+    return prefix() + packed(RecordType.INIT, packed_header(header_for(small_scene()))) + b"".join(records)
+
+
+def test_a_reader_sees_what_the_encoder_promised() -> None:
+    sink = MemorySink()
+    promised = write_stream(sink, [moved(small_scene(), i) for i in range(4)])
+    reader = StreamReader(sink.data)
+    assert reader.complete
+    assert reader.cut_reason is None
+    assert [info.kind for info in reader.packets] == [1, 2, 2, 1]
+    assert [info.pts_seconds for info in reader.packets] == [0.0, 1 / 30, 2 / 30, 3 / 30]
+    assert all(same(scene, promised[info.index]) for info, scene in reader.scenes())
+    assert [info.index for info, _ in reader.scenes(2)] == [2, 3]
+
+
+def test_bytes_are_all_accounted_for() -> None:
+    data = small_stream()
+    reader = StreamReader(data)
+    index = 8 + 4 * 13 + 4 + 16
+    assert reader.header_bytes + sum(info.bytes for info in reader.packets) + index == reader.total_bytes == len(data)
+    assert all(info.bytes == sum(info.field_bytes.values()) + 12 + 8 + 4 for info in reader.packets)
+
+
+def test_a_stream_cut_at_any_byte_plays_up_to_the_cut() -> None:
+    data = small_stream()
+    whole = StreamReader(data)
+    scenes = [whole.scene(i) for i in range(len(whole))]
+    for cut in range(len(data)):
+        if cut < whole.header_bytes:
+            with pytest.raises(StreamError, match="cut at byte|ends at byte"):
+                StreamReader(data[:cut])
+            continue
+        reader = StreamReader(data[:cut])
+        expected = sum(info.offset + info.bytes <= cut for info in whole.packets)
+        assert len(reader) == expected
+        assert reader.complete == (cut >= len(data) - 16)
+        if expected:
+            assert same(reader.scene(expected - 1), scenes[expected - 1])
+
+
+@pytest.mark.parametrize("damaged", range(5))
+def test_what_comes_before_damage_plays(damaged: int) -> None:
+    data = bytearray(small_stream())
+    record = list(scanned(bytes(data)))[damaged]
+    data[record.offset + 8 + len(record.payload) // 2] ^= 0x10
+    if damaged == 0:
+        with pytest.raises(StreamError, match="the record at byte 12 .* is damaged"):
+            StreamReader(bytes(data))
+        return
+    reader = StreamReader(bytes(data))
+    assert len(reader) == damaged - 1
+    assert not reader.complete
+    assert reader.cut_reason == f"the record at byte {record.offset} of {len(data)} is damaged"
+
+
+def test_damage_after_opening_is_noticed() -> None:
+    data = bytearray(small_stream())
+    reader = StreamReader(memoryview(data))
+    data[reader.packets[1].offset + 20] ^= 1
+    with pytest.raises(StreamError, match="Packet 1 .* damaged"):
+        reader.scene(1)
+
+
+def test_unknown_records_are_skipped() -> None:
+    data = small_stream()
+    second = list(scanned(data))[2]
+    foreign = struct.pack("<BBHI", 77, 0, 0, 3) + b"abc"
+    foreign += struct.pack("<I", zlib.crc32(foreign))
+    reader = StreamReader(data[: second.offset] + foreign + data[second.offset :])
+    assert len(reader) == 4
+    assert same(reader.scene(3), StreamReader(data).scene(3))
+
+
+def test_a_newer_major_version_is_refused_and_a_newer_minor_is_not() -> None:
+    data = small_stream()
+    with pytest.raises(StreamError, match=r"format version 2\.0; this program reads 1\.x\. Install a newer"):
+        StreamReader(data[:8] + struct.pack("<HH", 2, 0) + data[PREFIX.size :])
+    assert len(StreamReader(data[:8] + struct.pack("<HH", 1, 9) + data[PREFIX.size :])) == 4
+
+
+@pytest.mark.parametrize(
+    ("records", "message"),
+    [
+        ([packet_record(1, PacketKind.KEY)], "has packet 1 where packet 0 belongs"),
+        ([packet_record(0, PacketKind.DELTA)], "begins with a delta packet"),
+        ([packet_record(0, PacketKind.KEY), packet_record(0, PacketKind.KEY)], "packet 0 where packet 1 belongs"),
+        (
+            [packet_record(0, PacketKind.KEY), packet_record(1, PacketKind.DELTA, pts_seconds=0.0)],
+            "packet 1 is not presented after",
+        ),
+        ([packet_record(0, PacketKind.KEY, pts_seconds=float("nan"))], "which is no time"),
+        ([packed(RecordType.KEY, b"short")], "too short"),
+        ([packed(RecordType.INIT, b"")], "second init record"),
+    ],
+)
+def test_records_that_contradict_each_other(records: list[bytes], message: str) -> None:
+    with pytest.raises(StreamError, match=message):
+        StreamReader(with_records(*records))
+
+
+def test_a_frame_that_is_not_there() -> None:
+    with pytest.raises(StreamError, match="has frames 0 to 3; there is no frame 4"):
+        StreamReader(small_stream()).scene(4)
+    with pytest.raises(StreamError, match="has no whole frame; there is no frame 0"):
+        StreamReader(with_records()).scene(0)
+
+
+def test_a_stream_that_begins_with_a_packet() -> None:
+    with pytest.raises(StreamError, match="begins with a record of type 2"):
+        StreamReader(prefix() + packet_record(0, PacketKind.KEY))
+
+
+def test_files_that_are_no_streams(tmp_path: Path) -> None:
+    empty, other = tmp_path / "empty.sgs", tmp_path / "other.sgs"
+    empty.touch()
+    other.write_text("A letter to someone.")
+    for path, message in [
+        (tmp_path, "Cannot read .*directory"),
+        (tmp_path / "missing.sgs", "Cannot read .*missing.sgs .No such file"),
+        (empty, "empty.sgs is empty"),
+        (other, "other.sgs is not a structgstream file"),
+    ]:
+        with pytest.raises(StreamError, match=message):
+            open_stream(path)
+
+
+def test_the_readable_part_leaves_out_the_index() -> None:
+    data = small_stream()
+    records = list(scanned(data))
+    assert readable_part(data, name="x") == records[-1].offset
+    assert readable_part(data[: records[3].end + 5], name="x") == records[3].end
+    assert readable_part(data[:40], name="x") is None
+    assert readable_part(b"", name="x") is None
