@@ -44,7 +44,7 @@ def packed_block(name: FieldName, value: Tensor) -> bytes:
     """One field, coded raw."""
     array = value.detach().cpu().contiguous().numpy()
     code = 1 if array.dtype == np.int64 else 0
-    array = np.ascontiguousarray(array, dtype=_DTYPES[code])
+    array = np.asarray(array, dtype=_DTYPES[code], order="C")
     head = BLOCK.pack(_CODES[name], RAW, code, array.ndim)
     return head + struct.pack(f"<{array.ndim}I", *array.shape) + array.tobytes()
 

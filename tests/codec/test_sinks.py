@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+import errno
+import io
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from streams import header_for, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.records import RecordType, scanned
+from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.errors import StorageError, StreamError
+
+SCENES = [moved(small_scene(), i) for i in range(4)]
+
+
+def packets() -> list[Packet]:
+    encoder = SceneEncoder(header_for(SCENES[0]))
+    kinds = [PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY]
+    return [
+        encoder.encode(scene, index=i, pts_seconds=i / 30.0, kind=kinds[i]).packet for i, scene in enumerate(SCENES)
+    ]
+
+
+class FullDisk(io.FileIO):
+    """A file on a disk that has ``room`` bytes, of which a write takes what it can, as the kernel does."""
+
+    room = 0
+    interrupt = False
+
+    def write(self, data: Any, /) -> int:
+        taken = super().write(memoryview(data)[: max(self.room - self.tell(), 0)])
+        if taken == 0:
+            if self.interrupt:
+                raise KeyboardInterrupt
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return taken
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> type[FullDisk]:
+    """Files opened by path are on a :class:`FullDisk`."""
+    monkeypatch.setattr(FullDisk, "room", 10**9)
+    monkeypatch.setattr(FullDisk, "interrupt", False)
+    monkeypatch.setattr(Path, "open", lambda path, mode, buffering=-1: FullDisk(path, mode))
+    return FullDisk
+
+
+def test_both_sinks_give_the_same_bytes(tmp_path: Path) -> None:
+    memory, file = MemorySink(), FileSink(tmp_path / "a.sgs")
+    for one in (memory, file):
+        promised = write_stream(one, SCENES)
+    assert file.path.read_bytes() == memory.data
+    reader = open_stream(file.path)
+    assert all(same(scene, promised[info.index]) for info, scene in reader.scenes())
+
+
+def test_writes_return_their_bytes_and_index_and_footer_point_at_them() -> None:
+    sink = MemorySink()
+    sizes = [sink.open(header_for(SCENES[0])), *(sink.write(packet) for packet in packets())]
+    assert len(sink.data) == sum(sizes)
+    sink.close()
+    sink.close()
+    offset, magic = struct.unpack("<Q8s", sink.data[-16:])
+    assert (offset, magic) == (sum(sizes), b"SGSINDEX")
+    index = list(scanned(sink.data))[-1]
+    assert (index.type, index.offset, index.end) == (RecordType.INDEX, offset, len(sink.data) - 16)
+    entries = list(struct.iter_unpack("<IBQ", index.payload))
+    assert entries == [(i, kind, sum(sizes[: i + 1])) for i, kind in enumerate((2, 3, 3, 2))]
+
+
+def test_the_whole_file_is_there_after_each_write(tmp_path: Path) -> None:
+    sink = FileSink(tmp_path / "a.sgs")
+    sink.open(header_for(SCENES[0]))
+    for i, packet in enumerate(packets()):
+        sink.write(packet)
+        reader = open_stream(sink.path)
+        assert (len(reader), reader.complete) == (i + 1, False)
+    sink.close()
+
+
+def test_an_existing_file_stays_unless_it_may_be_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "a.sgs"
+    path.write_text("precious")
+    with pytest.raises(StorageError, match="exists; continue it with --resume, replace it with --overwrite"):
+        FileSink(path).open(header_for(SCENES[0]))
+    assert path.read_text() == "precious"
+    write_stream(FileSink(path, overwrite=True), SCENES)
+    assert path.read_bytes() == small_stream()
+
+
+def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
+    for path, overwrite in ((tmp_path / "no" / "a.sgs", False), (tmp_path, True)):
+        sink = FileSink(path, overwrite=overwrite)
+        with pytest.raises(StorageError, match="Cannot open .* for writing"):
+            sink.open(header_for(SCENES[0]))
+        sink.close()
+
+
+def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path: Path, disk: type[FullDisk]) -> None:
+    """In the header, at bytes all over a packet record and of what closes the file; the finished rest equals an uninterrupted run."""
+    whole = small_stream()
+    records = list(scanned(whole))
+    path = tmp_path / "a.sgs"
+    packet, closing = range(records[2].offset, records[2].end, 5), range(records[5].offset, len(whole), 2)
+    for room in [0, 5, records[0].end - 1, *packet, *closing]:
+        disk.room = room
+        sink = FileSink(path, overwrite=True)
+        with pytest.raises(StorageError, match="No space left on device.*continue with --resume"):
+            write_stream(sink, SCENES)
+        sink.close()
+        ends = [record.end for record in records[:5] if record.end <= room]
+        assert path.stat().st_size == max(ends, default=0)
+        disk.room = 10**9
+        sink, reader = FileSink.resume(path)
+        assert (0 if reader is None else len(reader)) == max(len(ends) - 1, 0)
+        sink.open(header_for(SCENES[0]))
+        for packet in packets()[0 if reader is None else len(reader) :]:
+            sink.write(packet)
+        sink.close()
+        assert path.read_bytes() == whole
+
+
+def test_a_failed_write_is_followed_by_no_index(tmp_path: Path, disk: type[FullDisk]) -> None:
+    """A small index may fit where a packet did not; the file still says that it was not finished."""
+    sink = FileSink(tmp_path / "a.sgs")
+    sink.open(header_for(SCENES[0]))
+    sink.write(packets()[0])
+    disk.room = sink.path.stat().st_size + 200
+    with pytest.raises(StorageError, match=r"The 1 frames before"):
+        sink.write(packets()[1])
+    sink.close()
+    reader = open_stream(sink.path)
+    assert (len(reader), reader.complete) == (1, False)
+    assert reader.cut_reason == f"it ends at byte {sink.path.stat().st_size} without an index"
+
+
+def test_an_interrupted_write_is_replaced_by_the_index(tmp_path: Path, disk: type[FullDisk]) -> None:
+    sink = FileSink(tmp_path / "a.sgs")
+    sink.open(header_for(SCENES[0]))
+    sink.write(packets()[0])
+    disk.room, disk.interrupt = sink.path.stat().st_size + 300, True
+    with pytest.raises(KeyboardInterrupt):
+        sink.write(packets()[1])
+    disk.room = 10**9
+    sink.close()
+    expected = MemorySink()
+    write_stream(expected, SCENES[:1])
+    assert sink.path.read_bytes() == expected.data
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/dev/full is Linux's")
+def test_a_device_that_is_full() -> None:
+    sink = FileSink("/dev/full", overwrite=True)
+    with pytest.raises(StorageError, match=r"to /dev/full \(No space left on device\)\. The 0 frames before"):
+        sink.open(header_for(SCENES[0]))
+    sink.close()
+
+
+def test_a_file_cut_at_any_byte_is_continued(tmp_path: Path) -> None:
+    whole = small_stream()
+    path = tmp_path / "a.sgs"
+    ends = [record.end for record in scanned(whole)][:5]
+    for cut in range(0, len(whole) + 1, 7):
+        path.write_bytes(whole[:cut])
+        sink, reader = FileSink.resume(path)
+        done = 0 if reader is None else len(reader)
+        assert done == max(sum(end <= cut for end in ends) - 1, 0)
+        assert path.read_bytes() == whole[:cut]  # Nothing is touched before open().
+        sink.open(header_for(SCENES[0]) if reader is None else reader.header)
+        for packet in packets()[done:]:
+            sink.write(packet)
+        sink.close()
+        assert path.read_bytes() == whole
+
+
+def test_a_resumed_file_that_is_not_opened_stays_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.sgs"
+    path.write_bytes(small_stream())
+    FileSink.resume(path)[0].close()
+    assert path.read_bytes() == small_stream()
+
+
+def test_what_cannot_be_resumed(tmp_path: Path) -> None:
+    damaged = bytearray(small_stream())
+    damaged[40] ^= 1
+    newer = bytearray(small_stream())
+    newer[8] = 2
+    for content, message in [
+        (b"Dear", "is not a structgstream file"),
+        (b"A long letter to someone.", "is not a structgstream file"),
+        (bytes(damaged), "Cannot continue .*a.sgs: the record at byte 12 .* damaged. Start again with --overwrite"),
+        (bytes(newer), "format version 2.0"),
+    ]:
+        path = tmp_path / "a.sgs"
+        path.write_bytes(content)
+        with pytest.raises(StreamError, match=message):
+            FileSink.resume(path)
+        assert path.read_bytes() == content
+    with pytest.raises(StreamError, match="Cannot read"):
+        FileSink.resume(tmp_path)
+
+
+def test_resuming_nothing_begins(tmp_path: Path) -> None:
+    sink, reader = FileSink.resume(tmp_path / "a.sgs")
+    assert reader is None
+    write_stream(sink, SCENES)
+    assert len(StreamReader(sink.path.read_bytes())) == 4
