@@ -101,7 +101,7 @@ class Session:
     def run(self) -> Iterator[FrameReport]:
         """Fit, encode and write every frame that the sink does not hold yet; yields a report for each.
 
-        The sink is closed, with its index, however the loop ends.
+        The sink is closed, with its index, however the loop ends; only a sink that could not write gets no index.
         """
         try:
             yield from self._frames()

@@ -103,7 +103,7 @@ def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path: Path, disk: type[FullDisk]) -> None:
-    """In the header, at bytes all over a packet record and of what closes the file; the finished rest equals an uninterrupted run."""
+    """In the header, all over a packet record and what closes the file; resumed, it equals an uninterrupted run."""
     whole = small_stream()
     records = list(scanned(whole))
     path = tmp_path / "a.sgs"
@@ -162,11 +162,11 @@ def test_a_device_that_is_full() -> None:
     sink.close()
 
 
-def test_a_file_cut_at_any_byte_is_continued(tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_is_continued(tmp_path: Path) -> None:
     whole = small_stream()
     path = tmp_path / "a.sgs"
     ends = [record.end for record in scanned(whole)][:5]
-    for cut in range(0, len(whole) + 1, 7):
+    for cut in range(0, len(whole) + 1, 13):
         path.write_bytes(whole[:cut])
         sink, reader = FileSink.resume(path)
         done = 0 if reader is None else len(reader)

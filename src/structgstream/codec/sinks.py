@@ -93,8 +93,8 @@ class FileSink:
     def resume(cls, path: Path | str) -> tuple["FileSink", StreamReader | None]:
         """A sink that continues a file after its last whole packet, and the reader of what is there.
 
-        The reader is None when not even the init record is whole: the stream then starts again from nothing. The file
-        stays as it is until :meth:`open`.
+        The reader is None when there is no whole packet: the stream then starts again from nothing, because the static
+        fields of frame 0 are good only beside its dynamic ones. The file stays as it is until :meth:`open`.
 
         Raises:
             StreamError: the file is something else, or damaged where nothing can be saved.
@@ -102,9 +102,9 @@ class FileSink:
         sink = cls(path, overwrite=True)
         data = stored_bytes(path) if sink.path.exists() else b""
         end = readable_part(data, name=str(path))
-        if end is None:
+        reader = None if end is None else StreamReader(memoryview(data)[:end], name=str(path))
+        if end is None or reader is None or not reader.packets:
             return sink, None
-        reader = StreamReader(memoryview(data)[:end], name=str(path))
         sink._resumed = (end, reader)
         return sink, reader
 
