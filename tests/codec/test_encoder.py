@@ -66,3 +66,12 @@ def test_another_number_of_anchors_than_the_header_s_is_refused() -> None:
     encoder = SceneEncoder(header_for(small_scene(3)))
     with pytest.raises(StreamError, match="Packet 1 has field"):
         encoder.encode(small_scene(4), index=1, pts_seconds=0.0, kind=PacketKind.DELTA)
+
+
+@pytest.mark.parametrize("pts_seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_time_rises(pts_seconds: float) -> None:
+    """A reader would refuse the whole stream, so the encoder does first."""
+    encoder = SceneEncoder(header_for(small_scene()))
+    encoder.encode(small_scene(), index=0, pts_seconds=0.0, kind=PacketKind.KEY)
+    with pytest.raises(StreamError, match="Frame 1 is to be presented at .* time stamps must rise"):
+        encoder.encode(small_scene(), index=1, pts_seconds=pts_seconds, kind=PacketKind.DELTA)

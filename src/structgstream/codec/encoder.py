@@ -7,11 +7,13 @@ The scene that the next frame starts from is the one the decoder will hold, bit 
 decodes the bytes it has just made and returns that. Without it trainer and viewers drift apart.
 """
 
+import math
 from dataclasses import dataclass
 
 from structgstream.codec.blocks import packed_block
 from structgstream.codec.decoder import FRAME, SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
@@ -30,13 +32,20 @@ class SceneEncoder:
     def __init__(self, header: StreamHeader) -> None:
         self._header = header
         self._decoder = SceneDecoder(header)
+        self._last_pts_seconds = -math.inf
 
     def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded:
         """The packet of one frame.
 
         Raises:
-            StreamError: the scene's shapes are not those that the header's static fields have.
+            StreamError: the scene's shapes are not those that the header's static fields have, or the frame is not
+                presented after the one before it.
         """
+        if not self._last_pts_seconds < pts_seconds < math.inf:
+            raise StreamError(
+                f"Frame {index} is to be presented at {pts_seconds} s, which is not after the frame before it "
+                f"({self._last_pts_seconds} s); the capture's time stamps must rise."
+            )
         state = state_of(scene)
         lengths: dict[FieldName, int] = {}
         parts = [FRAME.pack(index, pts_seconds)]
@@ -45,4 +54,6 @@ class SceneEncoder:
                 parts.append(packed_block(row.name, state[row.name]))
                 lengths[row.name] = len(parts[-1])
         packet = Packet(kind, index, pts_seconds, b"".join(parts), lengths)
-        return Encoded(packet, self._decoder.decode(packet))
+        encoded = Encoded(packet, self._decoder.decode(packet))
+        self._last_pts_seconds = pts_seconds
+        return encoded
