@@ -18,8 +18,9 @@ from structgstream.errors import StreamError
 def packet_record(index: int, kind: PacketKind, *, pts_seconds: float | None = None) -> bytes:
     pts = index / 30 if pts_seconds is None else pts_seconds
     scene = small_scene()
-    encoded = SceneEncoder(header_for(scene)).encode(scene, index=index, pts_seconds=pts, kind=kind)
-    return packed(RecordType.KEY if kind is PacketKind.KEY else RecordType.DELTA, encoded.packet.payload)
+    encoded = SceneEncoder(header_for(scene)).encode(scene, index=index, pts_seconds=0.0, kind=kind)
+    payload = struct.pack("<Id", index, pts) + encoded.packet.payload[12:]
+    return packed(RecordType.KEY if kind is PacketKind.KEY else RecordType.DELTA, payload)
 
 
 def with_records(*records: bytes) -> bytes:
