@@ -103,8 +103,12 @@ def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkey
     started_from = []
 
     def following(scene, frame, rig, *, config, backend, seed, on_step):
+        """A trainer that touches a static field, which no packet carries."""
         started_from.append(scene)
-        return FitResult(moved(scene, frame.index), 1, 21.0)
+        fitted = moved(scene, frame.index)
+        return FitResult(
+            replace(fitted, anchors=replace(fitted.anchors, features=fitted.anchors.features + 1)), 1, 21.0
+        )
 
     monkeypatch.setattr(session, "fit_next_frame", following)
     sink = MemorySink()

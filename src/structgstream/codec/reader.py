@@ -9,7 +9,9 @@ from structgstream.codec.decoder import SceneDecoder, packet_of
 from structgstream.codec.header import unpacked_header
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.records import (
+    CHECKSUM,
     PREFIX,
+    RECORD,
     Record,
     RecordType,
     check_prefix,
@@ -139,6 +141,14 @@ def stored_bytes(path: Path | str) -> bytes:
         raise StreamError(f"Cannot read {path} ({error.strerror}); expected a stream file.") from error
 
 
+def record_after_damage(data: bytes, offset: int) -> bool:
+    """Whether a whole record follows a damaged one at ``offset``: no crash leaves that, only a medium that forgets."""
+    if offset + RECORD.size > len(data) or record_at(data, offset) is not None:
+        return False
+    length = RECORD.unpack_from(data, offset)[3]
+    return record_at(data, offset + RECORD.size + length + CHECKSUM.size) is not None
+
+
 def readable_part(data: bytes, *, name: str) -> int | None:
     """Where the last whole packet ends, the index and what follows left out; None when the init record was cut.
 
@@ -155,6 +165,11 @@ def readable_part(data: bytes, *, name: str) -> int | None:
             break
         end = record.end
     if end > PREFIX.size:
+        if record_after_damage(data, end):
+            raise StreamError(
+                f"Cannot continue {name}: {why_stopped(data, end)}, and whole frames follow it that continuing would "
+                f"throw away. Keep a copy, then cut the file to {end} bytes and use --resume to fit them anew."
+            )
         return end
     reason = why_stopped(data, end)
     if "damaged" in reason:

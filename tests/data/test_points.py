@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial points of the bundled clip, whose geometry is known: a room of about three metres around a table."""
+
+import logging
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pytest
+
+from structgstream.data.clip import bundled_clip
+from structgstream.data.points import InitialPoints, PointsConfig, initial_points
+from structgstream.frames import MultiViewFrame
+
+
+class Guarded(Mapping[str, np.ndarray]):
+    """Pictures that refuse to be read for held-out cameras."""
+
+    def __init__(self, images: Mapping[str, np.ndarray], held_out: frozenset[str]) -> None:
+        self.images, self.held_out = images, held_out
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        assert name not in self.held_out, f"{name} is held out"
+        return self.images[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.images)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+@pytest.fixture(scope="module")
+def clip_points() -> tuple[InitialPoints, MultiViewFrame]:
+    clip = bundled_clip()
+    frame = next(iter(clip.frames()))
+    guarded = MultiViewFrame(0, 0.0, Guarded(frame.images, clip.rig.held_out))
+    return initial_points(guarded, clip.rig, config=PointsConfig(max_points=20_000)), frame
+
+
+def test_points_cover_the_scene_within_the_bound(clip_points: tuple[InitialPoints, MultiViewFrame]) -> None:
+    points, _ = clip_points
+    assert not points.random
+    assert 5_000 < len(points.positions) <= 20_000
+    assert points.counts["sift"] > 100
+    assert points.counts["sweep"] > 1_000
+    assert np.isfinite(points.positions).all()
+
+
+def test_points_have_the_colour_that_the_held_out_camera_sees(
+    clip_points: tuple[InitialPoints, MultiViewFrame],
+) -> None:
+    """A point in the wrong place projects onto something else; the held-out camera took no part in finding it."""
+    points, frame = clip_points
+    camera = bundled_clip().rig["cam00"]
+    local = points.positions @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
+    pixels = (local @ camera.K.numpy().T)[:, :2] / local[:, 2:]
+    columns, rows = np.floor(pixels).astype(int).T
+    seen = (local[:, 2] > 0) & (columns >= 0) & (columns < 320) & (rows >= 0) & (rows < 240)
+    assert seen.mean() > 0.4
+
+    def difference(shift: int) -> float:
+        there = frame.images["cam00"][rows[seen], (columns[seen] + shift) % 320].astype(float)
+        return float(np.median(np.abs(there - points.colors[seen]).mean(1)))
+
+    assert difference(0) < 20.0
+    assert difference(0) < 0.5 * difference(25)
+
+
+def test_pictures_without_texture_give_random_points_and_say_so(caplog: pytest.LogCaptureFixture) -> None:
+    clip = bundled_clip()
+    blank = {name: np.full((240, 320, 3), 128, dtype=np.uint8) for name in clip.rig}
+    config = PointsConfig(random_points=500)
+    with caplog.at_level(logging.WARNING):
+        points = initial_points(MultiViewFrame(0, 0.0, blank), clip.rig, config=config, seed=3)
+    assert points.random
+    assert 500 <= len(points.positions) < 600  # A whole number for each camera.
+    assert "random points" in caplog.text
+    again = initial_points(MultiViewFrame(0, 0.0, blank), clip.rig, config=config, seed=3)
+    other = initial_points(MultiViewFrame(0, 0.0, blank), clip.rig, config=config, seed=4)
+    assert np.array_equal(points.positions, again.positions)
+    assert not np.array_equal(points.positions, other.positions)
