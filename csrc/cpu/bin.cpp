@@ -3,35 +3,50 @@
 // without a sort of its own.
 
 #include <cstring>
+#include <limits>
+#include <new>
 
 #include "bin.h"
 
 namespace structgstream {
 namespace {
 
-// Positive floats order as their bits do; the index breaks ties, so the order is total.
-std::vector<int32_t> by_depth(const std::vector<Splat>& splats) {
+struct Tiles {
+    uint16_t x0, y0, x1, y1;  // the last ones included
+};
+
+struct Entry {
+    int32_t splat;
+    int32_t slot;
+    Tiles tiles;
+};
+
+Tiles tiles_of(const Splat& s) {
+    const auto tile = [](int pixel) { return static_cast<uint16_t>(pixel / kTile); };
+    return {tile(s.box[0]), tile(s.box[1]), tile(s.box[2] - 1), tile(s.box[3] - 1)};
+}
+
+// The drawn splats front to back. Positive floats order as their bits do; the index breaks ties, so the order is total.
+std::vector<uint64_t> by_depth(const std::vector<Splat>& splats) {
+    constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
     std::vector<uint64_t> keys, other;
     keys.reserve(splats.size());
+    size_t counts[kPasses][kBuckets + 1] = {};
     for (size_t i = 0; i < splats.size(); ++i) {
         if (splats[i].box[0] >= splats[i].box[2]) continue;
         uint32_t bits;
         std::memcpy(&bits, &splats[i].depth, sizeof bits);
         keys.push_back(static_cast<uint64_t>(bits) << 32 | i);
+        for (int pass = 0; pass < kPasses; ++pass) ++counts[pass][(bits >> kDigit * pass & (kBuckets - 1)) + 1];
     }
     other.resize(keys.size());
-    constexpr int kDigit = 11, kBuckets = 1 << kDigit;
-    for (int pass = 0; pass < 3; ++pass) {
-        const int shift = 32 + kDigit * pass;
-        size_t counts[kBuckets + 1] = {};
-        for (uint64_t key : keys) ++counts[(key >> shift & (kBuckets - 1)) + 1];
-        for (int b = 0; b < kBuckets; ++b) counts[b + 1] += counts[b];
-        for (uint64_t key : keys) other[counts[key >> shift & (kBuckets - 1)]++] = key;
+    for (int pass = 0; pass < kPasses; ++pass) {
+        size_t* next = counts[pass];
+        for (int b = 0; b < kBuckets; ++b) next[b + 1] += next[b];
+        for (uint64_t key : keys) other[next[key >> (32 + kDigit * pass) & (kBuckets - 1)]++] = key;
         keys.swap(other);
     }
-    std::vector<int32_t> order(keys.size());
-    for (size_t i = 0; i < keys.size(); ++i) order[i] = static_cast<int32_t>(keys[i] & 0xffffffffu);
-    return order;
+    return keys;
 }
 
 }  // namespace
@@ -40,30 +55,35 @@ void bin(Raster& raster) {
     const int tiles = raster.tiles_x * raster.tiles_y;
     raster.starts.assign(tiles + 1, 0);
     raster.slots.assign(raster.splats.size() + 1, 0);
-    const auto columns = [](const Splat& s) { return (s.box[2] - 1) / kTile - s.box[0] / kTile + 1; };
-    const auto rows = [](const Splat& s) { return (s.box[3] - 1) / kTile - s.box[1] / kTile + 1; };
+    int64_t total = 0;
     for (size_t i = 0; i < raster.splats.size(); ++i) {
         const Splat& s = raster.splats[i];
-        const bool drawn = s.box[0] < s.box[2];
-        raster.slots[i + 1] = raster.slots[i] + (drawn ? columns(s) * rows(s) : 0);
-    }
-    const std::vector<int32_t> order = by_depth(raster.splats);
-    for (int32_t i : order) {
-        const int32_t* box = raster.splats[i].box;
-        for (int y = box[1] / kTile; y <= (box[3] - 1) / kTile; ++y)
-            for (int x = box[0] / kTile; x <= (box[2] - 1) / kTile; ++x) ++raster.starts[y * raster.tiles_x + x + 1];
+        if (s.box[0] < s.box[2]) {
+            const Tiles t = tiles_of(s);
+            total += (t.x1 - t.x0 + 1) * (t.y1 - t.y0 + 1);
+            if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 80 GB of gradients, anyway
+            for (int y = t.y0; y <= t.y1; ++y)
+                for (int x = t.x0; x <= t.x1; ++x) ++raster.starts[y * raster.tiles_x + x + 1];
+        }
+        raster.slots[i + 1] = static_cast<int32_t>(total);
     }
     for (int t = 0; t < tiles; ++t) raster.starts[t + 1] += raster.starts[t];
+    // Once in order of depth, small entries instead of whole splats: what follows is bound by memory.
+    const std::vector<uint64_t> keys = by_depth(raster.splats);
+    std::vector<Entry> order(keys.size());
+    for (size_t i = 0; i < keys.size(); ++i) {
+        const int32_t splat = static_cast<int32_t>(keys[i] & 0xffffffffu);
+        order[i] = {splat, raster.slots[splat], tiles_of(raster.splats[splat])};
+    }
     raster.pairs.resize(raster.starts[tiles]);
     raster.pair_slots.resize(raster.starts[tiles]);
     std::vector<int32_t> next(raster.starts.begin(), raster.starts.end() - 1);
-    for (int32_t i : order) {
-        const int32_t* box = raster.splats[i].box;
-        int32_t slot = raster.slots[i];
-        for (int y = box[1] / kTile; y <= (box[3] - 1) / kTile; ++y)
-            for (int x = box[0] / kTile; x <= (box[2] - 1) / kTile; ++x) {
+    for (const Entry& e : order) {
+        int32_t slot = e.slot;
+        for (int y = e.tiles.y0; y <= e.tiles.y1; ++y)
+            for (int x = e.tiles.x0; x <= e.tiles.x1; ++x) {
                 const int32_t at = next[y * raster.tiles_x + x]++;
-                raster.pairs[at] = i;
+                raster.pairs[at] = e.splat;
                 raster.pair_slots[at] = slot++;
             }
     }

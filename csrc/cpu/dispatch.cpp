@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <atomic>
 #include <memory>
+#include <new>
 
 #include "bin.h"
 #include "splat.h"
@@ -125,28 +126,38 @@ void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* screen_offsets, float* image, float* alpha, float* radii, int threads) {
-    auto raster = std::make_unique<Raster>();
-    raster->camera = pinhole(viewmat, K, width, height, near_plane);
-    raster->tiles_x = (width + kTile - 1) / kTile;
-    raster->tiles_y = (height + kTile - 1) / kTile;
-    raster->splats.resize(count);
-    project_dispatched({means, quats, scales, opacities, colors, screen_offsets, count}, *raster, radii, threads);
-    bin(*raster);
-    rasterize_dispatched(*raster, background, image, alpha, threads);
-    return raster.release();
+    try {
+        auto raster = std::make_unique<Raster>();
+        raster->camera = pinhole(viewmat, K, width, height, near_plane);
+        raster->tiles_x = (width + kTile - 1) / kTile;
+        raster->tiles_y = (height + kTile - 1) / kTile;
+        raster->splats.resize(count);
+        project_dispatched({means, quats, scales, opacities, colors, screen_offsets, count}, *raster, radii, threads);
+        bin(*raster);
+        rasterize_dispatched(*raster, background, image, alpha, threads);
+        return raster.release();
+    } catch (const std::bad_alloc&) {
+        return nullptr;
+    }
 }
 
-void sgs_raster_backward(
+int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,
     const float* opacities, const float* colors, const float* background, const float* image, const float* alpha,
     const float* grad_image, const float* grad_alpha, float* grad_means, float* grad_quats, float* grad_scales,
     float* grad_opacities, float* grad_colors, float* grad_screen_offsets, int threads) {
     const Raster& raster = *static_cast<const Raster*>(state);
-    std::vector<float> moments(raster.pairs.size() * kMomentCount, 0.0f);
+    std::vector<float> moments;
+    try {
+        moments.resize(raster.pairs.size() * kMomentCount, 0.0f);
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
     rasterize_backward_dispatched(raster, background, image, alpha, grad_image, grad_alpha, moments.data(), threads);
     project_backward_dispatched(
         {means, quats, scales, opacities, colors, nullptr, count}, raster, moments.data(),
         {grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_screen_offsets}, threads);
+    return 0;
 }
 
 void sgs_raster_free(void* state) { delete static_cast<Raster*>(state); }

@@ -16,6 +16,7 @@ namespace SGS_ISA {
 namespace {
 
 constexpr float kLog2E = 1.44269504f;
+constexpr float kBoxSlack = 0.01f;  // pixels
 
 void rotation(const float* q, float* r) {
     const float s = 1.0f / std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
@@ -57,7 +58,8 @@ Footprint footprint(const Pinhole& c, const float* mean, const float* quat, cons
 
 bool finite(const GaussianInputs& in, int64_t i) {
     float sum = in.opacities[i];
-    for (int j = 0; j < 3; ++j) sum += in.means[3 * i + j] * 0.0f + in.scales[3 * i + j] * 0.0f;
+    for (int j = 0; j < 3; ++j)
+        sum += in.means[3 * i + j] * 0.0f + in.scales[3 * i + j] * 0.0f + in.colors[3 * i + j] * 0.0f;
     for (int j = 0; j < 4; ++j) sum += in.quats[4 * i + j] * 0.0f;
     return std::isfinite(sum);
 }
@@ -83,22 +85,24 @@ void project(const GaussianInputs& in, Raster& raster, float* radii, int threads
         s.x = c.fx * f.point[0] / f.point[2] + c.cx, s.y = c.fy * f.point[1] / f.point[2] + c.cy;
         if (in.screen_offsets) s.x += in.screen_offsets[2 * i], s.y += in.screen_offsets[2 * i + 1];
         // The exact box of alpha = 1/255: it shrinks with the opacity.
-        const float reach = 2.0f * std::log(255.0f * opacity);
+        const float log2_opacity = std::log2(opacity);
+        const float reach = std::max(0.0f, log2_opacity - kLog2MinAlpha) * (2.0f / kLog2E);
         const float half_x = std::sqrt(reach * xx), half_y = std::sqrt(reach * yy);
         if (!(half_x < 1e7f && half_y < 1e7f && std::fabs(s.x) < 1e7f && std::fabs(s.y) < 1e7f)) continue;
         if (s.x + half_x <= 0.0f || s.y + half_y <= 0.0f || s.x - half_x >= c.width || s.y - half_y >= c.height) continue;
-        const int x0 = std::max(0, static_cast<int>(std::floor(s.x - half_x - 0.5f)));
-        const int y0 = std::max(0, static_cast<int>(std::floor(s.y - half_y - 0.5f)));
-        const int x1 = std::min(c.width, static_cast<int>(std::ceil(s.x + half_x + 0.5f)));
-        const int y1 = std::min(c.height, static_cast<int>(std::ceil(s.y + half_y + 0.5f)));
-        if (x0 >= x1 || y0 >= y1) continue;
+        // Pixels whose centre is in the box, with slack for roundings.
+        const int x0 = std::max(0, static_cast<int>(std::ceil(s.x - half_x - 0.5f - kBoxSlack)));
+        const int y0 = std::max(0, static_cast<int>(std::ceil(s.y - half_y - 0.5f - kBoxSlack)));
+        const int x1 = std::min(c.width, static_cast<int>(std::floor(s.x + half_x + 0.5f + kBoxSlack)));
+        const int y1 = std::min(c.height, static_cast<int>(std::floor(s.y + half_y + 0.5f + kBoxSlack)));
+        radii[i] = std::max(half_x, half_y);
+        if (x0 >= x1 || y0 >= y1) continue;  // between two pixel centres
         const float scale = 0.5f * kLog2E / determinant;
         s.xx = yy * scale, s.xy = -2.0f * xy * scale, s.yy = xx * scale;
-        s.log2_opacity = std::log2(opacity);
+        s.log2_opacity = log2_opacity;
         for (int j = 0; j < 3; ++j) s.color[j] = in.colors[3 * i + j];
         s.depth = f.point[2];
         s.box[0] = x0, s.box[1] = y0, s.box[2] = x1, s.box[3] = y1;
-        radii[i] = std::max(half_x, half_y);
     }
 }
 

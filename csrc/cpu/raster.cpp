@@ -8,12 +8,9 @@
 #include <algorithm>
 #include <cstring>
 
+#include "mask.h"
 #include "splat.h"
 #include "vec.h"
-
-#if defined(__AVX512F__) || defined(__AVX__) || defined(__SSE2__)
-#include <immintrin.h>
-#endif
 
 namespace structgstream {
 namespace SGS_ISA {
@@ -24,27 +21,20 @@ constexpr int kBlockY = kLanes / kBlockX;
 constexpr int kBlocksX = kTile / kBlockX;
 constexpr int kBlocksY = kTile / kBlockY;
 constexpr int kBlocks = kBlocksX * kBlocksY;
+constexpr int kAhead = 4;  // splats
 
-inline bool any(vi mask) {
-#if defined(__AVX512F__)
-    return _mm512_cmplt_epi32_mask((__m512i)mask, _mm512_setzero_si512()) != 0;
-#elif defined(__AVX__)
-    return _mm256_movemask_ps((__m256)mask) != 0;
-#elif defined(__SSE2__)
-    return _mm_movemask_ps((__m128)mask) != 0;
-#else
-    int32_t found = 0;
-    for (int i = 0; i < kLanes; ++i) found |= mask[i];
-    return found != 0;
-#endif
-}
-
-inline float sum(vf v) {
-    float parts[kLanes];
-    store(parts, v);
-    for (int width = kLanes / 2; width > 0; width /= 2)
-        for (int i = 0; i < width; ++i) parts[i] += parts[i + width];
-    return parts[0];
+// The sums over the lanes of each moment, for all of them at once where there are as many lanes.
+inline void store_sums(const vf (&m)[kMomentCount], float* out) {
+    constexpr int kGroups = (kMomentCount + kLanes - 1) / kLanes;
+    float sums[kGroups * kLanes];
+#pragma GCC unroll 4
+    for (int g = 0; g < kGroups; ++g) {
+        vf rows[kLanes];
+#pragma GCC unroll 16
+        for (int i = 0; i < kLanes; ++i) rows[i] = g * kLanes + i < kMomentCount ? m[g * kLanes + i] : splat(0.0f);
+        store(sums + g * kLanes, sums_of_lanes(rows));
+    }
+    std::memcpy(out, sums, sizeof(float) * kMomentCount);
 }
 
 // 2^x for x in [-8, 0.1]: the rounding splits off the integer, a polynomial fitted around zero does the rest.
@@ -83,18 +73,18 @@ struct Blocks {
 // transmittance with a minus sign.
 struct Coverage {
     vf dx, dy, alpha;
-    vi used, clamped, stopped;
+    mask used, clamped, stopped;
 
     bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T) {
         dx = lanes.x + (left - s.x), dy = lanes.y + (top - s.y);
         const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
-        used = (power >= kLog2MinAlpha) & (T > 0.0f);
+        used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(0.0f)));
         if (!any(used)) return false;
-        const vf raw = power_of_two(largest(power, splat(-8.0f)));
-        clamped = raw >= kMaxAlpha;
-        alpha = used ? smallest(raw, splat(kMaxAlpha)) : splat(0.0f);
-        stopped = used & (T * (1.0f - alpha) <= kMinTransmittance);
-        alpha = stopped ? splat(0.0f) : alpha;
+        const vf raw = power_of_two(power);
+        clamped = at_least(raw, splat(kMaxAlpha));
+        alpha = keep(used, choose(clamped, splat(kMaxAlpha), raw));
+        stopped = both(used, at_least(splat(kMinTransmittance), T * (1.0f - alpha)));
+        alpha = keep(without(used, stopped), alpha);
         return true;
     }
 };
@@ -141,6 +131,8 @@ void blend(const Raster& raster, int index, const float* background, float* imag
     bool done[kBlocks] = {};
     for (int n = raster.starts[index]; n < raster.starts[index + 1] && live > 0; ++n) {
         const Splat& s = raster.splats[raster.pairs[n]];
+        // Neighbours in depth are far apart in memory: ask early.
+        __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
         const Blocks blocks(s, tile.left, tile.top);
         for (int by = blocks.y0; by < blocks.y1; ++by)
             for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
@@ -151,9 +143,11 @@ void blend(const Raster& raster, int index, const float* background, float* imag
                 if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
                 const vf weight = c.alpha * before;
                 for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
-                const vf after = c.stopped ? -before : before * (1.0f - c.alpha);
+                const vf after = before * (1.0f - c.alpha);
                 store(T + at, after);
-                if (!any(after > 0.0f)) done[block] = true, --live;
+                if (!any(c.stopped)) continue;
+                store(T + at, choose(c.stopped, -before, after));
+                if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
             }
     }
     alignas(kAlignment) float coverage[1][kTilePixels];
@@ -194,6 +188,8 @@ void blend_backward(
     bool done[kBlocks] = {};
     for (int n = raster.starts[index]; n < raster.starts[index + 1] && live > 0; ++n) {
         const Splat& s = raster.splats[raster.pairs[n]];
+        // Neighbours in depth are far apart in memory: ask early.
+        __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
         const Blocks blocks(s, tile.left, tile.top);
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
@@ -211,20 +207,21 @@ void blend_backward(
                 const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(grad_coverage[0] + at);
                 const vf to_come = load(rest + at) - weight * q;
                 store(rest + at, to_come);
-                const vf slope = before * q - to_come / (1.0f - c.alpha);
-                const vi moves = c.used & ~c.clamped & ~c.stopped;  // a clamped alpha does not react
-                const vf d = moves ? slope * c.alpha : splat(0.0f);
+                const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
+                const vf d = keep(without(c.used, c.clamped), slope * c.alpha);  // a clamped alpha does not react
                 const vf dx = d * c.dx, dy = d * c.dy;
                 m[0] += d, m[1] += dx, m[2] += dy;
                 m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
                 m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
-                const vf after = c.stopped ? -before : before * (1.0f - c.alpha);
+                const vf after = before * (1.0f - c.alpha);
                 store(T + at, after);
-                if (!any(after > 0.0f)) done[block] = true, --live;
+                if (!any(c.stopped)) continue;
+                store(T + at, choose(c.stopped, -before, after));
+                if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
             }
         if (!hit) continue;
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
-        for (int j = 0; j < kMomentCount; ++j) out[j] = sum(m[j]);
+        store_sums(m, out);
     }
 }
 

@@ -16,15 +16,16 @@ int sgs_isa(void);           /* the one in use */
 int sgs_best_isa(void);      /* the widest that was compiled and that this processor has */
 int sgs_use_isa(int isa);    /* switch, for tests; returns the one in use afterwards */
 
-/* Rasteriser. Forward returns a state for backward; sgs_raster_free releases it.
+/* Rasteriser. Forward returns a state for backward, null where memory does not suffice; sgs_raster_free releases it.
  * means [N,3], quats [N,4] wxyz, scales [N,3], opacities [N], colors [N,3], viewmat [4,4] world to camera, K [3,3] pixels;
  * background [3] or null, screen_offsets [N,2] or null. Out: image [H,W,3], alpha [H,W], radii [N]. */
 void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* screen_offsets, float* image, float* alpha, float* radii, int threads);
-/* grad_image [H,W,3]; grad_alpha [H,W] or null. The gradients out are zero on entry. */
-void sgs_raster_backward(
+/* grad_image [H,W,3]; grad_alpha [H,W] or null. The gradients out are zero on entry. Returns 0, or 1 where memory does
+ * not suffice. */
+int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,
     const float* opacities, const float* colors, const float* background, const float* image, const float* alpha,
     const float* grad_image, const float* grad_alpha, float* grad_means, float* grad_quats, float* grad_scales,

@@ -6,14 +6,12 @@ The scene stays away from where the definition jumps: depths are far apart, and 
 decide which branch is taken, and the comparison would measure that instead of the kernel.
 """
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
 
 from structgstream.kernels import cpu_raster, cuda, reference_raster
-from structgstream.kernels._load import ISA_NAMES, native_library, native_reason
+from structgstream.kernels._load import native_reason
 from structgstream.kernels.reference_raster import rasterize as reference
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
@@ -116,16 +114,6 @@ def check_against_reference(rasterize, *, background: Tensor | None, device: str
         assert errors.quantile(0.95) < max(2e-4, 3 * autograd.quantile(0.95)), name
 
 
-@pytest.fixture(params=range(len(ISA_NAMES)), ids=ISA_NAMES)
-def isa(request: pytest.FixtureRequest) -> Iterator[int]:
-    library = native_library()
-    if request.param > library.sgs_best_isa():
-        pytest.skip(f"this processor or build has no {ISA_NAMES[request.param]}")
-    library.sgs_use_isa(request.param)
-    yield request.param
-    library.sgs_use_isa(len(ISA_NAMES))
-
-
 @native
 @pytest.mark.parametrize("background", [None, torch.tensor([0.3, 0.6, 0.1])], ids=["black", "coloured"])
 def test_cpu(isa: int, background: Tensor | None) -> None:
@@ -161,16 +149,17 @@ def test_nothing_to_draw(isa: int) -> None:
 
 @native
 def test_broken_and_hidden_gaussians_are_not_drawn(isa: int) -> None:
-    inputs = [v[:6].float().clone() for v in gaussians()]
+    inputs = [v[:7].float().clone() for v in gaussians()]
     inputs[0][0] = torch.nan
     inputs[0][1] = torch.tensor([0.0, 0.0, -5.0])
     inputs[1][2] = torch.inf
     inputs[2][3] = torch.tensor([1e9, 1e9, 1e9])
+    inputs[4][4, 1] = torch.nan
     image, _, gradients, radii = run(cpu_raster.rasterize, tuple(inputs))
-    assert radii[:4].tolist() == [0.0] * 4
+    assert radii[:5].tolist() == [0.0] * 5
     assert torch.isfinite(image).all()
-    assert all(torch.isfinite(g[4:]).all() for g in gradients)
-    assert all((g[:4] == 0).all() for g in gradients)
+    assert all(torch.isfinite(g[5:]).all() for g in gradients)
+    assert all((g[:5] == 0).all() for g in gradients)
 
 
 @native

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
@@ -20,7 +21,9 @@ def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
 class _State:
     """Owns what forward leaves for backward."""
 
-    def __init__(self, address: int) -> None:
+    def __init__(self, address: int | None) -> None:
+        if not address:
+            raise MemoryError("The rasteriser has no memory left; draw fewer or smaller Gaussians.")
         self.pointer = ctypes.c_void_p(address)
         weakref.finalize(self, native_library().sgs_raster_free, self.pointer)
 
@@ -43,7 +46,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         width, height = size
         count = means.shape[0]
-        image, alpha, radii = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(count)
+        image, alpha, radii = (means.new_empty(shape) for shape in ((height, width, 3), (height, width), (count,)))
         state = _State(
             native_library().sgs_raster_forward(
                 ctypes.c_int64(count),
@@ -63,20 +66,25 @@ class _Rasterize(torch.autograd.Function):
         return image, alpha, radii
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         grad_image, grad_alpha, _ = gradients
         means, quats, scales, opacities, colors, background, image, alpha = ctx.saved_tensors
         given = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         given_alpha = None if grad_alpha is None else grad_alpha.contiguous()
         results = [torch.zeros_like(tensor) for tensor in (means, quats, scales, opacities, colors)]
         offsets = means.new_zeros(means.shape[0], 2) if ctx.tracked else None
-        native_library().sgs_raster_backward(
+        failed = native_library().sgs_raster_backward(
             ctx.state.pointer,
             ctypes.c_int64(means.shape[0]),
             *(_pointer(t) for t in (means, quats, scales, opacities, colors, background, image, alpha)),
             *(_pointer(t) for t in (given, given_alpha, *results, offsets)),
             ctypes.c_int(torch.get_num_threads()),
         )
+        if failed:
+            raise MemoryError("The rasteriser has no memory left for gradients; draw fewer or smaller Gaussians.")
         return *results, offsets, None, None, None, None, None
 
 
@@ -101,11 +109,14 @@ def rasterize(
 
     Raises:
         BackendError: a tensor is not float32 on the CPU.
+        MemoryError: the lists of what each tile draws do not fit.
     """
     gaussians = (means, quats, scales, opacities, colors)
+    given = gaussians if screen_offsets is None else (*gaussians, screen_offsets)
     n = means.shape[0]
-    assert [tuple(t.shape) for t in gaussians] == [(n, 3), (n, 4), (n, 3), (n,), (n, 3)], [t.shape for t in gaussians]
-    for tensor in gaussians:
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, 2)]
+    assert [tuple(t.shape) for t in given] == shapes[: len(given)], [tuple(t.shape) for t in given]
+    for tensor in given:
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             raise BackendError(
                 f"The cpu back-end draws float32 tensors on the CPU, got {tensor.dtype} on {tensor.device}; "

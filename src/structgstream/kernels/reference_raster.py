@@ -52,6 +52,7 @@ def _project(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
+    colors: Tensor,
     viewmat: Tensor,
     K: Tensor,
     width: int,
@@ -60,7 +61,7 @@ def _project(
     screen_offsets: Tensor | None,
 ) -> _Projected:
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None]], dim=1)).all(1)
+    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None], colors], dim=1)).all(1)
     rows = ((points[:, 2] >= near) & (opacities >= MIN_ALPHA) & finite).nonzero()[:, 0]
     points = points[rows]
     x, y, z = points.unbind(1)
@@ -126,7 +127,7 @@ def rasterize(
         screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
             gradient, by the same contract on every back-end.
     """
-    projected = _project(means, quats, scales, opacities, viewmat, K, width, height, near, screen_offsets)
+    projected = _project(means, quats, scales, opacities, colors, viewmat, K, width, height, near, screen_offsets)
     radii = means.new_zeros(means.shape[0], dtype=torch.float32)
     radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
     back = means.new_zeros(3) if background is None else background

@@ -1,0 +1,64 @@
+// SPDX-License-Identifier: Apache-2.0
+// Comparisons that keep their result in the form the instruction set has for it: a mask register on AVX-512, whole
+// lanes of ones elsewhere.
+#pragma once
+
+#include "vec.h"
+
+#if defined(__AVX512F__) || defined(__AVX__) || defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace structgstream {
+namespace SGS_ISA {
+
+#if defined(__AVX512F__)
+
+typedef __mmask16 mask;
+inline mask at_least(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
+inline mask above(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
+inline mask both(mask a, mask b) { return a & b; }
+inline mask without(mask a, mask b) { return a & static_cast<mask>(~b); }
+inline bool any(mask m) { return m != 0; }
+inline vf choose(mask m, vf a, vf b) { return (vf)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
+inline vf keep(mask m, vf a) { return (vf)_mm512_maskz_mov_ps(m, (__m512)a); }
+
+#else
+
+typedef vi mask;
+inline mask at_least(vf a, vf b) { return a >= b; }
+inline mask above(vf a, vf b) { return a > b; }
+inline mask both(mask a, mask b) { return a & b; }
+inline mask without(mask a, mask b) { return a & ~b; }
+inline vf choose(mask m, vf a, vf b) { return (vf)(((vi)a & m) | ((vi)b & ~m)); }
+inline vf keep(mask m, vf a) { return (vf)((vi)a & m); }
+
+inline bool any(mask m) {
+#if defined(__AVX__)
+    return _mm256_movemask_ps((__m256)m) != 0;
+#elif defined(__SSE2__)
+    return _mm_movemask_ps((__m128)m) != 0;
+#else
+    int32_t found = 0;
+    for (int i = 0; i < kLanes; ++i) found |= m[i];
+    return found != 0;
+#endif
+}
+
+#endif
+
+// 1 / x to about one unit in the last place, for x that is neither tiny nor huge.
+inline vf reciprocal(vf x) {
+#if defined(__AVX512F__)
+    const vf guess = (vf)_mm512_maskz_rcp14_ps(0xffff, (__m512)x);
+    return guess * (2.0f - x * guess);
+#elif defined(__AVX__)
+    const vf guess = (vf)_mm256_rcp_ps((__m256)x);
+    return guess * (2.0f - x * guess);
+#else
+    return splat(1.0f) / x;
+#endif
+}
+
+}  // namespace SGS_ISA
+}  // namespace structgstream
