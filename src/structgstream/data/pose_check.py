@@ -119,8 +119,8 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
             "pixels of these pictures, and each camera's own pictures, in sync: check these."
         )
     raise CalibrationError(
-        f"{check.share_violating:.0%} of {check.matches} good matches between neighbouring cameras violate the "
-        "epipolar geometry of the given poses (median distance "
+        f"{check.share_violating:.0%} of {check.matches} good matches between neighbouring cameras violate "
+        "the epipolar geometry of the given poses (median distance "
         f"{check.median_epipolar_error_pixels:.1f} pixels). {advice}"
     )
 
