@@ -19,8 +19,8 @@ from structgstream.data.matching import Floats, back_project, inside, load_cv2, 
 
 FloatImage = NDArray[np.float32]
 
-# Larger than any sum of grey values in a window, so that a window touching a place outside the picture shows.
-_OUTSIDE = -1e3
+# Far below any grey value, so that a pixel blended with the least bit of what is outside the picture shows.
+_OUTSIDE = -1e6
 
 
 @dataclass(frozen=True)
@@ -329,6 +329,9 @@ def _correlation(reference: SweepView, other: SweepView, plane: Floats, config: 
         borderValue=(_OUTSIDE,),
     )
     warped[~facing] = _OUTSIDE
+    seen = warped >= 0
+    # Out of the sums before any is formed: they run in single precision.
+    warped[~seen] = 0
     window = (config.window, config.window)
 
     def mean(image: FloatImage) -> FloatImage:
@@ -336,12 +339,10 @@ def _correlation(reference: SweepView, other: SweepView, plane: Floats, config: 
 
     grey, noise = reference.grey, config.noise**2
     mean_own, mean_other = mean(grey), mean(warped)
-    outside = mean_other < 0
-    warped[warped < 0] = 0
     covariance = mean(grey * warped) - mean_own * mean_other
     variances = (mean(grey * grey) - mean_own**2 + noise) * (mean(warped * warped) - mean_other**2 + noise)
     score = covariance / np.sqrt(np.maximum(variances, noise**2))
-    score[outside] = -1
+    score[cv2.erode(seen.astype(np.uint8), np.ones(window, np.uint8)) == 0] = -1
     return score.astype(np.float32, copy=False)
 
 
