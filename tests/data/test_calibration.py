@@ -3,8 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import small_rig
 
+from captures import small_rig
 from structgstream.cameras import Camera
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
 from structgstream.errors import CalibrationError, CaptureError

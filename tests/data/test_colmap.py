@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import quaternion, small_rig, write_text_model
 
+from captures import quaternion, small_rig, write_text_model
 from structgstream.data.colmap import find_model, read_model
 from structgstream.errors import CalibrationError
 

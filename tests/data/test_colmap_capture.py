@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
 
+from captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
 from structgstream.data.colmap_capture import open_colmap
 from structgstream.errors import CalibrationError, CaptureError
 

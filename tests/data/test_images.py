@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from captures import all_numbers, picture, small_rig, write_picture
 
+from captures import all_numbers, picture, small_rig, write_picture
 from structgstream.data.images import ImageSource, common_pictures
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from captures import all_numbers, picture, write_clip, write_shared_intrinsics, write_video
 
+from captures import all_numbers, picture, write_clip, write_shared_intrinsics, write_video
 from structgstream.data.json_videos import open_json_videos
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.similarity import rig_radius

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from captures import all_numbers, write_n3dv
 
+from captures import all_numbers, write_n3dv
 from structgstream.data.n3dv import open_n3dv
 from structgstream.errors import CalibrationError
 

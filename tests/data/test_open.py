@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 from captures import (
     all_numbers,
     picture,
@@ -16,7 +17,6 @@ from captures import (
     write_shared_intrinsics,
     write_text_model,
 )
-
 from structgstream.cameras import CameraRig
 from structgstream.data.open import LAYOUTS, open_capture
 from structgstream.errors import CalibrationError, CaptureError, ConfigError

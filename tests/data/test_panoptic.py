@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from captures import all_numbers, write_panoptic
 
+from captures import all_numbers, write_panoptic
 from structgstream.data.panoptic import PANOPTIC_FPS, TEST, TRAIN, open_panoptic
 from structgstream.errors import CalibrationError, CaptureError
 

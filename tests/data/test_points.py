@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pytest
 
+from planes import distance_to_surface, room_frame, room_rig
 from structgstream.data.clip import bundled_clip
 from structgstream.data.points import InitialPoints, PointsConfig, initial_points
 from structgstream.frames import MultiViewFrame
@@ -79,3 +80,37 @@ def test_pictures_without_texture_give_random_points_and_say_so(caplog: pytest.L
     other = initial_points(MultiViewFrame(0, 0.0, blank), clip.rig, config=config, seed=4)
     assert np.array_equal(points.positions, again.positions)
     assert not np.array_equal(points.positions, other.positions)
+
+
+def room_points(*, seed: int = 0, max_points: int = 60_000, sweep: bool = True) -> InitialPoints:
+    rig = room_rig()
+    frame = room_frame(rig)
+    guarded = MultiViewFrame(0, 0.0, Guarded(frame.images, rig.held_out))
+    levels = PointsConfig().sweep_levels if sweep else ()
+    return initial_points(guarded, rig, config=PointsConfig(max_points=max_points, sweep_levels=levels), seed=seed)
+
+
+def test_points_lie_on_the_surfaces_of_a_room_of_planes() -> None:
+    points = room_points()
+    off = distance_to_surface(points.positions)
+    assert len(off) > 5_000
+    assert np.median(off) < 0.01
+    assert (off < 0.05).mean() > 0.9
+
+
+def test_keypoints_alone_are_few_and_precise() -> None:
+    points = room_points(sweep=False)
+    assert points.counts["sweep"] == 0
+    assert points.counts["sift"] == len(points.positions) > 300
+    off = distance_to_surface(points.positions)
+    assert np.median(off) < 0.01
+    assert (off < 0.1).mean() > 0.97
+
+
+def test_points_are_the_same_again_and_thinned_to_the_bound() -> None:
+    points, again, few = room_points(), room_points(seed=1), room_points(max_points=2_000)
+    assert np.array_equal(points.positions, again.positions)  # The seed only matters to random points.
+    assert np.array_equal(points.colors, again.colors)
+    assert 1_500 < len(few.positions) <= 2_000
+    # Thinned by cells: the few still reach as far as the many.
+    assert np.ptp(few.positions, axis=0) == pytest.approx(np.ptp(points.positions, axis=0), rel=0.1)

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from planes import room_frame, room_rig
 from structgstream.cameras import CameraRig
 from structgstream.data.clip import bundled_clip
 from structgstream.data.pose_check import check_poses
@@ -24,13 +26,62 @@ def test_right_poses_pass_with_room_to_spare(clip_frame: MultiViewFrame) -> None
     assert check.median_epipolar_error_pixels < 0.7
 
 
+def changed(rig: CameraRig, change: Callable[[torch.Tensor], torch.Tensor]) -> CameraRig:
+    return rig.mapped({name: replace(rig[name], viewmat=change(rig[name].viewmat)) for name in rig})
+
+
 def inverted(rig: CameraRig) -> CameraRig:
-    return rig.mapped({name: replace(rig[name], viewmat=torch.linalg.inv(rig[name].viewmat)) for name in rig})
+    return changed(rig, torch.linalg.inv)
 
 
 def test_camera_to_world_given_as_world_to_camera_is_named(clip_frame: MultiViewFrame) -> None:
     with pytest.raises(CalibrationError, match="camera-to-world matrices given as world-to-camera"):
         check_poses(clip_frame, inverted(bundled_clip().rig))
+
+
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def test_opengl_axes_are_named(clip_frame: MultiViewFrame) -> None:
+    with pytest.raises(CalibrationError, match="look like OpenGL axes"):
+        check_poses(clip_frame, changed(bundled_clip().rig, lambda viewmat: FLIP @ viewmat))
+
+
+def test_camera_to_world_with_opengl_axes_is_named(clip_frame: MultiViewFrame) -> None:
+    with pytest.raises(CalibrationError, match="camera-to-world matrices with OpenGL axes"):
+        check_poses(clip_frame, changed(bundled_clip().rig, lambda viewmat: torch.linalg.inv(viewmat) @ FLIP))
+
+
+def test_pictures_of_the_wrong_cameras_are_refused_without_a_wrong_guess(clip_frame: MultiViewFrame) -> None:
+    rig = bundled_clip().rig
+    names = list(rig)
+    mixed = {name: clip_frame.images[names[(i * 3 + 1) % len(names)]] for i, name in enumerate(names)}
+    with pytest.raises(CalibrationError, match="each camera's own pictures"):
+        check_poses(MultiViewFrame(0, 0.0, mixed), rig)
+
+
+def test_inverted_poses_of_a_flat_array_look_backwards() -> None:
+    """Cameras that differ in position only keep their epipolar lines when inverted; what they see lies behind."""
+    room = room_rig()
+    camera = room["cam02"]
+    moved = {}
+    for index in range(5):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, 3] = torch.tensor([0.3 * index - 0.6, 0.1 * (index % 2), 2.0])
+        moved[f"cam{index}"] = replace(camera, viewmat=viewmat)
+    rig = CameraRig(moved)
+    frame = room_frame(rig)
+    assert check_poses(frame, rig).share_violating < 0.1
+    with pytest.raises(CalibrationError, match="camera-to-world matrices given as world-to-camera"):
+        check_poses(frame, inverted(rig))
+
+
+def test_held_out_pictures_stay_unread(clip_frame: MultiViewFrame) -> None:
+    rig = bundled_clip().rig
+    training = {name: clip_frame.images[name] for name in rig.training}  # A held-out name would be a KeyError.
+    check_poses(MultiViewFrame(0, 0.0, training), rig)
+    with pytest.raises(CalibrationError):
+        check_poses(MultiViewFrame(0, 0.0, training), inverted(rig))
 
 
 def test_too_little_to_judge_by_refuses_nothing() -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
 
+from captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
 from structgstream.data.video import VideoSource, measured_fps, scan_videos, synchronised
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from captures import all_numbers, numbers, write_clip, write_panoptic
 
+from captures import all_numbers, numbers, write_clip, write_panoptic
 from structgstream.data.json_videos import open_json_videos
 from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
