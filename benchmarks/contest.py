@@ -1,82 +1,118 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks contestants against each other, times them in turns, and tells their ratios."""
 
-import os
-import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+Results = Sequence[Tensor | None]
+"""What is compared, quantity by quantity; None where a contestant does not compute one."""
+
 
 @dataclass(frozen=True)
 class Contestant:
-    """A name, what it runs, and how many threads it may use; ``run`` returns what is checked."""
+    """One way to do the work.
+
+    Args:
+        name: how tables call it.
+        run: does the work once and returns what is checked.
+        threads: how many it may use.
+        units: pieces of work in one run (iterations, say); seconds are told for one piece.
+        facts: other numbers about it, asked for once after timing (quality, shares of stages).
+    """
 
     name: str
-    run: Callable[[], list[Tensor]]
+    run: Callable[[], Results]
     threads: int
+    units: int = 1
+    facts: Callable[[], Mapping[str, float]] = dict
 
 
-def check(contestants: list[Contestant], *, tolerance: float) -> None:
-    """Every result is close to the first contestant's: the median relative error stays under ``tolerance``.
+@dataclass(frozen=True)
+class Quantity:
+    """What is compared before timing, in the order in which contestants return it.
+
+    ``median`` is the median over elements of the relative error, ``norm`` the norm of the difference over the norm,
+    ``largest`` the largest absolute difference. The median suits results in which a coin toss of rounding (two splats
+    of one depth) changes a few elements a lot.
+    """
+
+    name: str
+    tolerance: float
+    measure: Literal["median", "norm", "largest"] = "norm"
+
+    def error(self, ours: Tensor, theirs: Tensor) -> float:
+        """How far ``ours`` is from ``theirs``; infinite when their shapes differ."""
+        if ours.shape != theirs.shape:
+            return float("inf")
+        if ours.numel() == 0:
+            return 0.0
+        a, b = ours.detach().double(), theirs.detach().double()
+        if self.measure == "largest":
+            return float((a - b).abs().max())
+        if self.measure == "median":
+            return float(((a - b).abs() / (b.abs() + 1e-6)).median())
+        return float((a - b).norm() / b.norm().clamp_min(1e-30))
+
+
+def check(
+    contestants: Sequence[Contestant], quantities: Sequence[Quantity], *, oracle: Results | None = None
+) -> dict[str, dict[str, float]]:
+    """Errors of every contestant against the oracle or, without one, the first contestant; each runs once.
 
     Raises:
-        SystemExit: one is not, and nothing is timed.
+        SystemExit: one exceeds its tolerance, and nothing is timed.
     """
-    truth = contestants[0].run()
-    for contestant in contestants[1:]:
+    truth, against = oracle, "the oracle"
+    errors: dict[str, dict[str, float]] = {}
+    for contestant in contestants:
         torch.set_num_threads(contestant.threads)
-        for ours, theirs in zip(contestant.run(), truth, strict=True):
-            error = ((ours.double() - theirs.double()).abs() / (theirs.double().abs() + 1e-6)).median().item()
-            if not error < tolerance:
-                raise SystemExit(f"{contestant.name} differs from {contestants[0].name}: median error {error:.2g}.")
+        results = contestant.run()
+        if truth is None:
+            truth, against = results, contestant.name
+            continue
+        found: dict[str, float] = {}
+        for quantity, ours, theirs in zip(quantities, results, truth, strict=True):
+            if ours is None or theirs is None:
+                continue
+            found[quantity.name] = error = quantity.error(ours, theirs)
+            if not error <= quantity.tolerance:
+                raise SystemExit(
+                    f"{contestant.name} differs from {against} in {quantity.name}: {quantity.measure} error "
+                    f"{error:.2g}, allowed {quantity.tolerance:.2g}. Nothing was timed."
+                )
+        errors[contestant.name] = found
+    return errors
 
 
-def timed(contestants: list[Contestant], *, repeats: int) -> dict[str, dict[str, float]]:
-    """Minimum, median and maximum seconds of each, the runs of all taking turns."""
+def timed(contestants: Sequence[Contestant], *, repeats: int) -> dict[str, list[float]]:
+    """Seconds for one piece of work of each contestant, one value a round.
+
+    The runs of a round take turns and every round starts with another contestant, so that load from outside meets all.
+    """
     seconds: dict[str, list[float]] = {contestant.name: [] for contestant in contestants}
-    for _ in range(repeats):
-        for contestant in contestants:
+    for round_number in range(repeats):
+        first = round_number % len(contestants)
+        for contestant in (*contestants[first:], *contestants[:first]):
             torch.set_num_threads(contestant.threads)
             started = time.perf_counter()
             contestant.run()
-            seconds[contestant.name].append(time.perf_counter() - started)
-    return {
-        name: {"min": min(values), "median": statistics.median(values), "max": max(values)}
-        for name, values in seconds.items()
-    }
+            seconds[contestant.name].append((time.perf_counter() - started) / contestant.units)
+    return seconds
 
 
-def ratios(times: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    """How many times faster each is than the first: of medians, and the least and most that the spread allows."""
-    slow = times[next(iter(times))]
-    return {
-        name: {
-            "median": slow["median"] / fast["median"],
-            "least": slow["min"] / fast["max"],
-            "most": slow["max"] / fast["min"],
-        }
-        for name, fast in list(times.items())[1:]
-    }
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, least and most."""
+    return {"median": statistics.median(values), "least": min(values), "most": max(values)}
 
 
-def environment() -> dict[str, Any]:
-    """The machine, for whoever reads the numbers later."""
-    from structgstream.kernels._load import instruction_set
-
-    model = platform.processor()
-    if os.path.exists("/proc/cpuinfo"):
-        with open("/proc/cpuinfo") as file:
-            model = next((line.split(":", 1)[1].strip() for line in file if line.startswith("model name")), model)
-    return {
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "instruction_set": instruction_set(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
+def ratios(seconds: Mapping[str, Sequence[float]]) -> dict[str, dict[str, float]]:
+    """How many times faster each contestant is than the first: spread of the ratios within each round."""
+    names = list(seconds)
+    slow = seconds[names[0]]
+    return {name: spread([s / f for s, f in zip(slow, seconds[name], strict=True)]) for name in names[1:]}

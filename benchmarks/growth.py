@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How seconds grow with size: sizes that double, the slope on log-log axes, a plot of each curve."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.benchmark import Benchmark, Growth
+from benchmarks.contest import check, spread, timed
+
+
+def slope(sizes: Sequence[float], seconds: Sequence[float]) -> float:
+    """Least-squares slope of log seconds over log size: 1 is linear, 0 does not depend on the size."""
+    x = [math.log(size) for size in sizes]
+    y = [math.log(value) for value in seconds]
+    middle_x, middle_y = sum(x) / len(x), sum(y) / len(y)
+    spread_x = sum((a - middle_x) ** 2 for a in x)
+    return sum((a - middle_x) * (b - middle_y) for a, b in zip(x, y, strict=True)) / spread_x
+
+
+def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: int) -> dict[str, Any]:
+    """One curve, every size checked before it is timed, as plain JSON values."""
+    sizes = growth.quick if quick else growth.full
+    curves: dict[str, list[dict[str, Any]]] = {}
+    for size, arguments in sizes.items():
+        entries = (growth.contestants or benchmark.contestants)(**arguments)
+        check(entries, benchmark.quantities, oracle=benchmark.oracle(**arguments) if benchmark.oracle else None)
+        seconds = timed(entries, repeats=repeats)
+        for entry in entries:
+            point = {"size": size, "seconds": spread(seconds[entry.name]), "facts": dict(entry.facts())}
+            curves.setdefault(entry.name, []).append(point)
+    return {
+        "axis": growth.axis,
+        "curves": curves,
+        "slopes": {
+            name: slope([point["size"] for point in points], [point["seconds"]["median"] for point in points])
+            for name, points in curves.items()
+        },
+    }
+
+
+def plot(title: str, found: Mapping[str, Any], path: Path) -> None:
+    """Draw one curve of :func:`run_growth` with its spread, log-log, the slope in the legend."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(6.0, 4.0))
+    for name, points in found["curves"].items():
+        sizes = [point["size"] for point in points]
+        median = [1e3 * point["seconds"]["median"] for point in points]
+        below = [1e3 * (point["seconds"]["median"] - point["seconds"]["least"]) for point in points]
+        above = [1e3 * (point["seconds"]["most"] - point["seconds"]["median"]) for point in points]
+        axes.errorbar(
+            sizes,
+            median,
+            yerr=[below, above],
+            marker="o",
+            capsize=3,
+            label=f"{name}: slope {found['slopes'][name]:.2f}",
+        )
+    axes.set(xscale="log", yscale="log", xlabel=found["axis"], ylabel="milliseconds", title=title)
+    axes.grid(visible=True, which="both", alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A wall of textured anchors, of which a rectangle moves between two frames; the pictures are its own renderings.
+
+The true scene of both frames is known, so a fit can be started from frame 0 exactly and be judged on frame 1 at a
+camera that training does not see. The wall's size is fixed: more anchors are a finer texture, not a larger picture.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.backend import Backend
+from structgstream.scene.anchors import AnchorCloud
+from structgstream.scene.color import CameraColor
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.render import render
+from structgstream.scene.scene import Scene
+
+WALL_WIDTH, WALL_HEIGHT = 2.8, 2.1
+DISTANCE = 2.4
+OFFSETS_PER_ANCHOR = 5
+FEATURES = 32
+HIDDEN = 32
+HELD_OUT = "held_out"
+
+
+@dataclass(frozen=True)
+class World:
+    """Two instants of one wall.
+
+    Args:
+        rig: the cameras, one of them held out; in normalised units.
+        before: the true scene of frame 0.
+        frame: the pictures of frame 1, in which part of the wall has moved.
+    """
+
+    rig: CameraRig
+    before: Scene
+    frame: MultiViewFrame
+
+
+def wall_scene(anchors: int, *, cameras: int, seed: int = 0) -> Scene:
+    """``anchors`` anchors on a slightly wavy wall at z = 0; about half of their Gaussians are drawn."""
+    g = torch.Generator().manual_seed(seed)
+    columns = max(1, round((anchors * WALL_WIDTH / WALL_HEIGHT) ** 0.5))
+    spacing = WALL_WIDTH / columns
+    index = torch.arange(anchors)
+    rows = (anchors + columns - 1) // columns
+    x = (index % columns + torch.rand(anchors, generator=g)) * spacing - WALL_WIDTH / 2
+    y = (index // columns + torch.rand(anchors, generator=g)) * (WALL_HEIGHT / rows) - WALL_HEIGHT / 2
+    z = 0.1 * torch.sin(4.0 * x) * torch.cos(3.0 * y) + 0.02 * torch.rand(anchors, generator=g)
+    # Features mix waves of the place with noise, so that the texture has coarse and fine detail.
+    waves = torch.randn(2, FEATURES, generator=g) * 4.0
+    features = torch.sin(torch.stack([x, y], dim=1) @ waves) + 0.7 * torch.randn(anchors, FEATURES, generator=g)
+    log_spacing = float(np.log(spacing))
+    return Scene(
+        anchors=AnchorCloud(
+            positions=torch.stack([x, y, z], dim=1),
+            log_offset_scales=torch.full((anchors, 3), log_spacing),
+            log_base_scales=torch.full((anchors, 3), log_spacing) + 0.2 * torch.randn(anchors, 3, generator=g),
+            offsets=0.5 * torch.randn(anchors, OFFSETS_PER_ANCHOR, 3, generator=g),
+            features=features,
+        ),
+        mlps=MLPWeights(*(_head(width * OFFSETS_PER_ANCHOR, g) for width in (1, 3, 7))),
+        free=FreeGaussians.empty(),
+        camera_color=CameraColor.identity(cameras),
+        distance_input=True,
+    )
+
+
+def _head(outputs: int, g: torch.Generator) -> HeadWeights:
+    return HeadWeights(
+        torch.randn(HIDDEN, FEATURES + 4, generator=g) * 0.25,
+        torch.randn(HIDDEN, generator=g) * 0.1,
+        torch.randn(outputs, HIDDEN, generator=g) * 0.25,
+        torch.randn(outputs, generator=g) * 0.1,
+    )
+
+
+def wall_rig(cameras: int, *, width: int, height: int) -> CameraRig:
+    """``cameras`` training cameras on an arc before the wall and one held-out camera between them."""
+    names = {f"cam{i:02d}": 2.0 * i / max(cameras - 1, 1) - 1.0 for i in range(cameras)} | {HELD_OUT: 0.1}
+    found = {}
+    for i, (name, place) in enumerate(names.items()):
+        angle = torch.tensor(0.42 * place, dtype=torch.float64)
+        up = torch.tensor(0.0 if name == HELD_OUT else 0.15 * (i % 3 - 1), dtype=torch.float64)
+        eye = torch.stack([DISTANCE * angle.sin(), up, -DISTANCE * angle.cos()])
+        focal = 0.83 * width
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+        found[name] = Camera(_looking_at_the_middle(eye), K, width, height, near=0.1)
+    return CameraRig(found, held_out=frozenset({HELD_OUT}))
+
+
+def _looking_at_the_middle(eye: Tensor) -> Tensor:
+    z = torch.nn.functional.normalize(-eye, dim=0)
+    x = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=z.dtype), z), dim=0)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.stack([x, torch.linalg.cross(z, x), z])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return viewmat
+
+
+def moved(scene: Scene, *, share: float, shift: tuple[float, float, float]) -> Scene:
+    """The wall after a rectangle in its middle, ``share`` (0 to 1) of its area, has shifted."""
+    positions = scene.anchors.positions
+    inside = (positions[:, 0].abs() <= share**0.5 * WALL_WIDTH / 2) & (
+        positions[:, 1].abs() <= share**0.5 * WALL_HEIGHT / 2
+    )
+    shifted = positions + inside[:, None] * torch.tensor(shift)
+    return replace(scene, anchors=replace(scene.anchors, positions=shifted))
+
+
+def picture(scene: Scene, camera: Camera, backend: Backend) -> NDArray[np.uint8]:
+    """What ``camera`` records, ``[H, W, 3]`` uint8."""
+    image = render(scene, camera, backend).image
+    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+
+
+def wall_world(
+    backend: Backend,
+    *,
+    anchors: int,
+    width: int,
+    height: int,
+    cameras: int,
+    share: float = 1.0,
+    shift: tuple[float, float, float] = (0.012, 0.006, 0.0),
+    seed: int = 0,
+) -> World:
+    """The wall before and the pictures after ``share`` of its area has moved by ``shift`` scene units."""
+    rig = wall_rig(cameras, width=width, height=height)
+    before = wall_scene(anchors, cameras=cameras, seed=seed)
+    after = moved(before, share=share, shift=shift)
+    images = {name: picture(after, rig[name], backend) for name in rig}
+    return World(rig, before, MultiViewFrame(1, 1.0 / 30.0, images))
+
+
+def held_out_psnr(scene: Scene, world: World, backend: Backend) -> float:
+    """PSNR of ``scene`` against frame 1 at the held-out camera, dB."""
+    shown = picture(scene, world.rig[HELD_OUT], backend).astype(np.float64)
+    error = np.mean((shown - world.frame.images[HELD_OUT]) ** 2) / 255.0**2
+    return float(-10.0 * np.log10(max(error, 1e-10)))
