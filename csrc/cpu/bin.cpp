@@ -60,10 +60,12 @@ void bin(Raster& raster) {
         const Splat& s = raster.splats[i];
         if (s.box[0] < s.box[2]) {
             const Tiles t = tiles_of(s);
-            total += (t.x1 - t.x0 + 1) * (t.y1 - t.y0 + 1);
-            if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 80 GB of gradients, anyway
             for (int y = t.y0; y <= t.y1; ++y)
-                for (int x = t.x0; x <= t.x1; ++x) ++raster.starts[y * raster.tiles_x + x + 1];
+                for (int x = t.x0; x <= t.x1; ++x) {
+                    const int tile = y * raster.tiles_x + x;
+                    if (raster.draws(tile)) ++total, ++raster.starts[tile + 1];
+                }
+            if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 80 GB of gradients, anyway
         }
         raster.slots[i + 1] = static_cast<int32_t>(total);
     }
@@ -82,7 +84,9 @@ void bin(Raster& raster) {
         int32_t slot = e.slot;
         for (int y = e.tiles.y0; y <= e.tiles.y1; ++y)
             for (int x = e.tiles.x0; x <= e.tiles.x1; ++x) {
-                const int32_t at = next[y * raster.tiles_x + x]++;
+                const int tile = y * raster.tiles_x + x;
+                if (!raster.draws(tile)) continue;
+                const int32_t at = next[tile]++;
                 raster.pairs[at] = e.splat;
                 raster.pair_slots[at] = slot++;
             }

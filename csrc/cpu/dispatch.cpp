@@ -8,7 +8,9 @@
 
 #include "bin.h"
 #include "splat.h"
+#include "ssim.h"
 #include "structgstream.h"
+#include "visible.h"
 
 // Every kernel source is compiled once for each instruction set into a namespace of this name (CMakeLists.txt).
 #define SGS_DECLARE(ISA)                                                                                              \
@@ -18,9 +20,9 @@
     void rasterize(const Raster&, const float*, float*, float*, int);                                                 \
     void rasterize_backward(                                                                                          \
         const Raster&, const float*, const float*, const float*, const float*, const float*, float*, int);            \
-    void l1_ssim(const float*, const float*, const uint8_t*, int, int, float*, double*, double*, int);                \
-    void l1_ssim_backward(                                                                                            \
-        const float*, const float*, const uint8_t*, const float*, int64_t, float, float, float*, int);                \
+    void l1_ssim(const Pictures&, const Part*, int, float*, int);                                                     \
+    void l1_ssim_backward(const Pictures&, const Part*, int, const float*, float, float, float*, int);                \
+    void anchors_visible(const sgs_anchors&, int64_t, const View&, const int32_t*, uint8_t*, int);                    \
     void anchors_select(const sgs_anchors&, sgs_selection&, int);                                                     \
     void anchors_dress(const sgs_anchors&, const sgs_selection&, const sgs_gaussians&, int);                          \
     void anchors_backward(                                                                                            \
@@ -94,6 +96,15 @@ void project_backward_dispatched(
     SGS_DISPATCH(project_backward(in, raster, moments, out, threads))
 }
 
+void l1_ssim_dispatched(const Pictures& pictures, const Part* parts, int count, float* gradient, int threads) {
+    SGS_DISPATCH(l1_ssim(pictures, parts, count, gradient, threads))
+}
+
+void anchors_visible_dispatched(
+    const sgs_anchors& anchors, int64_t count, const View& view, const int32_t* covered, uint8_t* visible, int threads) {
+    SGS_DISPATCH(anchors_visible(anchors, count, view, covered, visible, threads))
+}
+
 Pinhole pinhole(const float* viewmat, const float* K, int width, int height, float near_plane) {
     Pinhole c;
     std::copy_n(viewmat, 12, c.view);
@@ -125,12 +136,15 @@ int sgs_use_isa(int wanted) {
 void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* screen_offsets, float* image, float* alpha, float* radii, int threads) {
+    const float* background, const float* screen_offsets, const uint8_t* drawn_tiles, int64_t trained, float* image,
+    float* alpha, float* radii, int threads) {
     try {
         auto raster = std::make_unique<Raster>();
         raster->camera = pinhole(viewmat, K, width, height, near_plane);
         raster->tiles_x = (width + kTile - 1) / kTile;
         raster->tiles_y = (height + kTile - 1) / kTile;
+        if (drawn_tiles) raster->drawn_tiles.assign(drawn_tiles, drawn_tiles + raster->tiles_x * raster->tiles_y);
+        raster->trained = trained;
         raster->splats.resize(count);
         project_dispatched({means, quats, scales, opacities, colors, screen_offsets, count}, *raster, radii, threads);
         bin(*raster);
@@ -149,7 +163,7 @@ int sgs_raster_backward(
     const Raster& raster = *static_cast<const Raster*>(state);
     std::vector<float> moments;
     try {
-        moments.resize(raster.pairs.size() * kMomentCount, 0.0f);
+        moments.resize(static_cast<size_t>(raster.slots[raster.trained]) * kMomentCount, 0.0f);
     } catch (const std::bad_alloc&) {
         return 1;
     }
@@ -163,15 +177,53 @@ int sgs_raster_backward(
 void sgs_raster_free(void* state) { delete static_cast<Raster*>(state); }
 
 void sgs_l1_ssim(
-    const float* image, const float* target, const uint8_t* target_u8, int height, int width, float* gradient,
-    double* row_l1, double* row_ssim, int threads) {
-    SGS_DISPATCH(l1_ssim(image, target, target_u8, height, width, gradient, row_l1, row_ssim, threads))
+    const float* image, const float* target, const uint8_t* target_u8, int height, int width, const float* gains,
+    const float* biases, const uint8_t* tiles, float* gradient, double* row_l1, double* row_ssim, int threads) {
+    const Parts parts(height, width, tiles, threads);
+    std::fill_n(row_l1, height, 0.0);
+    std::fill_n(row_ssim, height, 0.0);
+    l1_ssim_dispatched(
+        {image, target, target_u8, gains, biases, height, width}, parts.data(), parts.count(), gradient, threads);
+    parts.add_to(row_l1, row_ssim);
 }
 
 void sgs_l1_ssim_backward(
-    const float* image, const float* target, const uint8_t* target_u8, const float* ssim_gradient, int64_t count,
-    float l1_scale, float ssim_scale, float* gradient, int threads) {
-    SGS_DISPATCH(l1_ssim_backward(image, target, target_u8, ssim_gradient, count, l1_scale, ssim_scale, gradient, threads))
+    const float* image, const float* target, const uint8_t* target_u8, int height, int width, const float* gains,
+    const float* biases, const uint8_t* tiles, const float* ssim_gradient, float l1_scale, float ssim_scale,
+    float* gradient, int threads) {
+    const Parts parts(height, width, tiles, threads);
+    const Pictures pictures{image, target, target_u8, gains, biases, height, width};
+    SGS_DISPATCH(l1_ssim_backward(
+        pictures, parts.data(), parts.count(), ssim_gradient, l1_scale, ssim_scale, gradient, threads))
+}
+
+int64_t sgs_anchors_visible(
+    const sgs_anchors* anchors, int64_t count, const float* viewmat, const float* K, int width, int height,
+    float near_plane, const uint8_t* tiles, int64_t* visible, int threads) {
+    View view;
+    std::copy_n(viewmat, 12, view.viewmat);
+    view.fx = K[0], view.fy = K[4], view.cx = K[2], view.cy = K[5], view.near = near_plane;
+    view.width = width, view.height = height;
+    view.tiles_x = (width + kTile - 1) / kTile, view.tiles_y = (height + kTile - 1) / kTile;
+    try {
+        std::vector<int32_t> covered;
+        if (tiles) {
+            const int row = view.tiles_x + 1;
+            covered.assign(static_cast<size_t>(row) * (view.tiles_y + 1), 0);
+            for (int y = 0; y < view.tiles_y; ++y)
+                for (int x = 0; x < view.tiles_x; ++x)
+                    covered[(y + 1) * row + x + 1] = covered[y * row + x + 1] + covered[(y + 1) * row + x] -
+                                                     covered[y * row + x] + (tiles[y * view.tiles_x + x] != 0);
+        }
+        std::vector<uint8_t> seen(count);
+        anchors_visible_dispatched(*anchors, count, view, tiles ? covered.data() : nullptr, seen.data(), threads);
+        int64_t found = 0;
+        for (int64_t i = 0; i < count; ++i)
+            if (seen[i]) visible[found++] = i;
+        return found;
+    } catch (const std::bad_alloc&) {
+        return -1;
+    }
 }
 
 void sgs_anchors_select(const sgs_anchors* anchors, sgs_selection* selection, int threads) {

@@ -64,6 +64,14 @@ bool finite(const GaussianInputs& in, int64_t i) {
     return std::isfinite(sum);
 }
 
+bool reaches_drawn_tile(const Raster& raster, int x0, int y0, int x1, int y1) {
+    if (raster.drawn_tiles.empty()) return true;
+    for (int y = y0 / kTile; y <= (y1 - 1) / kTile; ++y)
+        for (int x = x0 / kTile; x <= (x1 - 1) / kTile; ++x)
+            if (raster.draws(y * raster.tiles_x + x)) return true;
+    return false;
+}
+
 }  // namespace
 
 void project(const GaussianInputs& in, Raster& raster, float* radii, int threads) {
@@ -95,8 +103,10 @@ void project(const GaussianInputs& in, Raster& raster, float* radii, int threads
         const int y0 = std::max(0, static_cast<int>(std::ceil(s.y - half_y - 0.5f - kBoxSlack)));
         const int x1 = std::min(c.width, static_cast<int>(std::floor(s.x + half_x + 0.5f + kBoxSlack)));
         const int y1 = std::min(c.height, static_cast<int>(std::floor(s.y + half_y + 0.5f + kBoxSlack)));
+        const bool between_centres = x0 >= x1 || y0 >= y1;
+        if (!between_centres && !reaches_drawn_tile(raster, x0, y0, x1, y1)) continue;
         radii[i] = std::max(half_x, half_y);
-        if (x0 >= x1 || y0 >= y1) continue;  // between two pixel centres
+        if (between_centres) continue;
         const float scale = 0.5f * kLog2E / determinant;
         s.xx = yy * scale, s.xy = -2.0f * xy * scale, s.yy = xx * scale;
         s.log2_opacity = log2_opacity;
@@ -111,7 +121,7 @@ void project_backward(
     const GaussianInputs& in, const Raster& raster, const float* moments, const GaussianGradients& out, int threads) {
     const Pinhole& c = raster.camera;
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t i = 0; i < in.count; ++i) {
+    for (int64_t i = 0; i < raster.trained; ++i) {
         const Splat& s = raster.splats[i];
         if (s.box[0] >= s.box[2]) continue;
         float m[kMomentCount] = {};

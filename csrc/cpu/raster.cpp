@@ -191,6 +191,7 @@ void blend_backward(
         // Neighbours in depth are far apart in memory: ask early.
         __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
         const Blocks blocks(s, tile.left, tile.top);
+        const bool trained = raster.pairs[n] < raster.trained;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
@@ -207,19 +208,21 @@ void blend_backward(
                 const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(grad_coverage[0] + at);
                 const vf to_come = load(rest + at) - weight * q;
                 store(rest + at, to_come);
-                const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
-                const vf d = keep(without(c.used, c.clamped), slope * c.alpha);  // a clamped alpha does not react
-                const vf dx = d * c.dx, dy = d * c.dy;
-                m[0] += d, m[1] += dx, m[2] += dy;
-                m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
-                m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
+                if (trained) {
+                    const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
+                    const vf d = keep(without(c.used, c.clamped), slope * c.alpha);  // a clamped alpha does not react
+                    const vf dx = d * c.dx, dy = d * c.dy;
+                    m[0] += d, m[1] += dx, m[2] += dy;
+                    m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
+                    m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
+                }
                 const vf after = before * (1.0f - c.alpha);
                 store(T + at, after);
                 if (!any(c.stopped)) continue;
                 store(T + at, choose(c.stopped, -before, after));
                 if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
             }
-        if (!hit) continue;
+        if (!hit || !trained) continue;
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         store_sums(m, out);
     }
@@ -230,17 +233,18 @@ void blend_backward(
 void rasterize(const Raster& raster, const float* background, float* image, float* alpha, int threads) {
     const int tiles = raster.tiles_x * raster.tiles_y;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
-    for (int t = 0; t < tiles; ++t) blend(raster, t, background, image, alpha);
+    for (int t = 0; t < tiles; ++t)
+        if (raster.draws(t)) blend(raster, t, background, image, alpha);
 }
 
-// moments: kMomentCount numbers a pair, zero on entry.
+// moments: kMomentCount numbers for each pair of a trained splat, zero on entry.
 void rasterize_backward(
     const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
     const float* grad_alpha, float* moments, int threads) {
     const int tiles = raster.tiles_x * raster.tiles_y;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
     for (int t = 0; t < tiles; ++t)
-        blend_backward(raster, t, background, image, alpha, grad_image, grad_alpha, moments);
+        if (raster.draws(t)) blend_backward(raster, t, background, image, alpha, grad_image, grad_alpha, moments);
 }
 
 }  // namespace SGS_ISA

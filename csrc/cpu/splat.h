@@ -37,11 +37,16 @@ struct Splat {
 struct Raster {
     Pinhole camera;
     int tiles_x, tiles_y;
+    std::vector<uint8_t> drawn_tiles; // [tiles_y * tiles_x], 0 where nothing is drawn; empty: all are
+    int64_t trained;                  // splats from here on get no gradient
     std::vector<Splat> splats;        // [N]; box empty where not drawn
     std::vector<int32_t> starts;      // [tiles + 1] into pairs
     std::vector<int32_t> pairs;       // splat of each (tile, splat) pair, front to back within a tile
     std::vector<int32_t> slots;       // [N + 1] first pair slot of each splat, for the fixed order of sums
     std::vector<int32_t> pair_slots;  // slot of each pair
+
+    // Inlined always: a copy that instruction sets shared could hold instructions that a processor lacks.
+    [[gnu::always_inline]] bool draws(int tile) const { return drawn_tiles.empty() || drawn_tiles[tile] != 0; }
 };
 
 struct GaussianInputs {

@@ -1,17 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 // L1 and SSIM (Wang et al., 2004; 11 x 11 Gaussian window, sigma 1.5, zero padding) with the gradient of SSIM.
 //
-// The picture is cut into bands of rows, one a thread, and each band into strips of columns that fit the cache. A strip
+// The picture comes in parts (csrc/cpu/parts.cpp), and each part is cut into strips of columns that fit the cache. A strip
 // streams downwards: products of the two pictures are blurred across into a ring of rows, blurred down four rows at a
 // time into the moments, turned into SSIM and its three adjoint maps, and those take the same two blurs back to the
 // picture. Only the sum of the two second moments enters SSIM, so four blurs suffice instead of five. A pixel's value
-// does not depend on the cut into bands, and sums are taken row by row in a fixed order.
+// does not depend on the parts, and sums are taken row by row in a fixed order.
 
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
 
+#include "ssim.h"
 #include "vec.h"
 
 namespace structgstream {
@@ -33,16 +34,11 @@ constexpr double kSigma = 1.5;
 constexpr float kC1 = 0.01f * 0.01f;
 constexpr float kC2 = 0.03f * 0.03f;
 
-struct Picture {
-    const float* image;
-    const float* target;        // either this
-    const uint8_t* target_u8;   // or this
+struct Picture : Pictures {
     float* gradient;            // or null
     double* row_l1;
     double* row_ssim;
     float weights[kTaps];
-    int height;
-    int width;
 };
 
 // The buffers of one strip. Rows are `stride` floats, of which the first `kPad` and those after `used` stay zero.
@@ -53,6 +49,7 @@ struct Strip {
     int stride;
     int skip;     // floats before the first column of the strip itself
     int own;      // floats of the strip itself
+    float* gains;      // [count], and biases [count] behind
     float* sources;    // [kMoments][stride]
     float* moments;    // [kRing][kMoments][count]
     float* sources2;   // [kAdjoints][stride]
@@ -96,6 +93,8 @@ void take_row(const Picture& p, const Strip& s, int row, bool count_l1) {
     float* squares = y + s.stride;
     float* product = squares + s.stride;
     std::memcpy(x, p.image + at, sizeof(float) * s.used);
+    if (p.gains != nullptr)
+        for (int i = 0; i < s.used; ++i) x[i] = x[i] * s.gains[i] + s.gains[s.count + i];
     if (p.target != nullptr) {
         std::memcpy(y, p.target + at, sizeof(float) * s.used);
     } else {
@@ -201,23 +200,29 @@ void give_batch(const Picture& p, const Strip& s, int first, int end, float scal
         const float* product = square + s.count;
         const float* x = p.image + at;
         float* out = p.gradient + at;
+        const float* gain = s.gains + s.skip;
+        const float* bias = gain + s.count;
         if (p.target != nullptr) {
             const float* y = p.target + at;
-            for (int i = 0; i < s.own; ++i) out[i] = scale * (mean[i] + x[i] * square[i] + y[i] * product[i]);
+            for (int i = 0; i < s.own; ++i)
+                out[i] = scale * gain[i] * (mean[i] + (x[i] * gain[i] + bias[i]) * square[i] + y[i] * product[i]);
         } else {
             const uint8_t* y = p.target_u8 + at;
             for (int i = 0; i < s.own; ++i)
-                out[i] = scale * (mean[i] + x[i] * square[i] + static_cast<float>(y[i]) / 255.0f * product[i]);
+                out[i] = scale * gain[i] * (mean[i] + (x[i] * gain[i] + bias[i]) * square[i] +
+                                            static_cast<float>(y[i]) / 255.0f * product[i]);
         }
     }
 }
 
-void band(const Picture& p, int top, int bottom) {
-    const int strips = std::max(1, (p.width + kStripPixels - 1) / kStripPixels);
-    const int most = std::min(p.width, (p.width + strips - 1) / strips + 4 * kHalf) * kChannels;
+void band(const Picture& p, const Part& own) {
+    const int top = own.top, bottom = own.bottom, width = own.right - own.left;
+    const int strips = std::max(1, (width + kStripPixels - 1) / kStripPixels);
+    const int most = std::min(p.width, (width + strips - 1) / strips + 4 * kHalf) * kChannels;
     const int most_count = (most + kLanes - 1) / kLanes * kLanes;
     const int most_stride = most_count + 2 * kPad + kLanes;
     const size_t sizes[] = {
+        static_cast<size_t>(2) * most_count,
         static_cast<size_t>(kMoments) * most_stride,        static_cast<size_t>(kRing) * kMoments * most_count,
         static_cast<size_t>(kBatch) * kAdjoints * most_stride, static_cast<size_t>(kRing) * kAdjoints * most_count,
         static_cast<size_t>(kBatch) * most_count,           static_cast<size_t>(kBatch) * kAdjoints * most_count,
@@ -227,8 +232,8 @@ void band(const Picture& p, int top, int bottom) {
     const Buffer memory(total);
     const float scale = 1.0f / (static_cast<float>(p.height) * p.width * kChannels);
     for (int n = 0; n < strips; ++n) {
-        const int begin = static_cast<int>(static_cast<int64_t>(p.width) * n / strips);
-        const int end = static_cast<int>(static_cast<int64_t>(p.width) * (n + 1) / strips);
+        const int begin = own.left + static_cast<int>(static_cast<int64_t>(width) * n / strips);
+        const int end = own.left + static_cast<int>(static_cast<int64_t>(width) * (n + 1) / strips);
         Strip s;
         s.first = std::max(0, begin - 2 * kHalf);
         s.used = (std::min(p.width, end + 2 * kHalf) - s.first) * kChannels;
@@ -237,14 +242,19 @@ void band(const Picture& p, int top, int bottom) {
         s.skip = (begin - s.first) * kChannels;
         s.own = (end - begin) * kChannels;
         float* next = memory.get();
-        s.sources = next, next += sizes[0];
-        s.moments = next, next += sizes[1];
-        s.sources2 = next, next += sizes[2];
-        s.adjoints = next, next += sizes[3];
-        s.ssim = next, next += sizes[4];
+        s.gains = next, next += sizes[0];
+        s.sources = next, next += sizes[1];
+        s.moments = next, next += sizes[2];
+        s.sources2 = next, next += sizes[3];
+        s.adjoints = next, next += sizes[4];
+        s.ssim = next, next += sizes[5];
         float* scratch = next;
-        std::memset(s.sources, 0, sizeof(float) * sizes[0]);
-        std::memset(s.sources2, 0, sizeof(float) * sizes[2]);
+        std::memset(s.sources, 0, sizeof(float) * sizes[1]);
+        std::memset(s.sources2, 0, sizeof(float) * sizes[3]);
+        for (int i = 0; i < s.count; ++i) {
+            s.gains[i] = p.gains != nullptr ? p.gains[i % kChannels] : 1.0f;
+            s.gains[s.count + i] = p.gains != nullptr ? p.biases[i % kChannels] : 0.0f;
+        }
 
         const bool adjoint = p.gradient != nullptr;
         const int start = adjoint ? top - (kLead - kHalf) : top;  // the first batch of moments
@@ -264,36 +274,43 @@ void band(const Picture& p, int top, int bottom) {
 
 }  // namespace
 
-void l1_ssim(
-    const float* image, const float* target, const uint8_t* target_u8, int height, int width, float* gradient,
-    double* row_l1, double* row_ssim, int threads) {
-    Picture p{image, target, target_u8, gradient, row_l1, row_ssim, {}, height, width};
+// Sums of every row of every part, and the gradient of SSIM in the parts (or none).
+void l1_ssim(const Pictures& pictures, const Part* parts, int count, float* gradient, int threads) {
+    Picture p{pictures, gradient, nullptr, nullptr, {}};
     double weights[kTaps], total = 0.0;
     for (int k = 0; k < kTaps; ++k) {
         weights[k] = std::exp(-(k - kHalf) * (k - kHalf) / (2.0 * kSigma * kSigma));
         total += weights[k];
     }
     for (int k = 0; k < kTaps; ++k) p.weights[k] = static_cast<float>(weights[k] / total);
-    std::fill(row_l1, row_l1 + height, 0.0);
-    std::fill(row_ssim, row_ssim + height, 0.0);
-    const int bands = std::max(1, std::min(threads, height / kBatch));
-#pragma omp parallel for num_threads(bands) schedule(static, 1) if (bands > 1)
-    for (int n = 0; n < bands; ++n) {
-        const int top = static_cast<int>(static_cast<int64_t>(height) * n / bands);
-        const int bottom = static_cast<int>(static_cast<int64_t>(height) * (n + 1) / bands);
-        band(p, top, bottom);
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1 && count > 1)
+    for (int n = 0; n < count; ++n) {
+        Picture mine = p;
+        mine.row_l1 = parts[n].row_l1 - parts[n].top;
+        mine.row_ssim = parts[n].row_ssim - parts[n].top;
+        band(mine, parts[n]);
     }
 }
 
-// gradient = l1_scale * sign(image - target) + ssim_scale * ssim_gradient, over `count` numbers.
+// gradient = gain * l1_scale * sign(gain * image + bias - target) + ssim_scale * ssim_gradient, in the parts.
 void l1_ssim_backward(
-    const float* image, const float* target, const uint8_t* target_u8, const float* ssim_gradient, int64_t count,
-    float l1_scale, float ssim_scale, float* gradient, int threads) {
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1)
-    for (int64_t i = 0; i < count; ++i) {
-        const float y = target != nullptr ? target[i] : static_cast<float>(target_u8[i]) / 255.0f;
-        const float sign = static_cast<float>((image[i] > y) - (image[i] < y));
-        gradient[i] = l1_scale * sign + ssim_scale * ssim_gradient[i];
+    const Pictures& p, const Part* parts, int count, const float* ssim_gradient, float l1_scale, float ssim_scale,
+    float* gradient, int threads) {
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1 && count > 1)
+    for (int n = 0; n < count; ++n) {
+        const Part& part = parts[n];
+        for (int row = part.top; row < part.bottom; ++row) {
+            const size_t last = (static_cast<size_t>(row) * p.width + part.right) * kChannels;
+            for (size_t i = (static_cast<size_t>(row) * p.width + part.left) * kChannels; i < last; i += kChannels) {
+                for (int c = 0; c < kChannels; ++c) {
+                    const float y = p.target != nullptr ? p.target[i + c] : static_cast<float>(p.target_u8[i + c]) / 255.0f;
+                    const float gain = p.gains != nullptr ? p.gains[c] : 1.0f;
+                    const float x = p.gains != nullptr ? p.image[i + c] * gain + p.biases[c] : p.image[i + c];
+                    const float sign = static_cast<float>((x > y) - (x < y));
+                    gradient[i + c] = gain * l1_scale * sign + ssim_scale * ssim_gradient[i + c];
+                }
+            }
+        }
     }
 }
 

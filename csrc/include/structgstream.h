@@ -18,11 +18,14 @@ int sgs_use_isa(int isa);    /* switch, for tests; returns the one in use afterw
 
 /* Rasteriser. Forward returns a state for backward, null where memory does not suffice; sgs_raster_free releases it.
  * means [N,3], quats [N,4] wxyz, scales [N,3], opacities [N], colors [N,3], viewmat [4,4] world to camera, K [3,3] pixels;
- * background [3] or null, screen_offsets [N,2] or null. Out: image [H,W,3], alpha [H,W], radii [N]. */
+ * background [3] or null, screen_offsets [N,2] or null. drawn_tiles: one byte for each tile of 16 x 16 pixels, row by row,
+ * zero where nothing is to be drawn and the picture is left as it is; or null. Gaussians from `trained` on get no
+ * gradient. Out: image [H,W,3], alpha [H,W], radii [N]. */
 void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* screen_offsets, float* image, float* alpha, float* radii, int threads);
+    const float* background, const float* screen_offsets, const uint8_t* drawn_tiles, int64_t trained, float* image,
+    float* alpha, float* radii, int threads);
 /* grad_image [H,W,3]; grad_alpha [H,W] or null. The gradients out are zero on entry. Returns 0, or 1 where memory does
  * not suffice. */
 int sgs_raster_backward(
@@ -32,13 +35,28 @@ int sgs_raster_backward(
     float* grad_opacities, float* grad_colors, float* grad_screen_offsets, int threads);
 void sgs_raster_free(void* state);
 
-/* Loss. One of target (float) and target_u8 is null; gradient [H,W,3] of SSIM or null; row sums [H]. */
+/* Loss. One of target (float) and target_u8 is null. gains and biases [3], applied to the image first, or both null.
+ * tiles: a byte for each tile of 16 x 16 pixels, zero where the picture does not count (the image is read up to ten
+ * pixels around the others), or null. Out: row sums [H]; gradient [H,W,3] of SSIM, written where it counts, or null. */
 void sgs_l1_ssim(
-    const float* image, const float* target, const uint8_t* target_u8, int height, int width, float* gradient,
-    double* row_l1, double* row_ssim, int threads);
+    const float* image, const float* target, const uint8_t* target_u8, int height, int width, const float* gains,
+    const float* biases, const uint8_t* tiles, float* gradient, double* row_l1, double* row_ssim, int threads);
 void sgs_l1_ssim_backward(
-    const float* image, const float* target, const uint8_t* target_u8, const float* ssim_gradient, int64_t count,
-    float l1_scale, float ssim_scale, float* gradient, int threads);
+    const float* image, const float* target, const uint8_t* target_u8, int height, int width, const float* gains,
+    const float* biases, const uint8_t* tiles, const float* ssim_gradient, float l1_scale, float ssim_scale,
+    float* gradient, int threads);
+
+/* Pixels whose 3 x 3 mean absolute difference (of pictures [H,W,3]) exceeds `threshold` (in 0 ... 1), and those up to
+ * `reach` pixels from them: one byte each. Returns 0, or 1 where memory does not suffice. */
+int sgs_changed_pixels(
+    const uint8_t* before, const uint8_t* now, int height, int width, float threshold, int reach, uint8_t* changed,
+    int threads);
+
+/* Anchors (of `count`) that can put a Gaussian into the picture, or into its tiles that are not zero; ascending. Reads
+ * positions, scales and offsets. Returns their number, or -1 where memory does not suffice. */
+int64_t sgs_anchors_visible(
+    const struct sgs_anchors* anchors, int64_t count, const float* viewmat, const float* K, int width, int height,
+    float near_plane, const uint8_t* tiles, int64_t* visible, int threads);
 
 /* Structured Gaussians: select, then dress into arrays of selection->gaussian_count rows. */
 void sgs_anchors_select(const struct sgs_anchors* anchors, struct sgs_selection* selection, int threads);

@@ -9,6 +9,7 @@ from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.raster_types import tiles_of
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -194,3 +195,28 @@ def test_what_it_cannot_generate_from() -> None:
         generate(cpu_anchors, [value.double() for value in values], visible, True)
     with pytest.raises(BackendError, match=r"expected \(32, 35\)"):
         generate(cpu_anchors, values, visible, False)
+
+
+@pytest.mark.parametrize("tiled", [False, True])
+def test_culling(isa: int, tiled: bool) -> None:
+    values = tensors(1003, 5, distance_input=True)
+    values[1] -= 1.0
+    values[2] -= 1.5
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] = torch.tensor([0.2, -0.1, 1.0])
+    K = torch.tensor([[90.0, 0, 50], [0, 95.0, 41], [0, 0, 1]])
+    tiles = torch.rand(tiles_of(101, 77)) < 0.2 if tiled else None
+    found = [
+        module.visible_anchors(
+            *(tensor.to(dtype) for tensor in values[:4]),
+            viewmat.to(dtype),
+            K.to(dtype),
+            width=101,
+            height=77,
+            near=0.3,
+            tiles=tiles,
+        )
+        for module, dtype in ((cpu_anchors, torch.float32), (reference_anchors, torch.float64))
+    ]
+    assert 20 < len(found[1]) < 900
+    assert torch.equal(*found)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from structgstream.kernels import cpu_raster, cuda, reference_raster
 from structgstream.kernels._load import native_reason
+from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
 from structgstream.kernels.reference_raster import rasterize as reference
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
@@ -193,3 +194,58 @@ def test_another_precision_is_refused_with_a_way_out() -> None:
     viewmat, K = camera()
     with pytest.raises(BackendError, match="reference back-end"):
         cpu_raster.rasterize(*gaussians(3)[:5], viewmat, K, width=8, height=8, near=NEAR)
+
+
+def some_tiles() -> Tensor:
+    tiles = torch.zeros(tiles_of(WIDTH, HEIGHT), dtype=torch.bool)
+    tiles[0, 1] = tiles[2, 2] = tiles[2, 3] = tiles[3, 4] = True
+    return tiles
+
+
+def run_tiles(rasterize, inputs: tuple[Tensor, ...], tiles: Tensor, onto: Tensor | None, trained: int | None):
+    dtype = inputs[0].dtype
+    leaves = [value.clone().requires_grad_() for value in inputs]
+    viewmat, K = (value.to(dtype) for value in camera())
+    output = rasterize(
+        *leaves[:5],
+        viewmat,
+        K,
+        width=WIDTH,
+        height=HEIGHT,
+        near=NEAR,
+        screen_offsets=leaves[5],
+        tiles=tiles,
+        onto=onto,
+        trained=trained,
+    )
+    g = torch.Generator().manual_seed(11)
+    v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * safe_pixels(inputs)[..., None]
+    gradients = torch.autograd.grad((output.image * v_image.to(dtype)).sum(), leaves)
+    return output, gradients
+
+
+@native
+@pytest.mark.parametrize("trained", [None, 120])
+def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained: int | None) -> None:
+    inputs = gaussians()
+    single = tuple(value.float() for value in inputs)
+    tiles = some_tiles()
+    inside = pixels_of_tiles(tiles, WIDTH, HEIGHT)
+    onto = torch.rand(HEIGHT, WIDTH, 3)
+    exact, exact_gradients = run_tiles(reference, inputs, tiles, onto.double(), trained)
+    whole, _ = run_tiles(cpu_raster.rasterize, single, torch.ones_like(tiles), None, None)
+    memory = onto.clone()
+    output, gradients = run_tiles(cpu_raster.rasterize, single, tiles, memory, trained)
+    assert torch.equal(output.image[inside], whole.image[inside])
+    assert torch.equal(output.image[~inside], onto[~inside])
+    assert output.image.data_ptr() == memory.data_ptr()
+    assert not memory.requires_grad
+    assert not output.alpha[~inside].any()
+    assert torch.equal(output.alpha[inside], whole.alpha[inside])
+    assert torch.equal(output.radii > 0, exact.radii > 0)
+    assert 0 < (output.radii > 0).sum() < (whole.radii > 0).sum()
+    for name, ours, theirs in zip(NAMES, gradients, exact_gradients, strict=True):
+        assert (ours - theirs).norm() < 1e-4 * theirs.norm(), name
+        if trained is not None:
+            assert not ours[trained:].any(), name
+            assert not theirs[trained:].any(), name

@@ -9,6 +9,7 @@ from torch import Tensor
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_ssim, reference_ssim
 from structgstream.kernels._load import native_reason
+from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -92,3 +93,52 @@ def test_what_it_cannot_compare() -> None:
         cpu_ssim.l1_ssim(image.double(), target)
     with pytest.raises(BackendError, match=r"\(8, 7, 3\)"):
         cpu_ssim.l1_ssim(image, target[:, :7])
+
+
+@pytest.mark.parametrize("as_bytes", [False, True])
+@pytest.mark.parametrize("tiled", [False, True])
+def test_a_corrected_picture_and_some_of_its_tiles(isa: int, as_bytes: bool, tiled: bool) -> None:
+    image, target = pictures(75, 310)
+    if as_bytes:
+        target = (target * 255).round().to(torch.uint8)
+    gains, biases = torch.tensor([1.1, 0.9, 1.05]), torch.tensor([0.02, -0.03, 0.01])
+    tiles = torch.rand(tiles_of(310, 75)) < 0.4 if tiled else None
+
+    def run(module, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x = x.clone().requires_grad_()
+        l1, ssim = module.l1_ssim(x, y, gains=gains.to(x), biases=biases.to(x), tiles=tiles)
+        return l1.detach(), ssim.detach(), torch.autograd.grad(l1 - 0.2 * ssim, x)[0]
+
+    l1, ssim, gradient = run(cpu_ssim, image, target)
+    exact_l1, exact_ssim, exact = run(reference_ssim, image.double(), target if as_bytes else target.double())
+    assert abs(l1.double() - exact_l1) < 1e-6
+    assert abs(ssim.double() - exact_ssim) < 1e-6
+    if tiles is None:
+        assert (gradient - exact).norm() < 1e-5 * exact.norm()
+        return
+    # In the tiles the gradient is that of the whole picture: what the other tiles' windows say is part of it.
+    inside = pixels_of_tiles(tiles, 310, 75)
+    whole = run_whole(image.double(), target, gains, biases)
+    assert (gradient - whole)[inside].norm() < 1e-5 * whole[inside].norm()
+    assert not gradient[~inside].any()
+
+
+def run_whole(image: Tensor, target: Tensor, gains: Tensor, biases: Tensor) -> Tensor:
+    image = image.clone().requires_grad_()
+    exact_target = target if target.dtype == torch.uint8 else target.double()
+    l1, ssim = reference_ssim.l1_ssim(image, exact_target, gains=gains.double(), biases=biases.double())
+    return torch.autograd.grad(l1 - 0.2 * ssim, image)[0]
+
+
+def test_tiles_do_not_depend_on_threads() -> None:
+    image, target = pictures(90, 200)
+    tiles = torch.rand(tiles_of(200, 90)) < 0.5
+    results = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        x = image.clone().requires_grad_()
+        l1, ssim = cpu_ssim.l1_ssim(x, target, tiles=tiles)
+        results.append((l1, ssim, *torch.autograd.grad(l1 + ssim, x)))
+    torch.set_num_threads(1)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))

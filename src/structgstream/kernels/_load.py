@@ -32,6 +32,7 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
         return None, f"The CPU kernels at {path} do not load ({error}); install structgstream again on this machine."
     for name in _POINTER_RESULTS:
         getattr(library, name).restype = ctypes.c_void_p
+    library.sgs_anchors_visible.restype = ctypes.c_int64
     return library, None
 
 

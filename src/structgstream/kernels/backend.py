@@ -31,6 +31,8 @@ class Backend:
         device: where its tensors live.
         rasterize: see ``kernels.reference_raster.rasterize``.
         l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
+        changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
+        visible_anchors: see ``kernels.reference_anchors.visible_anchors``.
         generate_structured: see ``kernels.reference_anchors.generate_structured``.
         adam_step: see ``kernels.reference_adam.adam_step``.
     """
@@ -38,20 +40,30 @@ class Backend:
     name: str
     device: torch.device
     rasterize: Callable[..., RasterOutput]
-    l1_ssim: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    l1_ssim: Callable[..., tuple[Tensor, Tensor]]
+    changed_pixels: Callable[..., Tensor]
+    visible_anchors: Callable[..., Tensor]
     generate_structured: Callable[..., StructuredGaussians]
     adam_step: Callable[..., None]
 
 
 def reference_backend() -> Backend:
     """Pure torch on the CPU: slow, exact, always there."""
-    from structgstream.kernels import reference_adam, reference_anchors, reference_raster, reference_ssim
+    from structgstream.kernels import (
+        reference_adam,
+        reference_anchors,
+        reference_change,
+        reference_raster,
+        reference_ssim,
+    )
 
     return Backend(
         name="reference",
         device=torch.device("cpu"),
         rasterize=reference_raster.rasterize,
         l1_ssim=reference_ssim.l1_ssim,
+        changed_pixels=reference_change.changed_pixels,
+        visible_anchors=reference_anchors.visible_anchors,
         generate_structured=reference_anchors.generate_structured,
         adam_step=reference_adam.adam_step,
     )
@@ -63,7 +75,7 @@ def cpu_backend() -> Backend:
     Raises:
         BackendError: the native library was not built or cannot be loaded.
     """
-    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_raster, cpu_ssim
+    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_change, cpu_raster, cpu_ssim
     from structgstream.kernels._load import native_library
 
     native_library()
@@ -72,6 +84,8 @@ def cpu_backend() -> Backend:
         device=torch.device("cpu"),
         rasterize=cpu_raster.rasterize,
         l1_ssim=cpu_ssim.l1_ssim,
+        changed_pixels=cpu_change.changed_pixels,
+        visible_anchors=cpu_anchors.visible_anchors,
         generate_structured=cpu_anchors.generate_structured,
         adam_step=cpu_adam.adam_step,
     )
@@ -83,7 +97,7 @@ def cuda_backend() -> Backend:
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
-    from structgstream.kernels import reference_adam, reference_anchors, reference_ssim
+    from structgstream.kernels import reference_adam, reference_anchors, reference_change, reference_ssim
     from structgstream.kernels.cuda import cuda_reason, rasterize
 
     reason = cuda_reason()
@@ -94,6 +108,8 @@ def cuda_backend() -> Backend:
         device=torch.device("cuda"),
         rasterize=rasterize,
         l1_ssim=reference_ssim.l1_ssim,
+        changed_pixels=reference_change.changed_pixels,
+        visible_anchors=reference_anchors.visible_anchors,
         generate_structured=reference_anchors.generate_structured,
         adam_step=reference_adam.adam_step,
     )

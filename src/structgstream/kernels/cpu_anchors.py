@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors to drawable Gaussians in this package's C++; the contract is ``kernels.reference_anchors``'s."""
+"""Anchors culled and dressed in this package's C++; the contract is ``kernels.reference_anchors``'s."""
 
 import ctypes
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from torch import Tensor
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.raster_types import tiles_of
 
 # The structures below mirror csrc/cpu/anchors.h, field by field.
 
@@ -146,6 +147,52 @@ def _check(tensors: Sequence[Tensor], mlps: MLPWeights, distance_input: bool) ->
                 f"The cpu back-end generates from float32 tensors that fit each other: expected {shape}, got "
                 f"{tensor.dtype} {tuple(tensor.shape)}; the reference back-end takes other precisions."
             )
+
+
+def visible_anchors(
+    positions: Tensor,
+    log_offset_scales: Tensor,
+    log_base_scales: Tensor,
+    offsets: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    tiles: Tensor | None = None,
+) -> Tensor:
+    """Indices ``[m]`` of the anchors in view, see ``kernels.reference_anchors.visible_anchors``.
+
+    Raises:
+        BackendError: a tensor of another precision.
+        MemoryError: there is no room for a byte an anchor.
+    """
+    tensors = [positions, log_offset_scales, log_base_scales, offsets]
+    if any(tensor.dtype != torch.float32 for tensor in tensors):
+        raise BackendError("The cpu back-end culls float32 anchors; the reference back-end takes other precisions.")
+    tensors = [tensor.detach().contiguous() for tensor in tensors]
+    count = positions.shape[0]
+    anchors = _Anchors(*_pointers([*tensors, None, None]))
+    anchors.offsets_per_anchor = offsets.shape[1]
+    camera = [matrix.detach().float().contiguous() for matrix in (viewmat, K)]
+    if tiles is not None:
+        assert tiles.shape == tiles_of(width, height), tiles.shape
+        tiles = tiles.to(torch.uint8).contiguous()
+    found = torch.empty(count, dtype=torch.int64)
+    seen = native_library().sgs_anchors_visible(
+        ctypes.byref(anchors),
+        ctypes.c_int64(count),
+        *(ctypes.c_void_p(pointer) for pointer in _pointers(camera)),
+        ctypes.c_int(width),
+        ctypes.c_int(height),
+        ctypes.c_float(near),
+        *(ctypes.c_void_p(pointer) for pointer in _pointers([tiles, found])),
+        ctypes.c_int(torch.get_num_threads()),
+    )
+    if seen < 0:
+        raise MemoryError("There is no memory left to find the anchors in view.")
+    return found[:seen]
 
 
 def generate_structured(

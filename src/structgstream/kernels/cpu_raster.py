@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
-from structgstream.kernels.raster_types import RasterOutput
+from structgstream.kernels.raster_types import RasterOutput, tiles_of
 
 
 def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
@@ -41,12 +41,19 @@ class _Rasterize(torch.autograd.Function):
         viewmat: Tensor,
         K: Tensor,
         background: Tensor | None,
+        tiles: Tensor | None,
+        onto: Tensor | None,
         size: tuple[int, int],
         near: float,
+        trained: int,
     ) -> tuple[Tensor, Tensor, Tensor]:
         width, height = size
         count = means.shape[0]
-        image, alpha, radii = (means.new_empty(shape) for shape in ((height, width, 3), (height, width), (count,)))
+        new = means.new_empty if tiles is None else means.new_zeros
+        image = new(height, width, 3) if onto is None else onto
+        alpha, radii = new(height, width), means.new_empty(count)
+        if onto is not None:
+            ctx.mark_dirty(onto)
         state = _State(
             native_library().sgs_raster_forward(
                 ctypes.c_int64(count),
@@ -54,7 +61,9 @@ class _Rasterize(torch.autograd.Function):
                 ctypes.c_int(width),
                 ctypes.c_int(height),
                 ctypes.c_float(near),
-                *(_pointer(tensor) for tensor in (background, screen_offsets, image, alpha, radii)),
+                *(_pointer(tensor) for tensor in (background, screen_offsets, tiles)),
+                ctypes.c_int64(trained),
+                *(_pointer(tensor) for tensor in (image, alpha, radii)),
                 ctypes.c_int(torch.get_num_threads()),
             )
         )
@@ -85,7 +94,7 @@ class _Rasterize(torch.autograd.Function):
         )
         if failed:
             raise MemoryError("The rasteriser has no memory left for gradients; draw fewer or smaller Gaussians.")
-        return *results, offsets, None, None, None, None, None
+        return *results, offsets, *(None,) * 8
 
 
 def rasterize(
@@ -102,8 +111,11 @@ def rasterize(
     near: float,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
+    tiles: Tensor | None = None,
+    onto: Tensor | None = None,
+    trained: int | None = None,
 ) -> RasterOutput:
-    """Render Gaussians, see ``kernels.reference_raster.rasterize``.
+    """Render Gaussians, see ``kernels.reference_raster.rasterize``. What is drawn ``onto`` is drawn in place.
 
     Repeated calls give the same bits, whatever the number of threads. Cameras and the background get no gradient.
 
@@ -124,7 +136,22 @@ def rasterize(
             )
     camera = [None if t is None else t.detach().float().contiguous() for t in (viewmat, K, background)]
     offsets = None if screen_offsets is None else screen_offsets.contiguous()
+    if tiles is not None:
+        assert tiles.shape == tiles_of(width, height), tiles.shape
+        tiles = tiles.to(torch.uint8).contiguous()
+    if onto is not None:
+        assert onto.shape == (height, width, 3)
+        assert onto.is_contiguous()
+        assert not onto.requires_grad
+        onto = onto.detach()  # An alias: autograd will make the result of what it is given.
     image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
-        *(tensor.contiguous() for tensor in gaussians), offsets, *camera, (width, height), near
+        *(tensor.contiguous() for tensor in gaussians),
+        offsets,
+        *camera,
+        tiles,
+        onto,
+        (width, height),
+        near,
+        n if trained is None else trained,
     )
     return RasterOutput(image, alpha, radii)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
+from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
 
 
 def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
@@ -23,46 +24,68 @@ def _targets(target: Tensor) -> tuple[ctypes.c_void_p, ctypes.c_void_p]:
 
 class _L1SSIM(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        gains: Tensor | None,
+        biases: Tensor | None,
+        tiles: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
         height, width = image.shape[:2]
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
         sums = torch.empty(2, height, dtype=torch.float64)  # rows, summed here in a fixed order
         native_library().sgs_l1_ssim(
-            _pointer(image),
-            *_targets(target),
-            ctypes.c_int(height),
-            ctypes.c_int(width),
+            *_pictures(image, target, gains, biases, tiles),
             _pointer(gradient),
             _pointer(sums[0]),
             _pointer(sums[1]),
             ctypes.c_int(torch.get_num_threads()),
         )
-        ctx.save_for_backward(image, target, gradient)
-        l1, ssim = (sums.cumsum(1)[:, -1] / image.numel()).float()
-        return l1, ssim
+        ctx.save_for_backward(image, target, gains, biases, tiles, gradient)
+        counted = image.numel() if tiles is None else 3 * int(pixels_of_tiles(tiles, width, height).sum())
+        l1, ssim = sums.cumsum(1)[:, -1].tolist()
+        of_the_rest = image.numel() - counted
+        return image.new_tensor(l1 / image.numel()), image.new_tensor((ssim + of_the_rest) / image.numel())
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         to_l1, to_ssim = gradients
-        image, target, ssim_gradient = ctx.saved_tensors
-        gradient = torch.empty_like(image)
+        image, target, gains, biases, tiles, ssim_gradient = ctx.saved_tensors
+        gradient = torch.empty_like(image) if tiles is None else torch.zeros_like(image)
         native_library().sgs_l1_ssim_backward(
-            _pointer(image),
-            *_targets(target),
+            *_pictures(image, target, gains, biases, tiles),
             _pointer(ssim_gradient),
-            ctypes.c_int64(image.numel()),
             ctypes.c_float(float(to_l1) / image.numel()),
             ctypes.c_float(float(to_ssim)),
             _pointer(gradient),
             ctypes.c_int(torch.get_num_threads()),
         )
-        return gradient, None
+        return gradient, None, None, None, None
 
 
-def l1_ssim(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean absolute difference and mean SSIM of ``image`` ``[H, W, 3]`` float32 against ``target`` (or uint8).
+def _pictures(
+    image: Tensor, target: Tensor, gains: Tensor | None, biases: Tensor | None, tiles: Tensor | None
+) -> tuple[Any, ...]:
+    return (
+        _pointer(image),
+        *_targets(target),
+        *(ctypes.c_int(size) for size in image.shape[:2]),
+        *(_pointer(tensor) for tensor in (gains, biases, tiles)),
+    )
 
-    Gradients flow to ``image`` only. Results do not depend on the number of threads.
+
+def l1_ssim(
+    image: Tensor,
+    target: Tensor,
+    *,
+    gains: Tensor | None = None,
+    biases: Tensor | None = None,
+    tiles: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Mean absolute difference and mean SSIM, see ``kernels.reference_ssim.l1_ssim``; float32.
+
+    Results do not depend on the number of threads.
 
     Raises:
         BackendError: another precision, layout or size than the C++ computes with.
@@ -76,7 +99,13 @@ def l1_ssim(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         raise BackendError(
             f"Two pictures [H, W, 3] of one size are expected, got {tuple(image.shape)} and {tuple(target.shape)}."
         )
-    return _L1SSIM.apply(image.contiguous(), target.contiguous())  # type: ignore[return-value]
+    constants = [None if t is None else t.detach().float().contiguous() for t in (gains, biases)]
+    assert (gains is None) == (biases is None)
+    assert all(t is None or t.shape == (3,) for t in constants)
+    if tiles is not None:
+        assert tiles.shape == tiles_of(image.shape[1], image.shape[0]), tiles.shape
+        tiles = tiles.to(torch.uint8).contiguous()
+    return _L1SSIM.apply(image.contiguous(), target.contiguous(), *constants, tiles)  # type: ignore[return-value]
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:

@@ -9,9 +9,7 @@ import importlib.util
 import torch
 from torch import Tensor
 
-from structgstream.kernels.raster_types import RasterOutput
-
-TILE_PIXELS = 16
+from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, pixels_of_tiles
 
 
 def cuda_reason() -> str | None:
@@ -38,12 +36,23 @@ def rasterize(
     near: float,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
+    tiles: Tensor | None = None,
+    onto: Tensor | None = None,
+    trained: int | None = None,
 ) -> RasterOutput:
     """The contract of ``kernels.reference_raster.rasterize`` on a GPU.
 
     The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient means the
-    same on every back-end.
+    same on every back-end. With ``tiles``, ``radii`` also counts Gaussians that reach other tiles only, and ``trained``
+    saves nothing here: the gradients of the rest are computed and not used.
     """
+    if trained is not None:
+        means, quats, scales, opacities, colors = (
+            torch.cat([tensor[:trained], tensor[trained:].detach()])
+            for tensor in (means, quats, scales, opacities, colors)
+        )
+        if screen_offsets is not None:
+            screen_offsets = torch.cat([screen_offsets[:trained], screen_offsets[trained:].detach()])
     from gsplat.cuda._wrapper import (  # pyright: ignore[reportMissingImports]
         fully_fused_projection,
         isect_offset_encode,
@@ -82,6 +91,15 @@ def rasterize(
         tile_starts,
         flat_ids,
         backgrounds=None if background is None else background[None],
+        masks=None if tiles is None else tiles[None],
         packed=False,
     )
-    return RasterOutput(image=image[0], alpha=alpha[0, :, :, 0], radii=radii[0].amax(-1).float())
+    drawn = radii[0].amax(-1).float()
+    if tiles is None:
+        return RasterOutput(image=image[0], alpha=alpha[0, :, :, 0], radii=drawn)
+    inside = pixels_of_tiles(tiles, width, height)
+    return RasterOutput(
+        image=torch.where(inside[..., None], image[0], torch.zeros_like(image[0]) if onto is None else onto),
+        alpha=torch.where(inside, alpha[0, :, :, 0], 0.0),
+        radii=drawn,
+    )

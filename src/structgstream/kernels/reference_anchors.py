@@ -1,10 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors to drawable Gaussians in pure torch: the oracle of the generation."""
+"""Anchors to drawable Gaussians in pure torch: the oracle of the culling and of the generation."""
 
 import torch
 from torch import Tensor
 
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.raster_types import TILE_PIXELS
+
+BALL_DEVIATIONS = 3.4
+"""A Gaussian ends within so many standard deviations: alpha = 1/255 is reached before 3.33 at any opacity."""
+BOX_MARGIN_PIXELS = 2.0
+"""The rasteriser's low-pass makes the smallest Gaussian this wide."""
+
+
+def visible_anchors(
+    positions: Tensor,
+    log_offset_scales: Tensor,
+    log_base_scales: Tensor,
+    offsets: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    tiles: Tensor | None = None,
+) -> Tensor:
+    """Indices ``[m]`` int64, ascending, of the anchors that can put a Gaussian into a picture.
+
+    Conservative: an anchor counts as a ball that holds all its Gaussians, so culling changes the cost of a rendering
+    and never its pixels.
+
+    Args:
+        positions: ``[M, 3]``.
+        log_offset_scales: ``[M, 3]``.
+        log_base_scales: ``[M, 3]``.
+        offsets: ``[M, K, 3]``.
+        viewmat: ``[4, 4]`` world to camera.
+        K: ``[3, 3]`` pixels.
+        width: pixels.
+        height: pixels.
+        near: smallest z that is drawn.
+        tiles: ``[rows, columns]`` bool: only what reaches one of these tiles counts.
+    """
+    with torch.no_grad():
+        points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]  # [M, 3]
+        reach = (offsets * log_offset_scales.exp()[:, None]).norm(dim=-1).amax(1)
+        radius = reach + BALL_DEVIATIONS * log_base_scales.amax(1).exp()  # [M]
+        closest, furthest = points[:, 2] - radius, points[:, 2] + radius
+        size = (width, height)
+        seen = furthest > near
+        low, high = [], []
+        for axis in range(2):
+            below, above = points[:, axis] - radius, points[:, axis] + radius
+            focal, center = K[axis, axis], K[axis, 2]
+            at_low = below / torch.where(below < 0, closest, furthest)
+            at_high = above / torch.where(above < 0, furthest, closest)
+            low.append(focal * at_low + center - BOX_MARGIN_PIXELS)
+            high.append(focal * at_high + center + BOX_MARGIN_PIXELS)
+            # A ball as near as its radius has no box: it counts unless it lies beyond a side of the frustum.
+            around = closest <= 0
+            for sign, edge in ((1.0, center), (-1.0, size[axis] - center)):
+                slope = (edge + BOX_MARGIN_PIXELS) / focal
+                distance = (sign * points[:, axis] + slope * points[:, 2]) / (1.0 + slope**2).sqrt()
+                seen &= ~around | (distance > -1.1 * radius)
+            seen &= around | ((low[axis] < size[axis]) & (high[axis] > 0))
+            low[axis] = torch.where(around, 0.0, low[axis])
+            high[axis] = torch.where(around, float(size[axis]), high[axis])
+        if tiles is not None:
+            covered = torch.zeros(tiles.shape[0] + 1, tiles.shape[1] + 1, dtype=torch.int64, device=tiles.device)
+            covered[1:, 1:] = tiles.long().cumsum(0).cumsum(1)
+            x0, y0 = (low[axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS for axis in range(2))
+            x1, y1 = (high[axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS + 1 for axis in range(2))
+            seen &= covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
+        return seen.nonzero()[:, 0]
 
 
 def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:

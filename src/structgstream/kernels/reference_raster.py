@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from structgstream.kernels.raster_types import RasterOutput
+from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, pixels_of_tiles
 
 LOW_PASS_PIXELS = 0.3
 MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
-TILE_PIXELS = 16
+BOX_SLACK_PIXELS = 0.01
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,9 @@ def rasterize(
     near: float,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
+    tiles: Tensor | None = None,
+    onto: Tensor | None = None,
+    trained: int | None = None,
 ) -> RasterOutput:
     """Render Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
@@ -126,27 +129,58 @@ def rasterize(
         background: ``[3]``, black when None.
         screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
             gradient, by the same contract on every back-end.
+        tiles: ``[rows, columns]`` bool: the tiles to draw, all when None. A Gaussian that reaches none of them counts
+            as not drawn.
+        onto: ``[H, W, 3]`` without gradient: what the picture shows in the other tiles, else zero. Its memory may be
+            drawn into and become the result.
+        trained: only so many Gaussians, the first ones, get gradients; all when None.
     """
+    if trained is not None:
+        means, quats, scales, opacities, colors = (
+            torch.cat([tensor[:trained], tensor[trained:].detach()])
+            for tensor in (means, quats, scales, opacities, colors)
+        )
+        if screen_offsets is not None:
+            screen_offsets = torch.cat([screen_offsets[:trained], screen_offsets[trained:].detach()])
     projected = _project(means, quats, scales, opacities, colors, viewmat, K, width, height, near, screen_offsets)
     radii = means.new_zeros(means.shape[0], dtype=torch.float32)
     radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
     back = means.new_zeros(3) if background is None else background
     low = projected.means2d.detach() - projected.extents
     high = projected.means2d.detach() + projected.extents
+    if tiles is not None:
+        reaching = _reaching(low, high, tiles, width, height)
+        radii[projected.rows[~reaching]] = 0.0
     bands, bands_alpha = [], []
     for top in range(0, height, TILE_PIXELS):
         bottom = min(top + TILE_PIXELS, height)
         in_band = ((low[:, 1] < bottom) & (high[:, 1] > top)).nonzero()[:, 0]
-        tiles, tiles_alpha = [], []
+        row, row_alpha = [], []
         for left in range(0, width, TILE_PIXELS):
             right = min(left + TILE_PIXELS, width)
             here = in_band[(low[in_band, 0] < right) & (high[in_band, 0] > left)]
             image, alpha = _tile(projected, here, opacities, colors, left, right, top, bottom)
-            tiles.append(image + (1.0 - alpha)[..., None] * back)
-            tiles_alpha.append(alpha)
-        bands.append(torch.cat(tiles, dim=1))
-        bands_alpha.append(torch.cat(tiles_alpha, dim=1))
-    return RasterOutput(torch.cat(bands), torch.cat(bands_alpha), radii)
+            row.append(image + (1.0 - alpha)[..., None] * back)
+            row_alpha.append(alpha)
+        bands.append(torch.cat(row, dim=1))
+        bands_alpha.append(torch.cat(row_alpha, dim=1))
+    image, alpha = torch.cat(bands), torch.cat(bands_alpha)
+    if tiles is not None:
+        inside = pixels_of_tiles(tiles, width, height)
+        image = torch.where(inside[..., None], image, torch.zeros_like(image) if onto is None else onto)
+        alpha = torch.where(inside, alpha, 0.0)
+    return RasterOutput(image, alpha, radii)
+
+
+def _reaching(low: Tensor, high: Tensor, tiles: Tensor, width: int, height: int) -> Tensor:
+    """Mask ``[n]`` of the boxes (pixels) with the centre of a pixel in one of ``tiles``, or without any centre."""
+    first, last = (low - 0.5 - BOX_SLACK_PIXELS).ceil().long(), (high + 0.5 + BOX_SLACK_PIXELS).floor().long()
+    x0, y0 = first[:, 0].clamp(0, width), first[:, 1].clamp(0, height)
+    x1, y1 = last[:, 0].clamp(0, width), last[:, 1].clamp(0, height)
+    covered = torch.zeros(height + 1, width + 1, dtype=torch.int64, device=low.device)
+    covered[1:, 1:] = pixels_of_tiles(tiles, width, height).long().cumsum(0).cumsum(1)
+    count = covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0]
+    return (count > 0) | (x0 >= x1) | (y0 >= y1)
 
 
 def _tile(

@@ -3,10 +3,7 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
-
-from structgstream.cameras import Camera
 
 
 @dataclass(frozen=True)
@@ -40,28 +37,3 @@ class AnchorCloud:
     def offsets_per_anchor(self) -> int:
         """The paper's k."""
         return self.offsets.shape[1]
-
-
-def visible_anchors(anchors: AnchorCloud, camera: Camera) -> Tensor:
-    """Indices ``[m]`` int64, ascending, of the anchors that can put a Gaussian into the picture of ``camera``.
-
-    Conservative: an anchor counts as a sphere that holds all its Gaussians at three standard deviations, so culling
-    changes the cost of a rendering and never its pixels.
-    """
-    with torch.no_grad():
-        viewmat = camera.viewmat.to(anchors.positions)
-        points = anchors.positions @ viewmat[:3, :3].T + viewmat[:3, 3]  # [M, 3]
-        reach = (anchors.offsets * anchors.log_offset_scales.exp()[:, None]).norm(dim=-1).amax(1)
-        radius = reach + 3.4 * anchors.log_base_scales.amax(1).exp()  # [M]
-        fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        inside = points[:, 2] > camera.near - radius
-        # Signed distance to each side plane of the frustum; the normals are unit length, so it compares with a radius.
-        for normal in (
-            (fx, 0.0, cx),
-            (-fx, 0.0, camera.width - cx),
-            (0.0, fy, cy),
-            (0.0, -fy, camera.height - cy),
-        ):
-            plane = points.new_tensor(normal)
-            inside &= points @ (plane / plane.norm()) > -radius * 1.1
-        return inside.nonzero()[:, 0]

@@ -10,7 +10,7 @@ from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.anchor_types import MLPWeights, StructuredGaussians
 from structgstream.kernels.backend import Backend
-from structgstream.scene.anchors import AnchorCloud, visible_anchors
+from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 
@@ -33,10 +33,26 @@ class Scene:
     camera_color: CameraColor
     distance_input: bool = True
 
-    def structured(self, camera: Camera, backend: Backend) -> tuple[StructuredGaussians, Tensor]:
-        """The structured Gaussians that ``camera`` may see, and the visible anchors ``[m]`` they belong to."""
-        visible = visible_anchors(self.anchors, camera)
+    def structured(
+        self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None
+    ) -> tuple[StructuredGaussians, Tensor]:
+        """The structured Gaussians that ``camera`` may see, and the visible anchors ``[m]`` they belong to.
+
+        With ``tiles`` (``kernels.raster_types``), those that may show in these tiles.
+        """
         anchors = self.anchors
+        visible = backend.visible_anchors(
+            anchors.positions,
+            anchors.log_offset_scales,
+            anchors.log_base_scales,
+            anchors.offsets,
+            camera.viewmat.to(anchors.positions),
+            camera.K.to(anchors.positions),
+            width=camera.width,
+            height=camera.height,
+            near=camera.near,
+            tiles=tiles,
+        )
         generated = backend.generate_structured(
             anchors.positions,
             anchors.log_offset_scales,

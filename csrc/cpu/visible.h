@@ -1,0 +1,53 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "anchors.h"
+#include "splat.h"
+
+namespace structgstream {
+
+constexpr float kBallDeviations = 3.4f;  // alpha = 1/255 is reached before 3.33 at any opacity
+constexpr float kBoxMargin = 2.0f;       // pixels: the rasteriser's low-pass makes the smallest Gaussian this wide
+
+struct View {
+    float viewmat[12];
+    float fx, fy, cx, cy, near;
+    int width, height, tiles_x, tiles_y;
+
+    [[gnu::always_inline]] static bool beyond(float x, float z, float radius, float focal, float edge) {
+        const float slope = (edge + kBoxMargin) / focal;
+        return !((x + slope * z) / std::sqrt(1.0f + slope * slope) > -1.1f * radius);
+    }
+
+    // A ball at (x, y, z) in the camera. covered: null, or sums over the tiles above and left of each corner, so that the
+    // number of tiles in a box takes four reads; [tiles_y + 1][tiles_x + 1].
+    [[gnu::always_inline]] bool sees(float x, float y, float z, float radius, const int32_t* covered) const {
+        if (!(z + radius > near)) return false;
+        const float closest = z - radius, furthest = z + radius;
+        float box[4] = {0.0f, 0.0f, static_cast<float>(width), static_cast<float>(height)};
+        if (closest > 0.0f) {
+            const float left = x - radius, right = x + radius, top = y - radius, bottom = y + radius;
+            box[0] = fx * left / (left < 0.0f ? closest : furthest) + cx - kBoxMargin;
+            box[1] = fy * top / (top < 0.0f ? closest : furthest) + cy - kBoxMargin;
+            box[2] = fx * right / (right < 0.0f ? furthest : closest) + cx + kBoxMargin;
+            box[3] = fy * bottom / (bottom < 0.0f ? furthest : closest) + cy + kBoxMargin;
+            if (!(box[0] < width && box[1] < height && box[2] > 0.0f && box[3] > 0.0f)) return false;
+        } else if (beyond(x, z, radius, fx, cx) || beyond(-x, z, radius, fx, width - cx) ||
+                   beyond(y, z, radius, fy, cy) || beyond(-y, z, radius, fy, height - cy)) {
+            return false;  // As near as its radius it has no box, but it may lie beyond a side of the frustum.
+        }
+        if (covered == nullptr) return true;
+        const int x0 = static_cast<int>(std::max(box[0], 0.0f)) / kTile;
+        const int y0 = static_cast<int>(std::max(box[1], 0.0f)) / kTile;
+        const int x1 = static_cast<int>(std::min(box[2], width - 1.0f)) / kTile + 1;
+        const int y1 = static_cast<int>(std::min(box[3], height - 1.0f)) / kTile + 1;
+        const int row = tiles_x + 1;
+        return covered[y1 * row + x1] - covered[y0 * row + x1] - covered[y1 * row + x0] + covered[y0 * row + x0] > 0;
+    }
+};
+
+}  // namespace structgstream
