@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.contest import Contestant, Quantity, Results, check, ratios, spread, timed
+from benchmarks.machine import Instant, others_share
 from benchmarks.roofline import Peaks, Work, line
 
 Sizes = Mapping[str, Any]
@@ -83,9 +84,12 @@ def run_variant(
     sizes = variant.quick if quick else variant.full
     entries = benchmark.contestants(**sizes)
     errors = check(entries, benchmark.quantities, oracle=benchmark.oracle(**sizes) if benchmark.oracle else None)
+    before = Instant.now()
     seconds = timed(entries, repeats=repeats)
+    busy = others_share(before, Instant.now())
     factors = ratios(seconds)
-    found: dict[str, Any] = {"title": variant.title, "sizes": dict(sizes), "contestants": {}}
+    title = f"quick, {', '.join(f'{key} {value}' for key, value in sizes.items())}" if quick else variant.title
+    found: dict[str, Any] = {"title": title, "sizes": dict(sizes), "others_share": busy, "contestants": {}}
     work = benchmark.count(**sizes) if benchmark.count is not None and peaks else None
     for entry in entries:
         summary = spread(seconds[entry.name])

@@ -64,6 +64,9 @@ def variant_lines(benchmark: Mapping[str, Any], variant: Mapping[str, Any]) -> I
     for target in variant.get("targets", ()):
         yield ""
         yield _target(target)
+    if variant["others_share"] is not None:
+        yield ""
+        yield f"Meanwhile other processes took {100 * variant['others_share']:.0f} % of the machine."
     yield ""
 
 

@@ -37,11 +37,13 @@ class World:
     Args:
         rig: the cameras, one of them held out; in normalised units.
         before: the true scene of frame 0.
+        previous: the pictures of frame 0.
         frame: the pictures of frame 1, in which part of the wall has moved.
     """
 
     rig: CameraRig
     before: Scene
+    previous: MultiViewFrame
     frame: MultiViewFrame
 
 
@@ -131,14 +133,26 @@ def wall_world(
     cameras: int,
     share: float = 1.0,
     shift: tuple[float, float, float] = (0.012, 0.006, 0.0),
+    noise: float = 0.0,
     seed: int = 0,
 ) -> World:
-    """The wall before and the pictures after ``share`` of its area has moved by ``shift`` scene units."""
+    """The wall before and after ``share`` of its area has moved by ``shift`` scene units.
+
+    ``noise`` is the standard deviation, in levels of 255, of what the training cameras' sensors add to each picture.
+    """
     rig = wall_rig(cameras, width=width, height=height)
     before = wall_scene(anchors, cameras=cameras, seed=seed)
     after = moved(before, share=share, shift=shift)
-    images = {name: picture(after, rig[name], backend) for name in rig}
-    return World(rig, before, MultiViewFrame(1, 1.0 / 30.0, images))
+    g = np.random.default_rng(seed)
+
+    def taken(scene: Scene, index: int) -> MultiViewFrame:
+        images = {name: picture(scene, rig[name], backend) for name in rig}
+        for name in rig.training if noise else ():
+            grain = noise * g.standard_normal(images[name].shape, dtype=np.float32)
+            images[name] = (images[name] + grain).round().clip(0, 255).astype(np.uint8)
+        return MultiViewFrame(index, index / 30.0, images)
+
+    return World(rig, before, taken(before, 0), taken(after, 1))
 
 
 def held_out_psnr(scene: Scene, world: World, backend: Backend) -> float:
