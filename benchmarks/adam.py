@@ -9,7 +9,6 @@ from torch import Tensor
 
 from benchmarks.benchmark import Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity, Results
-from benchmarks.roofline import Work
 from benchmarks.world import wall_scene
 from structgstream.kernels import cpu_adam, reference_adam
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -70,12 +69,6 @@ def contestants(*, anchors: int, trained: Trained) -> list[Contestant]:
     ]
 
 
-def count(*, anchors: int, trained: Trained) -> Work:
-    """A number: two moments 5, correction, root and division about 8; four floats read, three written."""
-    numbers = sum(value.numel() for value in parameters(anchors, trained)[0])
-    return Work(13.0 * numbers, 28.0 * numbers)
-
-
 def _sizes(anchors: int, trained: Trained) -> dict[str, object]:
     return {"anchors": anchors, "trained": trained}
 
@@ -97,5 +90,4 @@ BENCHMARK = Benchmark(
             {n: _sizes(n, "all") for n in (100, 200)},
         )
     ],
-    count=count,
 )

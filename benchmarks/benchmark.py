@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.contest import Contestant, Quantity, Results, check, ratios, spread, timed
+from benchmarks.contest import TURN_SECONDS, Contestant, Quantity, Results, check, ratios, spread, timed
 from benchmarks.machine import Instant, others_share
 from benchmarks.roofline import Peaks, Work, line
 
@@ -85,7 +85,7 @@ def run_variant(
     entries = benchmark.contestants(**sizes)
     errors = check(entries, benchmark.quantities, oracle=benchmark.oracle(**sizes) if benchmark.oracle else None)
     before = Instant.now()
-    seconds = timed(entries, repeats=repeats)
+    seconds = timed(entries, repeats=repeats, turn_seconds=0.0 if quick else TURN_SECONDS)
     busy = others_share(before, Instant.now())
     factors = ratios(seconds)
     title = f"quick, {', '.join(f'{key} {value}' for key, value in sizes.items())}" if quick else variant.title

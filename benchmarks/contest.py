@@ -90,19 +90,29 @@ def check(
     return errors
 
 
-def timed(contestants: Sequence[Contestant], *, repeats: int) -> dict[str, list[float]]:
+TURN_SECONDS = 0.1
+
+
+def timed(
+    contestants: Sequence[Contestant], *, repeats: int, turn_seconds: float = TURN_SECONDS
+) -> dict[str, list[float]]:
     """Seconds for one piece of work of each contestant, one value a round.
 
-    The runs of a round take turns and every round starts with another contestant, so that load from outside meets all.
+    Contestants take turns and every round starts with another one, so that load from outside meets all. A turn runs
+    again until ``turn_seconds`` have passed and gives the mean: a kernel of a millisecond is met as in training, with
+    its threads awake, and not as the first thing after another contestant's.
     """
     seconds: dict[str, list[float]] = {contestant.name: [] for contestant in contestants}
     for round_number in range(repeats):
         first = round_number % len(contestants)
         for contestant in (*contestants[first:], *contestants[:first]):
             torch.set_num_threads(contestant.threads)
-            started = time.perf_counter()
-            contestant.run()
-            seconds[contestant.name].append((time.perf_counter() - started) / contestant.units)
+            started, elapsed, runs = time.perf_counter(), 0.0, 0
+            while runs == 0 or elapsed < turn_seconds:
+                contestant.run()
+                runs += 1
+                elapsed = time.perf_counter() - started
+            seconds[contestant.name].append(elapsed / (runs * contestant.units))
     return seconds
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.benchmark import Benchmark, Growth
-from benchmarks.contest import check, spread, timed
+from benchmarks.contest import TURN_SECONDS, check, spread, timed
 
 
 def slope(sizes: Sequence[float], seconds: Sequence[float]) -> float:
@@ -26,7 +26,7 @@ def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: in
     for size, arguments in sizes.items():
         entries = (growth.contestants or benchmark.contestants)(**arguments)
         check(entries, benchmark.quantities, oracle=benchmark.oracle(**arguments) if benchmark.oracle else None)
-        seconds = timed(entries, repeats=repeats)
+        seconds = timed(entries, repeats=repeats, turn_seconds=0.0 if quick else TURN_SECONDS)
         for entry in entries:
             point = {"size": size, "seconds": spread(seconds[entry.name]), "facts": dict(entry.facts())}
             curves.setdefault(entry.name, []).append(point)

@@ -20,23 +20,28 @@ def _times(factors: Mapping[str, float] | None) -> str:
     return f"{factors['median']:.{digits}f} ({factors['least']:.{digits}f} to {factors['most']:.{digits}f})"
 
 
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
 def _fact(name: str, value: float) -> str:
-    if name.endswith("_seconds"):
-        return f"{name.removesuffix('_seconds')} {milliseconds(value)}"
-    if name.endswith("_share"):
-        return f"{name.removesuffix('_share')} {100 * value:.0f} %"
     return f"{name} {value:.2f} dB" if name.endswith("psnr") else f"{name} {value:,.6g}"
 
 
 def _notes(benchmark: Mapping[str, Any], entry: Mapping[str, Any]) -> str:
-    notes = [_fact(name, value) for name, value in entry["facts"].items()]
+    facts = entry["facts"]
+    notes = [_fact(name, value) for name, value in facts.items() if not name.endswith(("_seconds", "_share"))]
+    for name, share in facts.items():
+        stage = name.removesuffix("_share")
+        if stage != name and share >= 0.001:
+            notes.append(f"{stage} {milliseconds(facts[f'{stage}_seconds'])} ({100 * share:.0f} %)")
     if entry["per_second"] is not None:
         notes.insert(0, f"{entry['per_second']:.1f} {benchmark['per_second']}")
     if entry["roofline"] is not None:
         r = entry["roofline"]
         notes.append(
-            f"{r['operations_per_second'] / 1e9:.0f} GFLOP/s, {100 * r['share_of_peak_operations']:.0f} % of peak; "
-            f"{100 * r['share_of_roof']:.0f} % of the roof at {r['operations'] / r['bytes']:.0f} operations a byte"
+            f"{_digits(r['operations_per_second'] / 1e9)} GFLOP/s; {_digits(100 * r['share_of_roof'])} % of the roof "
+            f"at {_digits(r['operations'] / r['bytes'])} operations a byte"
         )
     return "; ".join(notes)
 

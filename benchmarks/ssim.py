@@ -118,7 +118,8 @@ def count(*, width: int, height: int) -> Work:
 
     A pixel and channel forward: three products 3; five blurs, each two passes of 11 multiply-adds, 5 * 44 = 220; the
     formula about 20. Its gradient: the three derivatives about 25, three blurs 132, combining 6. L1 with its gradient:
-    4. Bytes: the picture read by both passes, the target by both, the gradient of SSIM written and read, the result
+    4. (The window's symmetry halves the products but leaves as many instructions, a multiply-add being one.)
+    Bytes: the picture read by both passes, the target by both, the gradient of SSIM written and read, the result
     written: 7 floats; what the blurs hand on stays in caches when rows are worked off in bands.
     """
     values = 3.0 * width * height

@@ -53,7 +53,7 @@ def test_every_round_starts_with_another_contestant_and_threads_are_set() -> Non
     def entry(name: str, threads: int) -> Contestant:
         return Contestant(name, lambda: seen.append((name, torch.get_num_threads())) or [], threads)
 
-    seconds = timed([entry("a", 1), entry("b", 2)], repeats=2)
+    seconds = timed([entry("a", 1), entry("b", 2)], repeats=2, turn_seconds=0.0)
     assert seen == [("a", 1), ("b", 2), ("b", 2), ("a", 1)]
     assert {name: len(values) for name, values in seconds.items()} == {"a": 2, "b": 2}
 
@@ -62,6 +62,12 @@ def test_seconds_are_for_one_unit(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([0.0, 6.0])
     monkeypatch.setattr("benchmarks.contest.time.perf_counter", lambda: next(clock))
     assert timed([Contestant("three at once", list, 1, units=3)], repeats=1) == {"three at once": [2.0]}
+
+
+def test_a_turn_runs_until_its_time_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 1.0, 2.0, 3.0])
+    monkeypatch.setattr("benchmarks.contest.time.perf_counter", lambda: next(clock))
+    assert timed([Contestant("short", list, 1)], repeats=1, turn_seconds=2.5) == {"short": [1.0]}
 
 
 def test_ratios_are_taken_within_each_round() -> None:
