@@ -47,3 +47,17 @@ def test_noise_is_added_to_training_pictures_only_and_quality_is_judged_without_
     assert 1.0 < difference.std() < 2.5
     assert np.array_equal(noisy.frame.images[HELD_OUT], clean.frame.images[HELD_OUT])
     assert held_out_psnr(noisy.before, noisy, backend) == 100.0
+
+
+def test_a_finer_wall_is_dressed_alike() -> None:
+    """Growth over anchors must not meet other MLPs: the share that is drawn stays."""
+    rig, backend = wall_rig(2, width=48, height=36), reference_backend()
+    shares = []
+    for anchors in (500, 1000, 2000):
+        scene = wall_scene(anchors, cameras=2)
+        gaussians = scene.gaussians(rig[HELD_OUT], backend)
+        shares.append(len(gaussians) / (5 * anchors))
+        spacing = scene.anchors.log_offset_scales.exp().mean()
+        assert (gaussians.scales.mean() / spacing).item() == pytest.approx(0.5, abs=0.15)
+    assert 0.35 < min(shares) <= max(shares) < 0.65
+    assert max(shares) - min(shares) < 0.05
