@@ -24,6 +24,7 @@ from structgstream.scene.scene import Scene
 
 WALL_WIDTH, WALL_HEIGHT = 2.8, 2.1
 DISTANCE = 2.4
+FOCAL = 0.83  # Of a picture's width.
 OFFSETS_PER_ANCHOR = 5
 FEATURES = 32
 HIDDEN = 32
@@ -95,7 +96,7 @@ def wall_rig(cameras: int, *, width: int, height: int) -> CameraRig:
         angle = torch.tensor(0.42 * place, dtype=torch.float64)
         up = torch.tensor(0.0 if name == HELD_OUT else 0.15 * (i % 3 - 1), dtype=torch.float64)
         eye = torch.stack([DISTANCE * angle.sin(), up, -DISTANCE * angle.cos()])
-        focal = 0.83 * width
+        focal = FOCAL * width
         K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
         found[name] = Camera(_looking_at_the_middle(eye), K, width, height, near=0.1)
     return CameraRig(found, held_out=frozenset({HELD_OUT}))
@@ -134,17 +135,17 @@ def wall_world(
     height: int,
     cameras: int,
     share: float = 1.0,
-    shift: tuple[float, float, float] = (0.012, 0.006, 0.0),
+    shift_pixels: float = 2.0,
     noise: float = 0.0,
     seed: int = 2,
 ) -> World:
-    """The wall before and after ``share`` of its area has moved by ``shift`` scene units.
+    """The wall before and after ``share`` of its area has moved by about ``shift_pixels`` in the pictures, sideways.
 
     ``noise`` is the standard deviation, in levels of 255, of what the training cameras' sensors add to each picture.
     """
     rig = wall_rig(cameras, width=width, height=height)
     before = wall_scene(anchors, cameras=cameras, seed=seed)
-    after = moved(before, share=share, shift=shift)
+    after = moved(before, share=share, shift=(shift_pixels * DISTANCE / (FOCAL * width), 0.0, 0.0))
     g = np.random.default_rng(seed)
 
     def taken(scene: Scene, index: int) -> MultiViewFrame:

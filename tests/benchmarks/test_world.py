@@ -28,9 +28,7 @@ def test_every_camera_sees_most_of_the_wall_and_one_is_held_out() -> None:
 
 
 def test_pictures_change_where_the_wall_moves_and_only_there() -> None:
-    world = wall_world(
-        reference_backend(), anchors=400, width=48, height=36, cameras=2, share=0.05, shift=(0.05, 0.05, 0.0)
-    )
+    world = wall_world(reference_backend(), anchors=400, width=48, height=36, cameras=2, share=0.05, shift_pixels=2.0)
     changed = (world.previous.images[HELD_OUT] != world.frame.images[HELD_OUT]).any(axis=2)
     assert changed[18, 24]
     assert 0.02 < changed.mean() < 0.4
