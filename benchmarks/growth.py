@@ -62,6 +62,9 @@ def plot(title: str, found: Mapping[str, Any], path: Path) -> None:
             label=f"{name}: slope {found['slopes'][name]:.2f}",
         )
     axes.set(xscale="log", yscale="log", xlabel=found["axis"], ylabel="milliseconds", title=title)
+    sizes = [point["size"] for point in next(iter(found["curves"].values()))]
+    axes.set_xticks(sizes, labels=[f"{size:,.6g}" for size in sizes])
+    axes.set_xticks([], minor=True)
     axes.grid(visible=True, which="both", alpha=0.3)
     axes.legend(fontsize="small")
     figure.tight_layout()
