@@ -18,6 +18,7 @@
     void project(const GaussianInputs&, Raster&, float*, int);                                                        \
     void project_backward(const GaussianInputs&, const Raster&, const float*, const GaussianGradients&, int);         \
     void rasterize(const Raster&, const float*, float*, float*, int);                                                 \
+    void weigh(const Raster&, const float*, float*, int);                                                             \
     void rasterize_backward(                                                                                          \
         const Raster&, const float*, const float*, const float*, const float*, const float*, float*, int);            \
     void l1_ssim(const Pictures&, const Part*, int, float*, int);                                                     \
@@ -91,6 +92,10 @@ void rasterize_backward_dispatched(
     SGS_DISPATCH(rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments, threads))
 }
 
+void weigh_dispatched(const Raster& raster, const float* maps, float* sums, int threads) {
+    SGS_DISPATCH(weigh(raster, maps, sums, threads))
+}
+
 void project_backward_dispatched(
     const GaussianInputs& in, const Raster& raster, const float* moments, const GaussianGradients& out, int threads) {
     SGS_DISPATCH(project_backward(in, raster, moments, out, threads))
@@ -155,21 +160,46 @@ void* sgs_raster_forward(
     }
 }
 
+int sgs_raster_weights(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, float* weights,
+    int threads) {
+    try {
+        Raster raster;
+        raster.camera = pinhole(viewmat, K, width, height, near_plane);
+        raster.tiles_x = (width + kTile - 1) / kTile;
+        raster.tiles_y = (height + kTile - 1) / kTile;
+        raster.trained = 0;
+        raster.splats.resize(count);
+        std::vector<float> radii(count);
+        // Colours play no part; any numbers of the right count will do.
+        project_dispatched({means, quats, scales, opacities, means, nullptr, count}, raster, radii.data(), threads);
+        bin(raster);
+        std::vector<float> sums(2 * raster.pairs.size());
+        weigh_dispatched(raster, maps, sums.data(), threads);
+        for (int64_t i = 0; i < count; ++i) {
+            weights[2 * i] = weights[2 * i + 1] = 0.0f;
+            for (int64_t slot = raster.slots[i]; slot < raster.slots[i + 1]; ++slot)
+                weights[2 * i] += sums[2 * slot], weights[2 * i + 1] += sums[2 * slot + 1];
+        }
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
+}
+
 int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,
     const float* opacities, const float* colors, const float* background, const float* image, const float* alpha,
     const float* grad_image, const float* grad_alpha, float* grad_means, float* grad_quats, float* grad_scales,
     float* grad_opacities, float* grad_colors, float* grad_screen_offsets, int threads) {
     const Raster& raster = *static_cast<const Raster*>(state);
-    std::vector<float> moments;
-    try {
-        moments.resize(static_cast<size_t>(raster.slots[raster.trained]) * kMomentCount, 0.0f);
-    } catch (const std::bad_alloc&) {
-        return 1;
-    }
-    rasterize_backward_dispatched(raster, background, image, alpha, grad_image, grad_alpha, moments.data(), threads);
+    const size_t numbers = static_cast<size_t>(raster.slots[raster.trained]) * kMomentCount;
+    const std::unique_ptr<float[]> moments(new (std::nothrow) float[numbers]);
+    if (!moments) return 1;
+    rasterize_backward_dispatched(raster, background, image, alpha, grad_image, grad_alpha, moments.get(), threads);
     project_backward_dispatched(
-        {means, quats, scales, opacities, colors, nullptr, count}, raster, moments.data(),
+        {means, quats, scales, opacities, colors, nullptr, count}, raster, moments.get(),
         {grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_screen_offsets}, threads);
     return 0;
 }

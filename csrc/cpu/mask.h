@@ -3,6 +3,8 @@
 // lanes of ones elsewhere.
 #pragma once
 
+#include <cmath>
+
 #include "vec.h"
 
 #if defined(__AVX512F__) || defined(__AVX__) || defined(__SSE2__)
@@ -46,6 +48,19 @@ inline bool any(mask m) {
 }
 
 #endif
+
+inline vf square_root(vf x) {
+#if defined(__AVX512F__)
+    return (vf)_mm512_maskz_sqrt_ps(0xffff, (__m512)x);
+#elif defined(__AVX__)
+    return (vf)_mm256_sqrt_ps((__m256)x);
+#elif defined(__SSE2__)
+    return (vf)_mm_sqrt_ps((__m128)x);
+#else
+    for (int i = 0; i < kLanes; ++i) x[i] = std::sqrt(x[i]);
+    return x;
+#endif
+}
 
 // 1 / x to about one unit in the last place, for x that is neither tiny nor huge.
 inline vf reciprocal(vf x) {

@@ -186,12 +186,14 @@ void blend_backward(
     }
     int live = kBlocks;
     bool done[kBlocks] = {};
-    for (int n = raster.starts[index]; n < raster.starts[index + 1] && live > 0; ++n) {
+    int n = raster.starts[index];
+    for (; n < raster.starts[index + 1] && live > 0; ++n) {
         const Splat& s = raster.splats[raster.pairs[n]];
         // Neighbours in depth are far apart in memory: ask early.
         __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
         const Blocks blocks(s, tile.left, tile.top);
         const bool trained = raster.pairs[n] < raster.trained;
+        float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
@@ -222,13 +224,67 @@ void blend_backward(
                 store(T + at, choose(c.stopped, -before, after));
                 if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
             }
-        if (!hit || !trained) continue;
-        float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
-        store_sums(m, out);
+        if (!trained) continue;
+        if (hit) {
+            store_sums(m, out);
+        } else {
+            std::memset(out, 0, sizeof(float) * kMomentCount);
+        }
+    }
+    for (; n < raster.starts[index + 1]; ++n)  // hidden
+        if (raster.pairs[n] < raster.trained)
+            std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
+}
+
+// Sums over the pixels of each pair's weight times each of two maps: sums[2 * slot], all of which are written.
+void weigh(const Raster& raster, int index, const float* maps, float* sums) {
+    const Tile tile(raster, index);
+    const Lanes lanes;
+    alignas(kAlignment) float T[kTilePixels], values[2][kTilePixels];
+    gather<2>(maps, raster.camera.width, tile, values);
+    for (float& t : T) t = 1.0f;
+    int live = kBlocks;
+    bool done[kBlocks] = {};
+    for (int n = raster.starts[index]; n < raster.starts[index + 1]; ++n) {
+        float* out = sums + 2 * static_cast<size_t>(raster.pair_slots[n]);
+        out[0] = out[1] = 0.0f;
+        if (live == 0) continue;
+        const Splat& s = raster.splats[raster.pairs[n]];
+        __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
+        const Blocks blocks(s, tile.left, tile.top);
+        vf m[2] = {splat(0.0f), splat(0.0f)};
+        for (int by = blocks.y0; by < blocks.y1; ++by)
+            for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
+                const int block = by * kBlocksX + bx, at = block * kLanes;
+                if (done[block]) continue;
+                const vf before = load(T + at);
+                Coverage c;
+                if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
+                const vf weight = c.alpha * before;
+                m[0] += weight * load(values[0] + at), m[1] += weight * load(values[1] + at);
+                const vf after = before * (1.0f - c.alpha);
+                store(T + at, after);
+                if (!any(c.stopped)) continue;
+                store(T + at, choose(c.stopped, -before, after));
+                if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
+            }
+        for (int k = 0; k < 2; ++k) {
+            float parts[kLanes];
+            store(parts, m[k]);
+            for (int step = kLanes / 2; step > 0; step /= 2)
+                for (int l = 0; l < step; ++l) parts[l] += parts[l + step];
+            out[k] = parts[0];
+        }
     }
 }
 
 }  // namespace
+
+void weigh(const Raster& raster, const float* maps, float* sums, int threads) {
+    const int tiles = raster.tiles_x * raster.tiles_y;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
+    for (int t = 0; t < tiles; ++t) weigh(raster, t, maps, sums);
+}
 
 void rasterize(const Raster& raster, const float* background, float* image, float* alpha, int threads) {
     const int tiles = raster.tiles_x * raster.tiles_y;
@@ -237,7 +293,7 @@ void rasterize(const Raster& raster, const float* background, float* image, floa
         if (raster.draws(t)) blend(raster, t, background, image, alpha);
 }
 
-// moments: kMomentCount numbers for each pair of a trained splat, zero on entry.
+// moments: kMomentCount numbers for each pair of a trained splat, all of which are written.
 void rasterize_backward(
     const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
     const float* grad_alpha, float* moments, int threads) {

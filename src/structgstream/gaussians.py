@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Renderable Gaussians: what a scene looks like from one camera, ready for a rasteriser."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -35,6 +35,10 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def select(self, rows: Tensor) -> "Gaussians":
+        """The rows that a mask ``[N]`` or an index ``[n]`` names."""
+        return Gaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:

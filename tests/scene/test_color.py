@@ -13,5 +13,6 @@ def test_the_gauge_is_exact_and_keeps_differences() -> None:
 
 
 def test_identity_changes_nothing() -> None:
-    image = torch.rand(4, 5, 3)
-    assert torch.equal(CameraColor.identity(2).apply(image, 1), image)
+    color = CameraColor.identity(2)
+    assert torch.equal(color.gains, torch.ones(2, 3))
+    assert not color.biases.any()

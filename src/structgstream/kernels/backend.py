@@ -8,6 +8,7 @@ functions. A back-end that lacks an operation of its own names another's, visibl
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -30,6 +31,7 @@ class Backend:
         name: ``reference``, ``cpu`` or ``cuda``.
         device: where its tensors live.
         rasterize: see ``kernels.reference_raster.rasterize``.
+        blending_weights: see ``kernels.reference_raster.blending_weights``.
         l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
         changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
         visible_anchors: see ``kernels.reference_anchors.visible_anchors``.
@@ -40,6 +42,7 @@ class Backend:
     name: str
     device: torch.device
     rasterize: Callable[..., RasterOutput]
+    blending_weights: Callable[..., Tensor]
     l1_ssim: Callable[..., tuple[Tensor, Tensor]]
     changed_pixels: Callable[..., Tensor]
     visible_anchors: Callable[..., Tensor]
@@ -61,6 +64,7 @@ def reference_backend() -> Backend:
         name="reference",
         device=torch.device("cpu"),
         rasterize=reference_raster.rasterize,
+        blending_weights=partial(reference_raster.blending_weights, reference_raster.rasterize),
         l1_ssim=reference_ssim.l1_ssim,
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,
@@ -83,6 +87,7 @@ def cpu_backend() -> Backend:
         name="cpu",
         device=torch.device("cpu"),
         rasterize=cpu_raster.rasterize,
+        blending_weights=cpu_raster.blending_weights,
         l1_ssim=cpu_ssim.l1_ssim,
         changed_pixels=cpu_change.changed_pixels,
         visible_anchors=cpu_anchors.visible_anchors,
@@ -97,7 +102,13 @@ def cuda_backend() -> Backend:
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
-    from structgstream.kernels import reference_adam, reference_anchors, reference_change, reference_ssim
+    from structgstream.kernels import (
+        reference_adam,
+        reference_anchors,
+        reference_change,
+        reference_raster,
+        reference_ssim,
+    )
     from structgstream.kernels.cuda import cuda_reason, rasterize
 
     reason = cuda_reason()
@@ -107,6 +118,7 @@ def cuda_backend() -> Backend:
         name="cuda",
         device=torch.device("cuda"),
         rasterize=rasterize,
+        blending_weights=partial(reference_raster.blending_weights, rasterize),
         l1_ssim=reference_ssim.l1_ssim,
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,

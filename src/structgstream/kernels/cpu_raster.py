@@ -83,8 +83,8 @@ class _Rasterize(torch.autograd.Function):
         means, quats, scales, opacities, colors, background, image, alpha = ctx.saved_tensors
         given = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         given_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        results = [torch.zeros_like(tensor) for tensor in (means, quats, scales, opacities, colors)]
-        offsets = means.new_zeros(means.shape[0], 2) if ctx.tracked else None
+        results = [torch.empty_like(tensor) for tensor in (means, quats, scales, opacities, colors)]
+        offsets = means.new_empty(means.shape[0], 2) if ctx.tracked else None
         failed = native_library().sgs_raster_backward(
             ctx.state.pointer,
             ctypes.c_int64(means.shape[0]),
@@ -155,3 +155,38 @@ def rasterize(
         n if trained is None else trained,
     )
     return RasterOutput(image, alpha, radii)
+
+
+def blending_weights(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    maps: Tensor,
+    *,
+    near: float,
+) -> Tensor:
+    """Sums of blending weights ``[N, 2]``, see ``kernels.reference_raster.blending_weights``; float32.
+
+    Raises:
+        MemoryError: the lists of what each tile draws do not fit.
+    """
+    tensors = [t.detach().float().contiguous() for t in (means, quats, scales, opacities, viewmat, K)]
+    maps = maps.float().contiguous()
+    height, width = maps.shape[:2]
+    weights = torch.empty(means.shape[0], 2)
+    failed = native_library().sgs_raster_weights(
+        ctypes.c_int64(means.shape[0]),
+        *(_pointer(tensor) for tensor in tensors),
+        ctypes.c_int(width),
+        ctypes.c_int(height),
+        ctypes.c_float(near),
+        _pointer(maps),
+        _pointer(weights),
+        ctypes.c_int(torch.get_num_threads()),
+    )
+    if failed:
+        raise MemoryError("The rasteriser has no memory left; draw fewer or smaller Gaussians.")
+    return weights

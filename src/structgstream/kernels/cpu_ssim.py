@@ -9,7 +9,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
-from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
+from structgstream.kernels.raster_types import count_pixels, tiles_of
 
 
 def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
@@ -43,7 +43,7 @@ class _L1SSIM(torch.autograd.Function):
             ctypes.c_int(torch.get_num_threads()),
         )
         ctx.save_for_backward(image, target, gains, biases, tiles, gradient)
-        counted = image.numel() if tiles is None else 3 * int(pixels_of_tiles(tiles, width, height).sum())
+        counted = image.numel() if tiles is None else 3 * count_pixels(tiles, width, height)
         l1, ssim = sums.cumsum(1)[:, -1].tolist()
         of_the_rest = image.numel() - counted
         return image.new_tensor(l1 / image.numel()), image.new_tensor((ssim + of_the_rest) / image.numel())

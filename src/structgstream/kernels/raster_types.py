@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 TILE_PIXELS = 16
@@ -17,6 +18,16 @@ def tiles_of(width: int, height: int) -> tuple[int, int]:
 def pixels_of_tiles(tiles: Tensor, width: int, height: int) -> Tensor:
     """A mask of tiles ``[rows, columns]`` as a mask of pixels ``[H, W]``."""
     return tiles.repeat_interleave(TILE_PIXELS, 0).repeat_interleave(TILE_PIXELS, 1)[:height, :width]
+
+
+def count_pixels(tiles: Tensor, width: int, height: int) -> int:
+    """Number of pixels in a mask of tiles ``[rows, columns]``."""
+    rows, columns = tiles_of(width, height)
+    heights = tiles.new_full((rows,), TILE_PIXELS, dtype=torch.int64)
+    widths = tiles.new_full((columns,), TILE_PIXELS, dtype=torch.int64)
+    heights[-1] -= rows * TILE_PIXELS - height
+    widths[-1] -= columns * TILE_PIXELS - width
+    return int(heights @ tiles.to(torch.int64) @ widths)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/2
 back by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -170,6 +171,42 @@ def rasterize(
         image = torch.where(inside[..., None], image, torch.zeros_like(image) if onto is None else onto)
         alpha = torch.where(inside, alpha, 0.0)
     return RasterOutput(image, alpha, radii)
+
+
+def blending_weights(
+    rasterize: Callable[..., RasterOutput],
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    maps: Tensor,
+    *,
+    near: float,
+) -> Tensor:
+    """For each Gaussian the sum over the pixels of its blending weight times either of two maps, ``[N, 2]``.
+
+    A colour's gradient is the sum of its Gaussian's weights times the picture's gradient, so any rasteriser can tell.
+
+    Args:
+        rasterize: one with the contract of :func:`rasterize`.
+        means: ``[N, 3]``, and the others as for :func:`rasterize`.
+        quats: ``[N, 4]``.
+        scales: ``[N, 3]``.
+        opacities: ``[N]``.
+        viewmat: ``[4, 4]``.
+        K: ``[3, 3]``.
+        maps: ``[H, W, 2]``; they give the picture's size.
+        near: smallest z.
+    """
+    height, width = maps.shape[:2]
+    with torch.enable_grad():
+        colors = torch.zeros_like(means).requires_grad_()
+        output = rasterize(means, quats, scales, opacities, colors, viewmat, K, width=width, height=height, near=near)
+        cotangent = torch.cat([maps, torch.zeros_like(maps[..., :1])], dim=-1)
+        (found,) = torch.autograd.grad(output.image, colors, cotangent)
+    return found[:, :2]
 
 
 def _reaching(low: Tensor, high: Tensor, tiles: Tensor, width: int, height: int) -> Tensor:

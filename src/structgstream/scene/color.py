@@ -37,7 +37,3 @@ class CameraColor:
             gains=self.gains - self.gains.mean(0) + 1.0,
             biases=self.biases - self.biases.mean(0),
         )
-
-    def apply(self, image: Tensor, camera: int) -> Tensor:
-        """``image`` ``[H, W, 3]`` as training camera number ``camera`` would have recorded it."""
-        return image * self.gains[camera] + self.biases[camera]

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera
-from structgstream.gaussians import Gaussians
+from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
+from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 
 
@@ -32,7 +33,14 @@ class Rendering:
     screen_offsets: Tensor | None
 
 
-def draw(gaussians: Gaussians, camera: Camera, backend: Backend, *, track_screen: bool = False) -> Rendering:
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    backend: Backend,
+    *,
+    track_screen: bool = False,
+    focus: Focus | None = None,
+) -> Rendering:
     """Rasterise a set of Gaussians.
 
     Args:
@@ -40,23 +48,33 @@ def draw(gaussians: Gaussians, camera: Camera, backend: Backend, *, track_screen
         camera: where from.
         backend: what computes.
         track_screen: keep the view-space positional gradient (see :class:`Rendering`).
+        focus: draw only its tiles, onto its picture and among its still Gaussians; the rendering tells of
+            ``gaussians`` alone.
     """
-    means = gaussians.means
+    means, count = gaussians.means, len(gaussians)
     offsets = torch.zeros_like(means[:, :2], requires_grad=True) if track_screen else None
+    drawn, drawn_offsets = gaussians, offsets
+    if focus is not None:
+        drawn = concatenate(gaussians, focus.still)
+        if offsets is not None:
+            drawn_offsets = torch.cat([offsets, offsets.new_zeros(len(focus.still), 2)])
     output = backend.rasterize(
-        means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.colors,
+        drawn.means,
+        drawn.quats,
+        drawn.scales,
+        drawn.opacities,
+        drawn.colors,
         camera.viewmat.to(means),
         camera.K.to(means),
         width=camera.width,
         height=camera.height,
         near=camera.near,
-        screen_offsets=offsets,
+        screen_offsets=drawn_offsets,
+        tiles=None if focus is None else focus.tiles,
+        onto=None if focus is None else focus.picture,
+        trained=None if focus is None else count,
     )
-    return Rendering(output.image, output.alpha, output.radii, gaussians, offsets)
+    return Rendering(output.image, output.alpha, output.radii[:count], gaussians, offsets)
 
 
 def render(scene: Scene, camera: Camera, backend: Backend) -> Rendering:

@@ -8,18 +8,22 @@
                               '-- view-space gradients by id
 """
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
+from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 from structgstream.training.losses import LossWeights
+from structgstream.training.motion import STILL_FIELDS, MotionConfig, moving_parts
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
     FREE_ROWS,
@@ -28,6 +32,7 @@ from structgstream.training.parameters import (
     detached,
     parameters_of_fields,
 )
+from structgstream.training.partition import Partition, focuses
 from structgstream.training.patching import (
     PatchingConfig,
     children_of,
@@ -74,6 +79,16 @@ class OnlineConfig:
     losses: LossWeights = field(default_factory=LossWeights)
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
+    motion: MotionConfig | None = None
+    """Fit only what moves (None, the paper: everything)."""
+
+    def __post_init__(self) -> None:
+        shared = sorted(self.dynamic.intersection(STILL_FIELDS))
+        if self.motion is not None and shared:
+            raise ConfigError(
+                f"Fitting only what moves needs everything else to stay as it is, but {', '.join(shared)} change with "
+                "every frame; take them out of the dynamic fields or set motion to None."
+            )
 
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
@@ -107,6 +122,7 @@ def fit_next_frame(
     config: OnlineConfig,
     backend: Backend,
     seed: int,
+    before: MultiViewFrame | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult:
     """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
@@ -118,64 +134,106 @@ def fit_next_frame(
         config: what may change, and how.
         backend: what computes.
         seed: all randomness comes from it, so a frame can be repeated alone.
+        before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
     generator = torch.Generator().manual_seed(seed)
     watch = Stopwatch(backend.device)
-    patching = config.patching
-    if patching.lifetime == "frame":
+    if config.patching.lifetime == "frame":
         scene = scene.without_free()
     views = training_views(frame, rig, backend.device)
-    order = shuffled_views(views, generator)
-    parameters = Parameters.of(scene, trained=parameters_of_fields(config.dynamic))
-    adam = Adam(backend)
-    statistics = GradientStatistics(_slots(scene), backend.device)
-    last_pass = LastPass()
-    spawned = pruned = 0
-    for iteration in range(1, config.iterations + 1):
-        view = next(order)
-        current = parameters.scene(scene)
-        loss = view_loss(
-            current,
-            view,
-            backend=backend,
-            weights=config.losses,
-            voxel_size=0.0,
-            track_screen=patching.spawn != "off" and patching.collect_from < iteration <= patching.iteration,
-            watch=watch,
+    fit = _Fit(config, backend, frame.index, generator, watch, on_step)
+    if config.motion is None or before is None or _is_full(config.motion, frame.index):
+        return fit.run(scene, views)
+    with watch.stage("find motion"):
+        earlier = training_views(before, rig, backend.device)
+        which = moving_parts(scene, views, earlier, config=config.motion, backend=backend)
+        partition = Partition.of(scene, which)
+    result = fit.run(partition.moving, views, partition=partition)
+    return replace(result, scene=partition.together(result.scene))
+
+
+def _is_full(motion: MotionConfig, frame_index: int) -> bool:
+    return motion.full_every_frames > 0 and frame_index % motion.full_every_frames == 0
+
+
+@dataclass
+class _Fit:
+    """The optimisation of one frame."""
+
+    config: OnlineConfig
+    backend: Backend
+    frame_index: int
+    generator: torch.Generator
+    watch: Stopwatch
+    on_step: StepListener | None
+
+    def run(self, scene: Scene, views: list[View], *, partition: Partition | None = None) -> FitResult:
+        """Fit ``scene`` to the pictures; with a partition it is its moving part, where that shows."""
+        config, watch, patching = self.config, self.watch, self.config.patching
+        places = None if partition is None else self._places(partition, views)
+        still_free = 0 if partition is None else len(partition.still.free)
+        seen = views if places is None else [view for view in views if view.index in places]
+        iterations = math.ceil(config.iterations * len(seen) / len(views))  # Each view as often as in a full frame.
+        patch_at = math.ceil(patching.iteration * len(seen) / len(views))
+        order = shuffled_views(seen, self.generator)
+        parameters = Parameters.of(scene, trained=parameters_of_fields(config.dynamic))
+        adam = Adam(self.backend)
+        statistics = GradientStatistics(_slots(scene), self.backend.device)
+        last_pass = LastPass()
+        spawned = pruned = 0
+        for iteration in range(1, iterations + 1):
+            view = next(order)
+            loss = view_loss(
+                parameters.scene(scene),
+                view,
+                backend=self.backend,
+                weights=config.losses,
+                voxel_size=0.0,
+                track_screen=patching.spawn != "off" and patching.collect_from < iteration <= patch_at,
+                watch=watch,
+                focus=None if places is None else places[view.index],
+            )
+            gradients, screen_gradient = gradients_of(loss, parameters, watch)
+            if iteration > iterations - len(seen):
+                last_pass.add(loss, view)
+            with watch.stage("optimise"):
+                adam.step(parameters, gradients, online_rates(config, (iteration - 1) / iterations))
+            if screen_gradient is not None:
+                statistics.add(loss.rendering, screen_gradient)
+            if iteration == patch_at and "free" in config.dynamic:
+                with watch.stage("patch"), torch.no_grad():
+                    others = [other for other in seen if other.index != view.index]
+                    spawned, pruned = _patch(
+                        parameters,
+                        adam,
+                        scene=scene,
+                        statistics=statistics,
+                        views=[view, *others],
+                        frame_index=self.frame_index,
+                        room=patching.max_free - still_free,
+                        config=patching,
+                        backend=self.backend,
+                        generator=self.generator,
+                    )
+            if self.on_step is not None:
+                free = parameters.values["free_means"].shape[0] + still_free
+                self.on_step(Step(iteration, iterations, float(loss.total.detach()), len(scene.anchors), free))
+        return FitResult(
+            scene=detached(parameters.scene(scene)),
+            iterations=iterations,
+            train_psnr=last_pass.psnr,
+            moving=len(scene.anchors),
+            spawned=spawned,
+            pruned=pruned,
+            seconds=watch.seconds,
+            losses=last_pass.terms,
         )
-        gradients, screen_gradient = gradients_of(loss, parameters, watch)
-        if iteration > config.iterations - len(views):
-            last_pass.add(loss, view)
-        with watch.stage("optimise"):
-            adam.step(parameters, gradients, online_rates(config, (iteration - 1) / config.iterations))
-        if screen_gradient is not None:
-            statistics.add(loss.rendering, screen_gradient)
-        if iteration == patching.iteration and "free" in config.dynamic:
-            with watch.stage("patch"), torch.no_grad():
-                spawned, pruned = _patch(
-                    parameters,
-                    adam,
-                    scene=scene,
-                    statistics=statistics,
-                    views=[view, *(other for other in views if other.index != view.index)],
-                    frame_index=frame.index,
-                    config=patching,
-                    backend=backend,
-                    generator=generator,
-                )
-        if on_step is not None:
-            free = parameters.values["free_means"].shape[0]
-            on_step(Step(iteration, config.iterations, float(loss.total.detach()), len(scene.anchors), free))
-    return FitResult(
-        scene=detached(parameters.scene(scene)),
-        iterations=config.iterations,
-        train_psnr=last_pass.psnr,
-        spawned=spawned,
-        pruned=pruned,
-        seconds=watch.seconds,
-        losses=last_pass.terms,
-    )
+
+    def _places(self, partition: Partition, views: list[View]) -> dict[int, Focus]:
+        assert self.config.motion is not None
+        with self.watch.stage("find motion"):
+            return focuses(partition, views, config=self.config.motion, backend=self.backend)
 
 
 def _slots(scene: Scene) -> int:
@@ -191,6 +249,7 @@ def _patch(
     statistics: GradientStatistics,
     views: list[View],
     frame_index: int,
+    room: int,
     config: PatchingConfig,
     backend: Backend,
     generator: torch.Generator,
@@ -201,7 +260,7 @@ def _patch(
     ids = parents_of(
         statistics.mean(),
         statistics.count,
-        room=config.max_free - int(keep.sum()),
+        room=room - int(keep.sum()),
         config=config,
         generator=generator,
     )

@@ -28,7 +28,9 @@ class FitResult:
     Args:
         scene: the scene after optimisation, detached, in normalised units.
         iterations: optimisation steps done.
-        train_psnr: mean over training cameras of the PSNR of the last rendering of each during optimisation, dB.
+        train_psnr: mean over training cameras of the PSNR of the last rendering of each during optimisation, dB, over
+            the pixels that were drawn; NaN when there was nothing to do.
+        moving: anchors that were free to move.
         spawned: free Gaussians added in this frame.
         pruned: free Gaussians removed in this frame.
         seconds: wall-clock seconds by stage (``render``, ``loss``, ``backward``, ``optimise``, ``patch``, ...).
@@ -38,6 +40,7 @@ class FitResult:
     scene: Scene
     iterations: int
     train_psnr: float
+    moving: int = 0
     spawned: int = 0
     pruned: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)

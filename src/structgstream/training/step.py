@@ -9,6 +9,8 @@ from torch import Tensor
 
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import pixels_of_tiles
+from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
 from structgstream.training.losses import LossWeights, offset_distance, volume
@@ -24,14 +26,24 @@ class ViewLoss:
     total: Tensor
     terms: dict[str, Tensor]
     rendering: Rendering
-    image: Tensor
+    gains: Tensor
+    biases: Tensor
     structured: StructuredGaussians
     visible: Tensor
+    focus: Focus | None
+
+    @property
+    def image(self) -> Tensor:
+        """The rendering as the camera would have recorded it: what was compared, ``[H, W, 3]``."""
+        return self.rendering.image * self.gains + self.biases
 
     def squared_error(self, view: View) -> float:
-        """Mean squared error of the clamped rendering against the picture."""
+        """Mean squared error of the clamped rendering against the picture, where it was drawn."""
         with torch.no_grad():
-            return float((self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square().mean())
+            squares = (self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square()
+            if self.focus is not None:
+                squares = squares[pixels_of_tiles(self.focus.tiles, view.camera.width, view.camera.height)]
+            return float(squares.mean())
 
 
 def view_loss(
@@ -43,16 +55,21 @@ def view_loss(
     voxel_size: float,
     track_screen: bool,
     watch: Stopwatch,
+    focus: Focus | None = None,
 ) -> ViewLoss:
-    """Render ``view`` and compare it with its picture (paper, equations for L and L_init)."""
+    """Render ``view`` and compare it with its picture (paper, equations for L and L_init), or what ``focus`` names."""
     with watch.stage("generate"):
-        structured, visible = scene.structured(view.camera, backend)
+        structured, visible = scene.structured(view.camera, backend, tiles=None if focus is None else focus.tiles)
         gaussians = scene.dressed(structured)
     with watch.stage("rasterise"):
-        rendering = draw(gaussians, view.camera, backend, track_screen=track_screen)
-        image = scene.camera_color.apply(rendering.image, view.index)
+        rendering = draw(gaussians, view.camera, backend, track_screen=track_screen, focus=focus)
     with watch.stage("loss"):
-        l1, ssim = backend.l1_ssim(image, view.image)
+        image, tiles = rendering.image, None if focus is None else focus.tiles
+        gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]
+        if gains.requires_grad:
+            l1, ssim = backend.l1_ssim(image * gains + biases, view.image, tiles=tiles)
+        else:  # A constant correction costs nothing inside the loss.
+            l1, ssim = backend.l1_ssim(image, view.image, gains=gains, biases=biases, tiles=tiles)
         terms = {"l1": l1, "ssim": 1.0 - ssim}
         total = weights.l1 * l1 + weights.ssim * terms["ssim"]
         if weights.volume:
@@ -61,7 +78,7 @@ def view_loss(
         if weights.offset_distance:
             terms["offset_distance"] = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights)
             total = total + weights.offset_distance * terms["offset_distance"]
-    return ViewLoss(total, terms, rendering, image, structured, visible)
+    return ViewLoss(total, terms, rendering, gains, biases, structured, visible, focus)
 
 
 def gradients_of(

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A part of a picture: what moves there is drawn anew, the rest is there already."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from structgstream.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Focus:
+    """Where a camera's picture can differ from the one before.
+
+    Drawing with a focus gives in its tiles what drawing everything would give, as long as what moves stays within
+    them, at the cost of the tiles.
+
+    Args:
+        tiles: ``[rows, columns]`` bool (``kernels.raster_types``), those that moving Gaussians reach.
+        picture: ``[H, W, 3]`` the rest of the picture, as far as a loss looks beyond the tiles; drawn onto in place.
+        still: Gaussians that reach the tiles and do not move; without gradient.
+    """
+
+    tiles: Tensor
+    picture: Tensor
+    still: Gaussians

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What moves: only anchors and free Gaussians whose place in the pictures changed are fitted (design, change gate).
+
+A Gaussian votes in every view that draws it: it may move if it covers changed pixels, and if they are a good part of
+what it covers there. Blending weights are used, so what is hidden behind something does not vote.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import FieldName
+from structgstream.training.views import View
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """When something counts as moving."""
+
+    change_threshold: float = 0.05
+    """Mean absolute difference, in 0 ... 1, of 3 x 3 pixels since the last frame; above the sensors' noise."""
+    reach_pixels: int = 3
+    """So far around a changed pixel things may have moved."""
+    least_pixels: float = 0.3
+    """A Gaussian votes in a view where it covers so many changed pixels, counted by blending weight ..."""
+    least_share: float = 0.3
+    """... and so large a part of what it covers."""
+    least_views: int = 2
+    """Votes that let an anchor, or a free Gaussian, move: one picture cannot tell motion from noise."""
+    picture_scale: float = 0.25
+    """Who covers what is found on pictures of this size."""
+    margin_pixels: int = 8
+    """Tiles this far around what moves are drawn too, so that it finds its loss where it goes."""
+    full_every_frames: int = 0
+    """Everything may move in every so many-th frame: changes too slow to be seen add up. 0: never."""
+    tiles: bool = True
+    """Draw only the tiles that moving Gaussians reach. Off: whole pictures, for the same result at their cost."""
+
+
+STILL_FIELDS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp", "camera_color")
+"""Shared by all anchors: while something stands still these must not be in the dynamic set."""
+
+
+@dataclass(frozen=True)
+class Moving:
+    """What may move in a frame.
+
+    Args:
+        anchors: mask ``[M]``.
+        free: mask ``[F]``.
+        shown: for each view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
+    """
+
+    anchors: Tensor
+    free: Tensor
+    shown: dict[int, Tensor]
+
+
+def moving_parts(
+    scene: Scene, views: Sequence[View], before: Sequence[View], *, config: MotionConfig, backend: Backend
+) -> Moving:
+    """What may move between the pictures ``before`` and those of ``views`` (same cameras, same order)."""
+    k, anchors, free = scene.anchors.offsets_per_anchor, len(scene.anchors), len(scene.free)
+    votes = torch.zeros(anchors + free, device=scene.anchors.positions.device)
+    shown: dict[int, Tensor] = {}
+    with torch.no_grad():
+        for view, last in zip(views, before, strict=True):
+            changed = backend.changed_pixels(
+                last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
+            )
+            weights = _weights(scene, view.camera, changed, config, backend)
+            # The K Gaussians of an anchor vote together: it moves as one.
+            structured, single = weights[: anchors * k].reshape(anchors, k, 2), weights[anchors * k :]
+            total, part = torch.cat([structured.sum(1), single]).unbind(1)
+            votes += (part > config.least_pixels) & (part > config.least_share * total)
+            shown[view.index] = weights[:, 0] > config.least_pixels
+    enough = votes >= config.least_views
+    return Moving(enough[:anchors], enough[anchors:], shown)
+
+
+def _weights(scene: Scene, camera: Camera, changed: Tensor, config: MotionConfig, backend: Backend) -> Tensor:
+    """Blending weight of each Gaussian over the picture and over its changed part, ``[M * K + F, 2]`` pixels."""
+    height, width = changed.shape
+    small = camera.resized(*(max(1, round(size * config.picture_scale)) for size in (width, height)))
+    gaussians = scene.gaussians(small, backend)
+    part = torch.nn.functional.interpolate(
+        changed[None, None].to(gaussians.means), size=(small.height, small.width), mode="area"
+    )[0, 0]
+    found = backend.blending_weights(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        small.viewmat.to(gaussians.means),
+        small.K.to(gaussians.means),
+        torch.stack([torch.ones_like(part), part], dim=-1),
+        near=small.near,
+    )
+    slots = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
+    weights = found.new_zeros(slots, 2)
+    weights[gaussians.ids] = found * (changed.numel() / part.numel())
+    return weights

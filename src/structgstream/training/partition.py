@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene taken apart into what moves in a frame and what stands still, and put together again.
+
+The moving part is a scene of its own with the same MLPs: a trainer works on it as on any other, at the cost of what
+moves. Its ids are its own (Note [Ids]).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import concatenate
+from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
+from structgstream.scene.anchors import AnchorCloud
+from structgstream.scene.focus import Focus
+from structgstream.scene.render import Rendering, draw
+from structgstream.scene.scene import Scene
+from structgstream.training.motion import MotionConfig, Moving
+from structgstream.training.views import View
+
+
+@dataclass(frozen=True)
+class Partition:
+    """A scene in two parts.
+
+    Args:
+        whole: as it was.
+        which: what the moving part holds.
+        moving: that part.
+        still: the rest.
+    """
+
+    whole: Scene
+    which: Moving
+    moving: Scene
+    still: Scene
+
+    @classmethod
+    def of(cls, scene: Scene, which: Moving) -> "Partition":
+        """Take ``scene`` apart."""
+
+        def part(anchors: Tensor, free: Tensor) -> Scene:
+            columns = {f.name: getattr(scene.anchors, f.name)[anchors] for f in fields(AnchorCloud)}
+            return replace(scene, anchors=AnchorCloud(**columns), free=scene.free.select(free))
+
+        moving = part(which.anchors, which.free)
+        return cls(scene, which, moving, part(~which.anchors, ~which.free))
+
+    def together(self, moved: Scene) -> Scene:
+        """The whole scene, its moving part replaced by ``moved``; what stood still keeps its bits.
+
+        ``moved`` has the anchors of ``moving``; free Gaussians may have come and gone.
+        """
+        columns = {f.name: getattr(self.whole.anchors, f.name).clone() for f in fields(AnchorCloud)}
+        for name, column in columns.items():
+            column[self.which.anchors] = getattr(moved.anchors, name)
+        free = self.still.free.append(moved.free)
+        return replace(
+            self.whole,
+            anchors=AnchorCloud(**columns),
+            free=free.select(free.births.argsort()),  # Births ascend, and are never used twice.
+        )
+
+
+def focuses(partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend) -> dict[int, Focus]:
+    """By index, the views that the moving part shows in, and where."""
+    which, moving = partition.which, partition.moving
+    k = moving.anchors.offsets_per_anchor
+    rows = torch.cat([which.anchors.repeat_interleave(k), which.free])  # of the whole scene's Gaussians
+    with torch.no_grad():
+        found = {
+            view.index: _focus(partition.still, moving, which.shown[view.index][rows], view.camera, config, backend)
+            for view in views
+        }
+    return {index: focus for index, focus in found.items() if focus is not None}
+
+
+def _focus(
+    still: Scene, moving: Scene, shown: Tensor, camera: Camera, config: MotionConfig, backend: Backend
+) -> Focus | None:
+    in_motion = moving.gaussians(camera, backend)
+    tiles = reached_tiles(draw(in_motion, camera, backend), shown[in_motion.ids], camera, config.margin_pixels)
+    if not tiles.any():
+        return None
+    if not config.tiles:
+        tiles = torch.ones_like(tiles)
+    # The loss looks ten pixels beyond a tile: a ring of tiles around them is drawn once and stays as it is.
+    ring = torch.nn.functional.max_pool2d(tiles[None].float(), 3, stride=1, padding=1)[0] > 0
+    structured, _ = still.structured(camera, backend, tiles=ring)
+    at_rest = still.dressed(structured)
+    nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.device))
+    empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
+    rendering = draw(concatenate(in_motion, at_rest), camera, backend, focus=Focus(ring, empty, nothing))
+    return Focus(tiles, rendering.image, at_rest)
+
+
+def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> Tensor:
+    """Mask of the tiles that drawn Gaussians of the mask ``shown`` reach, or could within ``margin_pixels``.
+
+    Two standard deviations of a Gaussian count: what lies beyond hardly shows.
+    """
+    rows, columns = tiles_of(camera.width, camera.height)
+    drawn = shown & (rendering.radii > 0)
+    means = rendering.gaussians.means[drawn]
+    viewmat, K = (matrix.to(means) for matrix in (camera.viewmat, camera.K))
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    centers = (points @ K.T)[:, :2] / points[:, 2:]
+    reach = 0.6 * rendering.radii[drawn, None] + margin_pixels
+    none, last = centers.new_zeros(2), centers.new_tensor([columns - 1, rows - 1])
+    low = ((centers - reach) / TILE_PIXELS).floor()
+    high = ((centers + reach) / TILE_PIXELS).floor()
+    inside = ((high >= none) & (low <= last)).all(1)
+    low = low[inside].clamp(min=none, max=last).long()
+    high = high[inside].clamp(min=none, max=last).long() + 1
+    # Each box adds one at two of its corners and takes one at the others; running sums then count boxes.
+    corners = torch.zeros((rows + 1) * (columns + 1), device=centers.device)
+    one = torch.ones(len(low), device=centers.device)
+    for x, y, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
+        corners.index_add_(0, y[:, 1] * (columns + 1) + x[:, 0], sign * one)
+    return corners.reshape(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns] > 0.5
