@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles this package's CUDA sources where NVIDIA's compiler is, once for each kind of GPU, and keeps the result.
+
+The sources are installed with the package, because the machine that builds a wheel is seldom the one with the GPU.
+"""
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+
+from structgstream.errors import BackendError
+from structgstream.kernels.cuda_ssim import LossLibrary, cuda_stream
+
+FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC")
+_LAST_LINES = 5  # of what a failing compiler says
+
+
+def source_folder() -> Path:
+    """Where the install puts the sources."""
+    return Path(str(files("structgstream") / "_native" / "cuda"))
+
+
+def find_nvcc(environment: Mapping[str, str]) -> Path | None:
+    """NVIDIA's compiler: in ``CUDA_HOME`` or ``CUDA_PATH``, on ``PATH``, or where its installer puts it."""
+    folders = [Path(environment[name]) / "bin" for name in ("CUDA_HOME", "CUDA_PATH") if environment.get(name)]
+    on_path = shutil.which("nvcc", path=environment.get("PATH", ""))
+    candidates = [folder / "nvcc" for folder in folders]
+    candidates += [Path(on_path)] if on_path else []
+    candidates.append(Path("/usr/local/cuda/bin/nvcc"))
+    return next((path for path in candidates if os.access(path, os.X_OK) and path.is_file()), None)
+
+
+def cache_folder(environment: Mapping[str, str]) -> Path:
+    """Where compiled libraries are kept: the user's cache."""
+    root = environment.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "structgstream" / "cuda"
+
+
+def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Path:
+    """The library for ``architecture`` (``sm_90``), compiled now unless ``cache`` has it.
+
+    It is kept under a hash of the sources, the compiler's version, the flags and the architecture. Processes may race:
+    a library appears whole or not at all.
+
+    Raises:
+        BackendError: the sources are not there, the compiler fails, or the cache cannot be written.
+    """
+    units = sorted(sources.glob("*.cu"))
+    if not units:
+        raise BackendError(f"No CUDA sources lie in {sources}; install structgstream again.")
+    virtual = architecture.replace("sm_", "compute_")
+    flags = [*FLAGS, "-gencode", f"arch={virtual},code={architecture}"]
+    state = hashlib.sha256("\n".join([_output([str(nvcc), "--version"]), *flags]).encode())
+    for path in sorted([*units, *sources.glob("*.h")]):
+        state.update(path.name.encode() + b"\0" + path.read_bytes())
+    library = cache / f"{architecture}-{state.hexdigest()[:32]}.so"
+    if library.is_file():
+        return library
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as scratch:
+            built = Path(scratch) / library.name
+            _output([str(nvcc), *flags, "-o", str(built), *map(str, units)])
+            built.replace(library)
+    except OSError as error:
+        raise BackendError(f"Compiled CUDA kernels cannot be kept in {cache} ({error}); set XDG_CACHE_HOME.") from error
+    return library
+
+
+def _output(command: list[str]) -> str:
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        said = "\n".join((result.stderr or result.stdout).strip().splitlines()[-_LAST_LINES:])
+        raise BackendError(f"{command[0]} failed with status {result.returncode}: {said}")
+    return result.stdout
+
+
+def loss_plan() -> tuple[Path | None, str]:
+    """NVIDIA's compiler, and a sentence: what the loss of the cuda back-end runs on, and why. Compiles nothing."""
+    nvcc = find_nvcc(os.environ)
+    if nvcc is None:
+        return None, (
+            "L1 and SSIM run in torch, which is slower than this package's kernels: nvcc was not found; install "
+            "NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
+        )
+    return nvcc, f"L1 and SSIM run in this package's kernels, compiled by {nvcc}."
+
+
+@cache
+def loss_library() -> tuple[LossLibrary | None, str]:
+    """The kernels for this machine's GPU or None, and a sentence: what runs and why. The first call compiles."""
+    nvcc, sentence = loss_plan()
+    if nvcc is None:
+        return None, sentence
+    major, minor = torch.cuda.get_device_capability()
+    try:
+        path = compiled(f"sm_{major}{minor}", nvcc=nvcc, sources=source_folder(), cache=cache_folder(os.environ))
+        return LossLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream), sentence
+    except (BackendError, OSError) as error:
+        return None, f"L1 and SSIM run in torch, which is slower than this package's kernels: {error}"

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The CUDA sources compile where NVIDIA's compiler is, and without it everything says why."""
+
+import ctypes
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from structgstream.errors import BackendError
+from structgstream.kernels import _nvcc
+
+SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
+NVCC = _nvcc.find_nvcc(os.environ)
+needs_nvcc = pytest.mark.skipif(NVCC is None, reason="nvcc, NVIDIA's compiler, was not found")
+
+
+def pretended(folder: Path, script: str) -> Path:
+    """A compiler that logs its calls and does what ``script`` says; ``$out`` is the file it is asked for."""
+    folder.mkdir(parents=True, exist_ok=True)
+    program = folder / "nvcc"
+    program.write_text(
+        '#!/bin/sh\nif [ "$1" = --version ]; then echo "release 1.0"; exit; fi\n'
+        f'echo call >>"{folder}/calls"\n'
+        'while [ $# -gt 0 ]; do if [ "$1" = -o ]; then out=$2; fi; shift; done\n' + script
+    )
+    program.chmod(0o755)
+    return program
+
+
+@needs_nvcc
+@pytest.mark.parametrize("architecture", ["sm_80", "sm_90"])
+def test_the_sources_compile(architecture: str, tmp_path: Path) -> None:
+    assert NVCC is not None
+    path = _nvcc.compiled(architecture, nvcc=NVCC, sources=SOURCES, cache=tmp_path)
+    library = ctypes.CDLL(str(path))  # CUDA's runtime is linked in, so it loads without a GPU.
+    for name in ("sgs_cuda_l1_ssim", "sgs_cuda_l1_ssim_backward", "sgs_cuda_error"):
+        assert hasattr(library, name)
+    library.sgs_cuda_error.restype = ctypes.c_char_p
+    assert library.sgs_cuda_error(ctypes.c_int(1)) == b"invalid argument"
+
+
+def test_the_sources_are_installed() -> None:
+    installed = _nvcc.source_folder()
+    if not installed.is_dir():
+        pytest.skip("structgstream was not installed from its wheel or by cmake --install")
+    assert {path.name for path in SOURCES.glob("ssim*")} == {path.name for path in installed.iterdir()}
+
+
+def test_a_library_is_compiled_once_until_something_changes(tmp_path: Path) -> None:
+    nvcc = pretended(tmp_path / "bin", 'echo library >"$out"')
+    sources, cache = tmp_path / "sources", tmp_path / "cache"
+    sources.mkdir()
+    (sources / "a.cu").write_text("one")
+    (sources / "a.h").write_text("one")
+
+    def path() -> Path:
+        return _nvcc.compiled("sm_90", nvcc=nvcc, sources=sources, cache=cache)
+
+    first = path()
+    assert first.read_text() == "library\n"
+    assert path() == first
+    (sources / "a.h").write_text("two")
+    assert path() != first
+    assert _nvcc.compiled("sm_80", nvcc=nvcc, sources=sources, cache=cache) not in (first, path())
+    assert (tmp_path / "bin" / "calls").read_text().split() == ["call"] * 3
+    assert len(list(cache.iterdir())) == 3
+
+
+def test_a_failing_compiler_is_quoted_and_leaves_nothing(tmp_path: Path) -> None:
+    nvcc = pretended(tmp_path / "bin", 'echo half >"$out"; echo "unsupported GNU version" >&2; exit 2')
+    with pytest.raises(BackendError, match="unsupported GNU version"):
+        _nvcc.compiled("sm_90", nvcc=nvcc, sources=SOURCES, cache=tmp_path / "cache")
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    nvcc = pretended(tmp_path / "bin", "")
+    with pytest.raises(BackendError, match="No CUDA sources"):
+        _nvcc.compiled("sm_90", nvcc=nvcc, sources=tmp_path, cache=tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BackendError, match="set XDG_CACHE_HOME"):
+        _nvcc.compiled("sm_90", nvcc=nvcc, sources=SOURCES, cache=tmp_path / "file" / "cache")
+
+
+def test_where_the_compiler_is_looked_for(tmp_path: Path) -> None:
+    home, path = (pretended(tmp_path / name / "bin", "") for name in ("home", "path"))
+    assert _nvcc.find_nvcc({"CUDA_HOME": str(tmp_path / "home"), "PATH": str(path.parent)}) == home
+    assert _nvcc.find_nvcc({"CUDA_HOME": str(tmp_path / "nowhere"), "PATH": str(path.parent)}) == path
+
+
+def test_where_libraries_are_kept(tmp_path: Path) -> None:
+    assert _nvcc.cache_folder({"XDG_CACHE_HOME": str(tmp_path)}) == tmp_path / "structgstream" / "cuda"
+    assert _nvcc.cache_folder({}) == Path.home() / ".cache" / "structgstream" / "cuda"
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_without_kernels_it_says_why(found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = pretended(tmp_path / "bin", 'echo "no host compiler" >&2; exit 1')
+    monkeypatch.setattr(_nvcc, "find_nvcc", lambda environment: broken if found else None)
+    monkeypatch.setattr(_nvcc, "source_folder", lambda: SOURCES)
+    monkeypatch.setattr(_nvcc, "cache_folder", lambda environment: tmp_path / "cache")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
+    _nvcc.loss_library.cache_clear()
+    library, sentence = _nvcc.loss_library()
+    _nvcc.loss_library.cache_clear()
+    assert library is None
+    assert sentence.startswith("L1 and SSIM run in torch")
+    assert ("no host compiler" if found else "put nvcc on PATH") in sentence
