@@ -13,7 +13,7 @@ BOX_MARGIN_PIXELS = 2.0
 """The rasteriser's low-pass makes the smallest Gaussian this wide."""
 
 
-def visible_anchors(
+def seen_anchors(
     positions: Tensor,
     log_offset_scales: Tensor,
     log_base_scales: Tensor,
@@ -26,7 +26,7 @@ def visible_anchors(
     near: float,
     tiles: Tensor | None = None,
 ) -> Tensor:
-    """Indices ``[m]`` int64, ascending, of the anchors that can put a Gaussian into a picture.
+    """Mask ``[M]`` bool of the anchors that can put a Gaussian into a picture.
 
     Conservative: an anchor counts as a ball that holds all its Gaussians, so culling changes the cost of a rendering
     and never its pixels.
@@ -73,7 +73,36 @@ def visible_anchors(
             x0, y0 = (low[axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS for axis in range(2))
             x1, y1 = (high[axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS + 1 for axis in range(2))
             seen &= covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
-        return seen.nonzero()[:, 0]
+        return seen
+
+
+def visible_anchors(
+    positions: Tensor,
+    log_offset_scales: Tensor,
+    log_base_scales: Tensor,
+    offsets: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    tiles: Tensor | None = None,
+) -> Tensor:
+    """Indices ``[m]`` int64, ascending, of the anchors that :func:`seen_anchors` marks."""
+    seen = seen_anchors(
+        positions,
+        log_offset_scales,
+        log_base_scales,
+        offsets,
+        viewmat,
+        K,
+        width=width,
+        height=height,
+        near=near,
+        tiles=tiles,
+    )
+    return seen.nonzero()[:, 0]
 
 
 def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adam in torch's fused kernel, one launch a tensor; the contract is ``kernels.reference_adam``'s."""
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels import reference_adam
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    lr: float,
+    step: int,
+    betas: tuple[float, float],
+    eps: float,
+    rows: Tensor | None = None,
+) -> None:
+    """Move ``param`` in place by one step, see ``kernels.reference_adam.adam_step``; the host waits for nothing.
+
+    Selected ``rows`` take the reference's way.
+    """
+    if rows is not None:
+        reference_adam.adam_step(param, grad, exp_avg, exp_avg_sq, lr=lr, step=step, betas=betas, eps=eps, rows=rows)
+        return
+    if param.numel() == 0:
+        return
+    torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
+        [param],
+        [grad.to(param.dtype).contiguous()],
+        [exp_avg],
+        [exp_avg_sq],
+        [],
+        [torch.full((), float(step), device=param.device)],  # filled by a kernel: nothing is copied from the host
+        lr=lr,
+        beta1=betas[0],
+        beta2=betas[1],
+        weight_decay=0.0,
+        eps=eps,
+        amsgrad=False,
+        maximize=False,
+    )

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""torch's fused optimiser step beside the oracle; the same operation runs on the processor and on a GPU."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from structgstream.kernels import cuda_adam, reference_adam
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+OPTIONS = {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-15}
+
+
+def steps(module, param: Tensor, gradients: list[Tensor], rows: Tensor | None = None) -> list[Tensor]:
+    state = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
+    for n, gradient in enumerate(gradients, start=1):
+        module.adam_step(state[0], gradient.to(param), state[1], state[2], step=n, rows=rows, **OPTIONS)
+    return state
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("shape", [(), (1,), (7, 3), (50, 5, 3), (9001, 4)])
+def test_steps(device: str, shape: tuple[int, ...]) -> None:
+    param = torch.randn(shape, device=device)
+    # Gradients of a mean over pixels are tiny, and those of unseen rows are zero.
+    gradients = [torch.randn_like(param) * 1e-6 * (torch.rand_like(param) < 0.8) for _ in range(10)]
+    ours, exact = steps(cuda_adam, param, gradients), steps(reference_adam, param.double(), gradients)
+    assert torch.allclose(ours[0].double(), exact[0], rtol=1e-6, atol=1e-6)
+    for moment, wanted in zip(ours[1:], exact[1:], strict=True):
+        assert (moment.double() - wanted).norm() <= 1e-6 * wanted.norm()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_gradient_laid_out_otherwise(device: str) -> None:
+    param, gradient = torch.randn(6, 4, device=device), torch.randn(4, 6, device=device).T
+    ours, exact = steps(cuda_adam, param, [gradient]), steps(reference_adam, param.double(), [gradient])
+    assert torch.allclose(ours[0].double(), exact[0], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_selected_rows_are_the_references(device: str) -> None:
+    param, rows = torch.randn(60, 3, device=device), torch.tensor([1, 3, 59], device=device)
+    gradients = [torch.randn_like(param) for _ in range(3)]
+    ours, exact = (steps(module, param, gradients, rows) for module in (cuda_adam, reference_adam))
+    assert all(torch.equal(a, b) for a, b in zip(ours, exact, strict=True))
+    assert torch.equal(ours[0][0], param[0])
+
+
+def test_nothing_to_move() -> None:
+    assert steps(cuda_adam, torch.zeros(0, 3), [torch.zeros(0, 3)])[0].shape == (0, 3)
+
+
+@pytest.mark.needs_cuda
+def test_nothing_waits_for_the_gpu() -> None:
+    param = torch.randn(100, 3, device="cuda")
+    state = [param, torch.randn_like(param), torch.zeros_like(param), torch.zeros_like(param)]
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        cuda_adam.adam_step(*state, step=1, **OPTIONS)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
