@@ -58,16 +58,16 @@ def examination() -> dict[str, Any]:
     ``packages``.
     """
     from structgstream.evaluation.environment import environment
-    from structgstream.kernels.backend import backend_reasons
+    from structgstream.kernels.backend import backend_reasons, backend_remarks
 
-    reasons = backend_reasons()
+    reasons, remarks = backend_reasons(), backend_remarks()
     chosen = next(name for name, reason in reasons.items() if reason is None)
     backends = [
         {
             "name": name,
             "available": reason is None,
             "state": "missing" if reason else "chosen by --device auto" if name == chosen else "available",
-            "advice": reason or "",
+            "advice": reason or remarks.get(name, ""),
         }
         for name, reason in reasons.items()
     ]

@@ -97,33 +97,38 @@ def cpu_backend() -> Backend:
 
 
 def cuda_backend() -> Backend:
-    """gsplat's rasteriser on an NVIDIA GPU, torch for the rest.
+    """gsplat's rasteriser and this package's loss on an NVIDIA GPU, torch for the rest.
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
     from structgstream.kernels import (
-        reference_adam,
+        cuda_adam,
+        cuda_anchors,
+        cuda_ssim,
         reference_anchors,
         reference_change,
         reference_raster,
         reference_ssim,
     )
+    from structgstream.kernels._nvcc import loss_library
     from structgstream.kernels.cuda import cuda_reason, rasterize
 
     reason = cuda_reason()
     if reason is not None:
         raise BackendError(reason)
+    library, sentence = loss_library()
+    _log.log(logging.WARNING if library is None else logging.INFO, sentence)
     return Backend(
         name="cuda",
         device=torch.device("cuda"),
         rasterize=rasterize,
         blending_weights=partial(reference_raster.blending_weights, rasterize),
-        l1_ssim=reference_ssim.l1_ssim,
+        l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,
-        generate_structured=reference_anchors.generate_structured,
-        adam_step=reference_adam.adam_step,
+        generate_structured=cuda_anchors.generate_structured,
+        adam_step=cuda_adam.adam_step,
     )
 
 
@@ -133,6 +138,13 @@ def backend_reasons() -> dict[str, str | None]:
     from structgstream.kernels.cuda import cuda_reason
 
     return {"cuda": cuda_reason(), "cpu": native_reason(), "reference": None}
+
+
+def backend_remarks() -> dict[str, str]:
+    """What a user should know of a back-end that is there: which of its operations run on what."""
+    from structgstream.kernels._nvcc import loss_plan
+
+    return {"cuda": loss_plan()[1]}
 
 
 def select_backend(name: BackendName) -> Backend:

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the cuda back-end is made of, on a machine that only says it has a GPU, and on one that has."""
+
+import ctypes
+import logging
+
+import pytest
+import torch
+
+from structgstream.cli import doctor
+from structgstream.kernels import _nvcc, backend, cuda, cuda_ssim, reference_ssim
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_loss_is_the_kernels_or_says_why_not(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    library = cuda_ssim.LossLibrary(ctypes.CDLL(None), "cuda", lambda device: 0) if compiled else None
+    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
+    monkeypatch.setattr(_nvcc, "loss_library", lambda: (library, "this is why"))
+    with caplog.at_level(logging.INFO):
+        found = backend.cuda_backend()
+    assert found.name == "cuda"
+    assert found.device == torch.device("cuda")
+    assert (found.l1_ssim is reference_ssim.l1_ssim) is not compiled
+    assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
+        (logging.INFO if compiled else logging.WARNING, "this is why")
+    ]
+
+
+def test_doctor_tells_what_the_loss_runs_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend, "backend_reasons", lambda: {"cuda": None, "cpu": None, "reference": None})
+    monkeypatch.setattr(_nvcc, "find_nvcc", lambda environment: None)
+    first = doctor.examination()["backends"][0]
+    assert first["name"] == "cuda"
+    assert first["advice"].startswith("L1 and SSIM run in torch")
+    assert "put nvcc on PATH" in first["advice"]
