@@ -58,11 +58,11 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Fits that take no time and depend on seed and start as real ones do; the list fills with the seeds used."""
     seeds: list[int] = []
 
-    def first(frame, rig, points, *, config, backend, seed, on_step):
+    def first(frame, rig, points, *, config, backend, seed, on_step, before=None):
         seeds.append(seed)
         return FitResult(small_scene(seed=seed % 1000), 1, 20.0)
 
-    def following(scene, frame, rig, *, config, backend, seed, on_step):
+    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None):
         seeds.append(seed)
         return FitResult(moved(scene, seed % 7), 1, 21.0, spawned=2, pruned=1, seconds={"render": 0.5})
 
@@ -102,7 +102,7 @@ def test_every_frame_is_reported_and_readable(quick_fits: list[int]) -> None:
 def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     started_from = []
 
-    def following(scene, frame, rig, *, config, backend, seed, on_step):
+    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None):
         """A trainer that touches a static field, which no packet carries."""
         started_from.append(scene)
         fitted = moved(scene, frame.index)

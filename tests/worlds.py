@@ -36,12 +36,22 @@ def emerging_ball(opacity: float) -> Gaussians:
     )
 
 
-def moving_world(frames: int = 3, *, cameras: int = 5, emerges_at: int | None = None, speed: float = 0.03) -> World:
-    """Anchors drift to the right; from frame ``emerges_at`` on a ball is there that was not."""
-    rig = arc_rig(cameras)
+def moving_world(
+    frames: int = 3,
+    *,
+    cameras: int = 5,
+    emerges_at: int | None = None,
+    speed: float = 0.03,
+    movers: int = 60,
+    width: int = 48,
+    height: int = 32,
+) -> World:
+    """The first ``movers`` of 60 anchors drift to the right; from frame ``emerges_at`` on a ball is there too."""
+    rig = arc_rig(cameras, width=width, height=height)
     scene = random_scene(60, cameras=cameras - 1, seed=4)
     backend = reference_backend()
-    shift = torch.tensor([speed, 0.0, 0.0])
+    shift = torch.zeros(60, 3)
+    shift[:movers, 0] = speed
     pictures = []
     for t in range(frames):
         moved = replace(scene, anchors=replace(scene.anchors, positions=scene.anchors.positions + t * shift))

@@ -5,9 +5,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from structgstream.data.points import PointsConfig
+from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.losses import LossWeights
+from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.optim import Rate
 
@@ -64,6 +66,12 @@ RIG = StreamConfig(
 )
 """The paper's online method on any rig: exposures are equalised, frame 0 is annealed and starts on small pictures."""
 
+MOTION = replace(
+    RIG,
+    online=replace(RIG.online, dynamic=PAPER_DYNAMIC - {"covariance_mlp"}, motion=MotionConfig(enabled=True)),
+)
+"""As RIG, but only what moves is fitted. F_Sigma stays as it is: what stands still depends on it."""
+
 FAST = replace(
     RIG,
     initial=replace(
@@ -103,6 +111,7 @@ PRESETS: dict[str, StreamConfig] = {
     "paper-meetroom": PAPER,
     "paper-immersive": PAPER,
     "rig": RIG,
+    "motion": MOTION,
     "fast": FAST,
     "tiny": TINY,
 }

@@ -37,6 +37,7 @@ class FrameReport:
     field_bytes: Mapping[FieldName, int]
     train_psnr: float
     anchors: int
+    moving: int
     free: int
     spawned: int
     pruned: int
@@ -122,14 +123,18 @@ class Session:
             scene = self._resumed.scene(start - 1) if start else None
         if start >= len(self._source):
             return
-        frames = self._source.frames(start)
+        # What moves shows against the frame before, so a resumed stream reads that one once more.
+        again = start > 0 and self._config.online.motion.enabled
+        frames = self._source.frames(start - again)
+        before = next(frames) if again else None
         while True:
             started = time.perf_counter()
             frame = next(frames, None)
             if frame is None:
                 return
             read = time.perf_counter()
-            fit = self._fit(scene, frame)
+            fit = self._fit(scene, frame, before)
+            before = frame if self._config.online.motion.enabled else None
             fitted = time.perf_counter()
             if encoder is None:
                 header = self._header(fit.scene)
@@ -149,6 +154,7 @@ class Session:
                 field_bytes=encoded.packet.field_bytes,
                 train_psnr=fit.train_psnr,
                 anchors=len(scene.anchors),
+                moving=fit.moving,
                 free=len(scene.free),
                 spawned=fit.spawned,
                 pruned=fit.pruned,
@@ -167,7 +173,7 @@ class Session:
     def _key_interval(self) -> int:
         return max(1, round(self._source.fps * self._config.key_interval_seconds))
 
-    def _fit(self, scene: Scene | None, frame: MultiViewFrame) -> FitResult:
+    def _fit(self, scene: Scene | None, frame: MultiViewFrame, before: MultiViewFrame | None) -> FitResult:
         seed = frame_seed(self._config.seed, frame.index)
         if scene is None:
             points = self._initial_points(frame)
@@ -187,6 +193,7 @@ class Session:
             config=self._config.online,
             backend=self._backend,
             seed=seed,
+            before=before,
             on_step=self._on_step,
         )
 

@@ -249,3 +249,16 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
         if trained is not None:
             assert not ours[trained:].any(), name
             assert not theirs[trained:].any(), name
+
+
+@native
+def test_blending_weights(isa: int) -> None:
+    means, quats, scales, opacities, _, _ = gaussians()
+    viewmat, K = camera()
+    maps = torch.rand(HEIGHT, WIDTH, 2, dtype=torch.float64) * safe_pixels(gaussians())[..., None]
+    exact = reference_raster.blending_weights(reference, means, quats, scales, opacities, viewmat, K, maps, near=NEAR)
+    single = [value.float() for value in (means, quats, scales, opacities, viewmat, K, maps)]
+    ours = cpu_raster.blending_weights(*single, near=NEAR)
+    assert (ours - exact).norm() < 1e-5 * exact.norm()
+    again = reference_raster.blending_weights(cpu_raster.rasterize, *single, near=NEAR)
+    assert (ours - again).norm() < 1e-5 * exact.norm()

@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
+from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame, without_patching
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.result import Step
@@ -105,3 +107,68 @@ def test_progress_is_told_after_every_iteration() -> None:
     assert result.iterations == 24
     assert result.train_psnr > 20.0
     assert {"generate", "rasterise", "loss", "backward", "optimise"} <= set(result.seconds)
+
+
+FOLLOWING = replace(
+    QUICK,
+    dynamic=PAPER_DYNAMIC - {"covariance_mlp"},
+    motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
+)
+
+
+def followed(scene, world, index, *, config=FOLLOWING, seed=0):
+    return fit_next_frame(
+        scene,
+        world.frames[index],
+        world.rig,
+        config=config,
+        backend=reference_backend(),
+        seed=seed,
+        before=world.frames[index - 1],
+    )
+
+
+def test_only_what_moves_is_fitted_and_as_well_as_when_everything_is() -> None:
+    world = moving_world(3, speed=0.06, movers=20)
+    full = part = world.scene
+    for index in (1, 2):
+        full = fit(full, world, index, config=replace(FOLLOWING, motion=MotionConfig())).scene
+        result = followed(part, world, index)
+        still = (result.scene.anchors.positions == part.anchors.positions).all(1)
+        assert still.sum() >= 60 - result.moving > 10
+        part = result.scene
+    truth = world.frames[2].images["cam00"]  # Held out.
+    unfitted, everything, followed_only = (psnr(rendered(s, world, "cam00"), truth) for s in (world.scene, full, part))
+    assert followed_only > unfitted + 2.0
+    assert followed_only > everything - 0.3
+
+
+def test_whole_pictures_give_the_same_quality_as_tiles() -> None:
+    world = moving_world(2, speed=0.06, movers=20)
+    whole = replace(FOLLOWING, motion=replace(FOLLOWING.motion, tiles=False))
+    truth = world.frames[1].images["cam00"]
+    values = [
+        psnr(rendered(followed(world.scene, world, 1, config=c).scene, world, "cam00"), truth)
+        for c in (FOLLOWING, whole)
+    ]
+    assert abs(values[0] - values[1]) < 0.2
+
+
+def test_a_frame_like_the_last_one_costs_no_iteration_and_changes_no_bit() -> None:
+    world = moving_world(2, speed=0.0)
+    result = followed(world.scene, world, 1)
+    assert (result.iterations, result.moving, result.spawned) == (0, 0, 0)
+    before, after = state_of(world.scene), state_of(result.scene)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_every_so_many_frames_everything_may_move() -> None:
+    world = moving_world(3, speed=0.0)
+    config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, full_every_frames=2))
+    assert followed(world.scene, world, 1, config=config).moving == 0
+    assert followed(world.scene, world, 2, config=config).moving == 60
+
+
+def test_what_all_anchors_share_cannot_change_while_some_stand_still() -> None:
+    with pytest.raises(ConfigError, match="covariance_mlp change with every frame"):
+        OnlineConfig(motion=MotionConfig(enabled=True))

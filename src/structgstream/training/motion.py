@@ -22,6 +22,8 @@ from structgstream.training.views import View
 class MotionConfig:
     """When something counts as moving."""
 
+    enabled: bool = False
+    """Fit only what moves. Off, the paper: everything."""
     change_threshold: float = 0.05
     """Mean absolute difference, in 0 ... 1, of 3 x 3 pixels since the last frame; above the sensors' noise."""
     reach_pixels: int = 3

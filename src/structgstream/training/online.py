@@ -79,15 +79,14 @@ class OnlineConfig:
     losses: LossWeights = field(default_factory=LossWeights)
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
-    motion: MotionConfig | None = None
-    """Fit only what moves (None, the paper: everything)."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
         shared = sorted(self.dynamic.intersection(STILL_FIELDS))
-        if self.motion is not None and shared:
+        if self.motion.enabled and shared:
             raise ConfigError(
                 f"Fitting only what moves needs everything else to stay as it is, but {', '.join(shared)} change with "
-                "every frame; take them out of the dynamic fields or set motion to None."
+                "every frame; take them out of the dynamic fields or do without motion.enabled."
             )
 
 
@@ -143,7 +142,7 @@ def fit_next_frame(
         scene = scene.without_free()
     views = training_views(frame, rig, backend.device)
     fit = _Fit(config, backend, frame.index, generator, watch, on_step)
-    if config.motion is None or before is None or _is_full(config.motion, frame.index):
+    if before is None or not config.motion.enabled or _is_full(config.motion, frame.index):
         return fit.run(scene, views)
     with watch.stage("find motion"):
         earlier = training_views(before, rig, backend.device)
@@ -231,7 +230,6 @@ class _Fit:
         )
 
     def _places(self, partition: Partition, views: list[View]) -> dict[int, Focus]:
-        assert self.config.motion is not None
         with self.watch.stage("find motion"):
             return focuses(partition, views, config=self.config.motion, backend=self.backend)
 

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene in two parts gives the pictures and the gradients of the whole, where something moves."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rigs import random_scene
+from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.kernels.raster_types import pixels_of_tiles
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.render import draw
+from structgstream.scene.state import PAPER_DYNAMIC, state_of
+from structgstream.training.losses import LossWeights
+from structgstream.training.motion import STILL_FIELDS, MotionConfig, Moving
+from structgstream.training.parameters import Parameters, parameters_of_fields
+from structgstream.training.partition import Partition, focuses
+from structgstream.training.step import gradients_of, view_loss
+from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.views import training_views
+from worlds import moving_world
+
+CPU = torch.device("cpu")
+WORLD = moving_world(2, width=96, height=64)
+VIEWS = training_views(WORLD.frames[1], WORLD.rig, CPU)
+SCENE = random_scene(60, free=8, cameras=4, seed=4)
+
+
+def some(scene=SCENE) -> Partition:
+    """A few anchors and free Gaussians move; nothing is hidden."""
+    anchors = torch.zeros(len(scene.anchors), dtype=torch.bool)
+    anchors[[3, 17]] = True
+    free = torch.arange(len(scene.free)) == 5
+    slots = torch.ones(len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free), dtype=torch.bool)
+    return Partition.of(scene, Moving(anchors, free, {view.index: slots for view in VIEWS}))
+
+
+def test_the_parts_make_the_whole_again() -> None:
+    partition = some()
+    assert len(partition.moving.anchors) == 2
+    assert len(partition.moving.anchors) + len(partition.still.anchors) == 60
+    assert len(partition.moving.free) + len(partition.still.free) == 8
+    before, after = state_of(SCENE), state_of(partition.together(partition.moving))
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_what_moved_moves_and_births_stay_in_order() -> None:
+    partition = some()
+    moving = partition.moving
+    born = FreeGaussians(**{**vars(moving.free), "births": torch.tensor([77])})
+    moved = replace(
+        moving,
+        anchors=replace(moving.anchors, positions=moving.anchors.positions + 1.0),
+        free=moving.free.append(born),
+    )
+    whole = partition.together(moved)
+    difference = (whole.anchors.positions - SCENE.anchors.positions).abs().sum(1)
+    assert difference.nonzero()[:, 0].tolist() == [3, 17]
+    assert whole.free.births.tolist() == [*range(8), 77]
+    assert torch.equal(whole.free.means[8], moving.free.means[0])
+
+
+@pytest.mark.parametrize("backend", [reference_backend(), cpu_backend()], ids=lambda b: b.name)
+@pytest.mark.parametrize("tiles", [True, False])
+def test_a_focus_draws_and_learns_what_the_whole_picture_would(backend: Backend, tiles: bool) -> None:
+    """The gradient of a step with a focus is that of the same step over the whole picture: to float32 rounding."""
+    config = MotionConfig(enabled=True, margin_pixels=24, tiles=tiles)
+    partition = some()
+    places = focuses(partition, VIEWS, config=config, backend=backend)
+    trained = parameters_of_fields(PAPER_DYNAMIC.difference(STILL_FIELDS))
+    assert places.keys() == {view.index for view in VIEWS}
+    shares = []
+    for view in VIEWS:
+        focus, camera = places[view.index], view.camera
+        inside = pixels_of_tiles(focus.tiles, camera.width, camera.height)
+        shares.append(float(inside.float().mean()))
+        whole = draw(SCENE.gaussians(camera, backend), camera, backend).image.detach()
+        part = draw(partition.moving.gaussians(camera, backend), camera, backend, focus=focus).image.detach()
+        assert (part - whole)[inside].abs().max() < 1e-5
+        found = []
+        for scene, place in ((SCENE, None), (partition.moving, focus)):
+            parameters = Parameters.of(scene, trained=trained)
+            loss = view_loss(
+                parameters.scene(scene),
+                view,
+                backend=backend,
+                weights=LossWeights(volume=0.0),
+                voxel_size=0.0,
+                track_screen=False,
+                watch=Stopwatch(CPU),
+                focus=place,
+            )
+            found.append(gradients_of(loss, parameters, Stopwatch(CPU))[0])
+        for name, theirs in found[1].items():
+            rows = partition.which.free if name.startswith("free") else partition.which.anchors
+            ours = found[0][name][rows]
+            assert (ours - theirs).norm() <= 1e-4 * ours.norm(), name
+    assert max(shares) == 1.0 if not tiles else max(shares) < 0.9
