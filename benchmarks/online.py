@@ -2,7 +2,7 @@
 """A whole online frame of the paper's method, patching included, on a wall of which a part has moved.
 
 It starts from the true scene of the frame before; quality is told at a camera that training does not see, beside the
-quality without any fit. Following motion is the package's own switch, ``OnlineConfig.motion``.
+quality without any fit. Following motion is as in the preset ``motion``.
 """
 
 from collections.abc import Mapping
@@ -16,8 +16,7 @@ from benchmarks.contenders import torch_but_raster
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import World, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
-from structgstream.presets import PAPER
-from structgstream.training.motion import STILL_FIELDS, MotionConfig
+from structgstream.presets import MOTION, PAPER
 from structgstream.training.online import OnlineConfig, fit_next_frame
 from structgstream.training.result import FitResult
 
@@ -35,9 +34,9 @@ def paper_config(iterations: int) -> OnlineConfig:
 
 
 def motion_config(iterations: int) -> OnlineConfig:
-    """The same, fitting only what moves: what all anchors share must then stay as it is."""
+    """The same, fitting only what moves, with the fields that the preset ``motion`` trains."""
     config = paper_config(iterations)
-    return replace(config, dynamic=config.dynamic.difference(STILL_FIELDS), motion=MotionConfig())
+    return replace(config, dynamic=MOTION.online.dynamic, motion=MOTION.online.motion)
 
 
 def _fitting(
@@ -69,7 +68,7 @@ def contestants(
 ) -> list[Contestant]:
     """An online frame in which ``share`` of the area has moved, and what it is held against."""
     native, paper, motion = cpu_backend(), paper_config(iterations), motion_config(iterations)
-    everything = replace(motion, motion=None)
+    everything = replace(motion, motion=replace(motion.motion, enabled=False))
 
     def world(moving: float) -> World:
         sizes = {"anchors": anchors, "width": width, "height": height, "cameras": cameras}
@@ -89,7 +88,6 @@ def contestants(
             _fitting("a part moves, everything fitted", here, native, everything, compared=False),
         ]
     if contest == "pictures":
-        assert motion.motion is not None
         whole = replace(motion, motion=replace(motion.motion, tiles=False))
         return [
             _fitting("following motion, whole pictures", here, native, whole),
