@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene in two parts gives the pictures and the gradients of the whole, where something moves."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
 from rigs import random_scene
+from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.kernels.raster_types import pixels_of_tiles
 from structgstream.scene.free import FreeGaussians
@@ -61,10 +63,14 @@ def test_what_moved_moves_and_births_stay_in_order() -> None:
     assert torch.equal(whole.free.means[8], moving.free.means[0])
 
 
-@pytest.mark.parametrize("backend", [reference_backend(), cpu_backend()], ids=lambda b: b.name)
+@pytest.mark.parametrize(
+    "build",
+    [reference_backend, pytest.param(cpu_backend, marks=pytest.mark.skipif(bool(native_reason()), reason="not built"))],
+)
 @pytest.mark.parametrize("tiles", [True, False])
-def test_a_focus_draws_and_learns_what_the_whole_picture_would(backend: Backend, tiles: bool) -> None:
+def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[], Backend], tiles: bool) -> None:
     """The gradient of a step with a focus is that of the same step over the whole picture: to float32 rounding."""
+    backend = build()
     config = MotionConfig(enabled=True, margin_pixels=24, tiles=tiles)
     partition = some()
     places = focuses(partition, VIEWS, config=config, backend=backend)
