@@ -41,16 +41,17 @@ void adam_step(
         static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(beta2, static_cast<double>(steps)))),
         static_cast<float>(eps)};
     constexpr int64_t kSpan = 1 << 14;
+    constexpr int64_t kWorthThreads = 1 << 22;  // Waking a thread costs more than it saves below.
     if (rows == nullptr) {
         const int64_t total = count * width, chunks = (total + kSpan - 1) / kSpan;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && chunks > 1)
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && total >= kWorthThreads)
         for (int64_t n = 0; n < chunks; ++n) {
             const int64_t at = n * kSpan;
             step(param + at, grad + at, first + at, second + at, std::min(kSpan, total - at), rates);
         }
         return;
     }
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && count * width > kSpan)
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && count * width >= kWorthThreads)
     for (int64_t n = 0; n < count; ++n) {
         const int64_t at = rows[n] * width;
         step(param + at, grad + at, first + at, second + at, width, rates);

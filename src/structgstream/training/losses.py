@@ -34,7 +34,8 @@ def volume(scales: Tensor, *, reduction: Literal["mean", "sum"]) -> Tensor:
     """L_vol: the product of the three scales of every drawn Gaussian, ``scales`` ``[N, 3]``."""
     if scales.shape[0] == 0:
         return scales.sum()
-    products = scales[:, 0] * scales[:, 1] * scales[:, 2]
+    x, y, z = scales.unbind(1)
+    products = x * y * z
     return products.mean() if reduction == "mean" else products.sum()
 
 
