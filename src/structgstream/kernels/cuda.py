@@ -9,7 +9,8 @@ import importlib.util
 import torch
 from torch import Tensor
 
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, pixels_of_tiles
+from structgstream.kernels.cuda_tiles import PairBudget, tile_lists
+from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, pixels_of_tiles, tiles_of
 
 
 def cuda_reason() -> str | None:
@@ -39,12 +40,14 @@ def rasterize(
     tiles: Tensor | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
+    budget: PairBudget | None = None,
 ) -> RasterOutput:
     """The contract of ``kernels.reference_raster.rasterize`` on a GPU.
 
     The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient means the
     same on every back-end. With ``tiles``, ``radii`` also counts Gaussians that reach other tiles only, and ``trained``
-    saves nothing here: the gradients of the rest are computed and not used.
+    saves nothing here: the gradients of the rest are computed and not used. With a ``budget`` the host does not wait
+    (``kernels.cuda_tiles``, Note [Pairs without waiting]).
     """
     if trained is not None:
         means, quats, scales, opacities, colors = (
@@ -76,10 +79,19 @@ def rasterize(
     )  # [1, N, 2], [1, N, 2], [1, N], [1, N, 3]
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[None]
-    tiles_x = (width + TILE_PIXELS - 1) // TILE_PIXELS
-    tiles_y = (height + TILE_PIXELS - 1) // TILE_PIXELS
-    _, pair_ids, flat_ids = isect_tiles(means2d, radii, depths, TILE_PIXELS, tiles_x, tiles_y, packed=False, n_images=1)
-    tile_starts = isect_offset_encode(pair_ids, 1, tiles_x, tiles_y).reshape(1, tiles_y, tiles_x)
+    rows, columns = tiles_of(width, height)
+    masks = tiles
+    if budget is None or not means.shape[0]:
+        _, pair_ids, flat_ids = isect_tiles(
+            means2d, radii, depths, TILE_PIXELS, columns, rows, packed=False, n_images=1
+        )
+        tile_starts = isect_offset_encode(pair_ids, 1, columns, rows).reshape(1, rows, columns)
+    else:
+        lists = tile_lists(means2d[0], radii[0], depths[0], width=width, height=height, capacity=budget.capacity)
+        torch.maximum(budget.needed, lists.needed, out=budget.needed)
+        tile_starts, flat_ids = lists.starts[None], lists.ids
+        if masks is not None:
+            masks = torch.cat([masks, torch.zeros_like(masks[:1])])  # the row below the picture
     image, alpha = rasterize_to_pixels(
         means2d,
         conics,
@@ -91,7 +103,7 @@ def rasterize(
         tile_starts,
         flat_ids,
         backgrounds=None if background is None else background[None],
-        masks=None if tiles is None else tiles[None],
+        masks=None if masks is None else masks[None],
         packed=False,
     )
     drawn = radii[0].amax(-1).float()

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tile lists of fixed size beside lists made one Gaussian at a time. It is plain torch: the processor tells as well."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from structgstream.kernels.cuda_tiles import PairBudget, tile_lists
+from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+
+
+def splats(count: int, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Some around the picture, some beyond it, some with the same depth, and what is not drawn full of rubbish."""
+    means2d = torch.rand(count, 2) * torch.tensor([width * 1.4, height * 1.4]) - torch.tensor([width, height]) * 0.2
+    radii = torch.randint(1, 40, (count, 2), dtype=torch.int32)
+    depths = torch.rand(count).mul(20.0).round() + 1.0
+    hidden = torch.rand(count) < 0.3
+    radii[hidden, 1] = 0
+    means2d[hidden], depths[hidden] = math.nan, math.nan
+    return means2d, radii, depths
+
+
+def expected(means2d: Tensor, radii: Tensor, depths: Tensor, width: int, height: int) -> list[list[int]]:
+    """Each tile's list, as gsplat defines it."""
+    rows, columns = tiles_of(width, height)
+    lists: list[list[int]] = [[] for _ in range(rows * columns)]
+    drawn = [i for i in range(len(depths)) if (radii[i] > 0).all()]
+    for i in sorted(drawn, key=lambda i: (float(depths[i]), i)):
+        edges = [
+            (
+                min(max(0, math.floor(float(means2d[i, axis] - radii[i, axis]) / TILE_PIXELS)), size),
+                min(max(0, math.ceil(float(means2d[i, axis] + radii[i, axis]) / TILE_PIXELS)), size),
+            )
+            for axis, size in enumerate((columns, rows))
+        ]
+        for row in range(*edges[1]):
+            for column in range(*edges[0]):
+                lists[row * columns + column].append(i)
+    return lists
+
+
+def found(starts: Tensor, ids: Tensor) -> list[list[int]]:
+    bounds = [*starts.flatten().tolist(), len(ids)]
+    return [ids[a:b].tolist() for a, b in pairwise(bounds)]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("size", [(75, 53), (64, 32), (5, 3)])
+def test_each_tile_lists_its_gaussians_front_to_back(device: str, size: tuple[int, int]) -> None:
+    width, height = size
+    values = splats(120, width, height)
+    exact = expected(*values, width, height)
+    count = sum(map(len, exact))
+    assert count > 20
+    for capacity in (count, count + 500):
+        lists = tile_lists(*(value.to(device) for value in values), width=width, height=height, capacity=capacity)
+        rows, columns = tiles_of(width, height)
+        assert lists.starts.shape == (rows + 1, columns)
+        assert lists.starts.dtype == lists.ids.dtype == torch.int32
+        assert int(lists.needed) == count
+        ours = found(lists.starts.cpu(), lists.ids.cpu())
+        assert ours[: rows * columns] == exact
+        below = [len(ids) for ids in ours[rows * columns :]]
+        assert sum(below) == capacity - count
+        assert max(below) - min(below) <= 1
+        assert lists.ids.min() >= 0
+        assert lists.ids.max() < 120
+
+
+def test_of_too_many_the_nearest_stay() -> None:
+    means2d, radii = torch.full((50, 2), 8.0), torch.full((50, 2), 2, dtype=torch.int32)
+    depths = torch.arange(50.0).flip(0) + 1.0
+    lists = tile_lists(means2d, radii, depths, width=16, height=16, capacity=20)
+    assert int(lists.needed) == 50
+    assert found(lists.starts, lists.ids)[0] == list(range(49, 29, -1))
+
+
+def test_nothing_is_drawn() -> None:
+    means2d, radii = torch.full((4, 2), torch.nan), torch.zeros(4, 2, dtype=torch.int32)
+    lists = tile_lists(means2d, radii, torch.full((4,), torch.nan), width=40, height=20, capacity=10)
+    assert int(lists.needed) == 0
+    assert [len(ids) for ids in found(lists.starts, lists.ids)[:6]] == [0] * 6
+
+
+def test_a_picture_with_more_tiles_than_a_short_number_holds() -> None:
+    width, height = 200 * TILE_PIXELS, 170 * TILE_PIXELS
+    means2d, radii = torch.tensor([[width - 1.0, height - 1.0]]), torch.ones(1, 2, dtype=torch.int32)
+    lists = tile_lists(means2d, radii, torch.ones(1), width=width, height=height, capacity=3)
+    assert found(lists.starts, lists.ids)[200 * 170 - 1] == [0]
+
+
+def test_a_budget_remembers_the_worst_picture() -> None:
+    budget = PairBudget.of(100, torch.device("cpu"))
+    assert budget.shortage() == 0
+    for needed, missing in ((90, 0), (130, 30), (10, 30)):
+        torch.maximum(budget.needed, torch.tensor(needed), out=budget.needed)
+        assert budget.shortage() == missing
