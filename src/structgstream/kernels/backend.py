@@ -7,7 +7,7 @@ functions. A back-end that lacks an operation of its own names another's, visibl
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.raster_types import RasterOutput
 
 _log = logging.getLogger(__name__)
@@ -130,6 +131,24 @@ def cuda_backend() -> Backend:
         generate_structured=cuda_anchors.generate_structured,
         adam_step=cuda_adam.adam_step,
     )
+
+
+def without_waiting(backend: Backend, budget: PairBudget) -> Backend:
+    """The cuda back-end with shapes that do not depend on numbers: the host waits for nothing within an iteration.
+
+    ``visible_anchors`` gives a mask and ``generate_structured`` all Gaussians (``kernels.cuda_anchors``, Note [Shapes
+    without waiting]); a picture has room for ``budget.capacity`` pairs (``kernels.cuda_tiles``, Note [Pairs without
+    waiting]): ask ``budget.shortage()`` when the work is done.
+
+    Raises:
+        BackendError: another back-end, on which nothing waits anyway.
+    """
+    from structgstream.kernels import cuda_anchors
+    from structgstream.kernels.cuda import rasterize
+
+    if backend.name != "cuda":
+        raise BackendError(f"Only the cuda back-end works apart from the host, not {backend.name}.")
+    return replace(backend, rasterize=partial(rasterize, budget=budget), visible_anchors=cuda_anchors.visible_anchors)
 
 
 def backend_reasons() -> dict[str, str | None]:

@@ -13,17 +13,20 @@ def adam_step(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     *,
-    lr: float,
-    step: int,
+    lr: float | Tensor,
+    step: int | Tensor,
     betas: tuple[float, float],
     eps: float,
     rows: Tensor | None = None,
 ) -> None:
     """Move ``param`` in place by one step, see ``kernels.reference_adam.adam_step``; the host waits for nothing.
 
-    Selected ``rows`` take the reference's way.
+    ``lr`` and ``step`` may also be ``[]`` float32 on the parameter's device, so that a recorded graph (``cuda_graph``)
+    can be told new ones. Selected ``rows`` take the reference's way.
     """
     if rows is not None:
+        assert isinstance(lr, float)
+        assert isinstance(step, int)
         reference_adam.adam_step(param, grad, exp_avg, exp_avg_sq, lr=lr, step=step, betas=betas, eps=eps, rows=rows)
         return
     if param.numel() == 0:
@@ -34,7 +37,8 @@ def adam_step(
         [exp_avg],
         [exp_avg_sq],
         [],
-        [torch.full((), float(step), device=param.device)],  # filled by a kernel: nothing is copied from the host
+        # A number is filled in by a kernel: nothing is copied from the host.
+        [step if isinstance(step, Tensor) else torch.full((), float(step), device=param.device)],
         lr=lr,
         beta1=betas[0],
         beta2=betas[1],
