@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from structgstream.data.points import PointsConfig
-from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.losses import LossWeights
@@ -68,7 +67,7 @@ RIG = StreamConfig(
 
 MOTION = replace(
     RIG,
-    online=replace(RIG.online, dynamic=PAPER_DYNAMIC - {"covariance_mlp"}, motion=MotionConfig(enabled=True)),
+    online=replace(RIG.online, motion=MotionConfig(enabled=True)),
 )
 """As RIG, but only what moves is fitted. F_Sigma stays as it is: what stands still depends on it."""
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
 from structgstream.training.motion import MotionConfig
@@ -111,7 +110,6 @@ def test_progress_is_told_after_every_iteration() -> None:
 
 FOLLOWING = replace(
     QUICK,
-    dynamic=PAPER_DYNAMIC - {"covariance_mlp"},
     motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
 )
 
@@ -169,6 +167,10 @@ def test_every_so_many_frames_everything_may_move() -> None:
     assert followed(world.scene, world, 2, config=config).moving == 60
 
 
-def test_what_all_anchors_share_cannot_change_while_some_stand_still() -> None:
-    with pytest.raises(ConfigError, match="covariance_mlp change with every frame"):
-        OnlineConfig(motion=MotionConfig(enabled=True))
+def test_what_all_anchors_share_changes_only_when_everything_may_move() -> None:
+    world = moving_world(3, speed=0.06, movers=20)
+    config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, full_every_frames=2))
+    heads = [state_of(followed(world.scene, world, t, config=config).scene)["covariance_mlp"] for t in (1, 2)]
+    start = state_of(world.scene)["covariance_mlp"]
+    assert torch.equal(heads[0], start)
+    assert not torch.equal(heads[1], start)

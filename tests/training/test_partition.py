@@ -15,7 +15,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.training.losses import LossWeights
-from structgstream.training.motion import STILL_FIELDS, MotionConfig, Moving
+from structgstream.training.motion import SHARED_FIELDS, MotionConfig, Moving
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.partition import Partition, focuses
 from structgstream.training.step import gradients_of, view_loss
@@ -74,7 +74,7 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
     config = MotionConfig(enabled=True, margin_pixels=24, tiles=tiles)
     partition = some()
     places = focuses(partition, VIEWS, config=config, backend=backend)
-    trained = parameters_of_fields(PAPER_DYNAMIC.difference(STILL_FIELDS))
+    trained = parameters_of_fields(PAPER_DYNAMIC.difference(SHARED_FIELDS))
     assert places.keys() == {view.index for view in VIEWS}
     shares = []
     for view in VIEWS:

@@ -44,8 +44,8 @@ class MotionConfig:
     """Draw only the tiles that moving Gaussians reach. Off: whole pictures, for the same result at their cost."""
 
 
-STILL_FIELDS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp", "camera_color")
-"""Shared by all anchors: while something stands still these must not be in the dynamic set."""
+SHARED_FIELDS: frozenset[FieldName] = frozenset({"opacity_mlp", "color_mlp", "covariance_mlp", "camera_color"})
+"""What all anchors share changes only in frames in which everything may move: what stands still depends on it."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
@@ -23,7 +22,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 from structgstream.training.losses import LossWeights
-from structgstream.training.motion import STILL_FIELDS, MotionConfig, moving_parts
+from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
     FREE_ROWS,
@@ -80,14 +79,6 @@ class OnlineConfig:
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
-
-    def __post_init__(self) -> None:
-        shared = sorted(self.dynamic.intersection(STILL_FIELDS))
-        if self.motion.enabled and shared:
-            raise ConfigError(
-                f"Fitting only what moves needs everything else to stay as it is, but {', '.join(shared)} change with "
-                "every frame; take them out of the dynamic fields or do without motion.enabled."
-            )
 
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
@@ -176,7 +167,8 @@ class _Fit:
         iterations = math.ceil(config.iterations * len(seen) / len(views))  # Each view as often as in a full frame.
         patch_at = math.ceil(patching.iteration * len(seen) / len(views))
         order = shuffled_views(seen, self.generator)
-        parameters = Parameters.of(scene, trained=parameters_of_fields(config.dynamic))
+        dynamic = config.dynamic if partition is None else config.dynamic.difference(SHARED_FIELDS)
+        parameters = Parameters.of(scene, trained=parameters_of_fields(dynamic))
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
