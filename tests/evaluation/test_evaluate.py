@@ -223,7 +223,7 @@ def test_compared_frames_are_truth_and_rendering(world: World) -> None:
 
 def test_every_pixel_changed_leaves_no_still_one() -> None:
     dark, bright = np.zeros((8, 8, 3), np.uint8), np.full((8, 8, 3), 200, np.uint8)
-    scores = score(bright, bright, dark)
+    scores = score(bright, bright, dark, backend=reference_backend())
     assert (scores.changed_share, scores.psnr_still) == (1.0, None)
     assert scores.psnr_changed == PSNR_OF_EQUALS
 

@@ -1,12 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics against closed forms and scikit-image."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from structgstream.evaluation.metrics import PSNR_OF_EQUALS, mse, psnr, quantised, ssim, ssim_map
+from structgstream.evaluation.metrics import (
+    PSNR_OF_EQUALS,
+    mean_of_squares,
+    psnr,
+    quantised,
+    squared_errors,
+    ssim,
+    ssim_map,
+)
+from structgstream.kernels._load import native_reason
+from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 
 
 def pictures(height: int = 37, width: int = 53) -> tuple[np.ndarray, np.ndarray]:
@@ -37,17 +49,6 @@ def test_equal_pictures_have_a_finite_psnr() -> None:
     assert psnr(picture, picture) == PSNR_OF_EQUALS
 
 
-def test_mse_of_a_mask_sees_its_pixels_only() -> None:
-    truth = np.zeros((4, 4, 3), np.uint8)
-    picture = truth.copy()
-    picture[0, 0] = 255
-    where = np.zeros((4, 4), bool)
-    assert np.isnan(mse(picture, truth, where=where))
-    where[0, :2] = True
-    assert mse(picture, truth, where=where) == pytest.approx(0.5)
-    assert mse(picture, truth, where=~where) == 0.0
-
-
 def test_ssim_away_from_the_border_agrees_with_scikit_image() -> None:
     picture, truth = pictures()
     _, theirs = structural_similarity(
@@ -73,6 +74,23 @@ def test_ssim_treats_what_lies_beyond_the_border_as_black() -> None:
 
 def test_ssim_of_equals_is_one_and_falls_with_noise() -> None:
     picture, truth = pictures()
-    assert ssim(truth, truth) == pytest.approx(1.0)
-    assert ssim(picture, truth) < 0.99
-    assert ssim(255 - truth, truth) < ssim(picture, truth)
+    backend = reference_backend()
+    assert ssim(truth, truth, backend) == pytest.approx(1.0)
+    assert ssim(picture, truth, backend) < 0.99
+    assert ssim(255 - truth, truth, backend) < ssim(picture, truth, backend)
+
+
+@pytest.mark.parametrize("build", [reference_backend, cpu_backend])
+def test_every_backend_gives_the_mean_of_the_map(build: Callable[[], Backend]) -> None:
+    picture, truth = pictures()
+    if build is cpu_backend and native_reason() is not None:
+        pytest.skip(str(native_reason()))
+    assert ssim(picture, truth, build()) == pytest.approx(float(ssim_map(picture, truth).mean()), abs=1e-6)
+
+
+def test_squared_errors_are_exact() -> None:
+    picture, truth = pictures()
+    errors = squared_errors(picture, truth)
+    np.testing.assert_array_equal(errors, ((picture.astype(int) - truth.astype(int)) ** 2).sum(2))
+    expected = np.mean((picture / 255.0 - truth / 255.0) ** 2)
+    assert mean_of_squares(int(errors.sum()), errors.size) == pytest.approx(expected, rel=1e-12)

@@ -17,7 +17,7 @@ from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.affine import psnr_affine
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.masks import changed_pixels
-from structgstream.evaluation.metrics import decibels, mse, psnr, quantised, ssim
+from structgstream.evaluation.metrics import decibels, mean_of_squares, quantised, squared_errors, ssim
 from structgstream.evaluation.report import FrameScores, Report, Scores, course, mean_scores
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
@@ -86,7 +86,9 @@ def evaluate(
             truth = frame.images[name]
             first.setdefault(name, truth)
             picture, seconds = rendered(placed, views[name], backend)
-            compared.append(Compared(name, truth, picture, score(picture, truth, first[name], seconds=seconds)))
+            compared.append(
+                Compared(name, truth, picture, score(picture, truth, first[name], backend=backend, seconds=seconds))
+            )
             if observer is not None:
                 observer(info.index, compared[-1])
         frames.append(_frame_scores(info, scene, compared, dict((log or {}).get(info.index, {}))))
@@ -96,17 +98,20 @@ def evaluate(
     return Report(frames, by_camera, mean, facts, environment() | {"backend": backend.name})
 
 
-def score(picture: Picture, truth: Picture, first: Picture, *, seconds: float = 0.0) -> Scores:
+def score(picture: Picture, truth: Picture, first: Picture, *, backend: Backend, seconds: float = 0.0) -> Scores:
     """The scores of a rendering against ``truth``; ``first`` is the camera's picture of frame 0."""
-    changed = changed_pixels(truth, first)
-    share = float(changed.mean())
+    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first)
+    total, moving = int(errors.sum(dtype=np.int64)), int(np.count_nonzero(changed))
+    in_changed = int(np.sum(errors, where=changed, dtype=np.int64))
     return Scores(
-        psnr=psnr(picture, truth),
-        ssim=ssim(picture, truth),
+        psnr=decibels(mean_of_squares(total, errors.size)),
+        ssim=ssim(picture, truth, backend),
         psnr_affine=psnr_affine(picture, truth),
-        psnr_changed=decibels(mse(picture, truth, where=changed)) if share > 0.0 else None,
-        psnr_still=decibels(mse(picture, truth, where=~changed)) if share < 1.0 else None,
-        changed_share=share,
+        psnr_changed=decibels(mean_of_squares(in_changed, moving)) if moving else None,
+        psnr_still=decibels(mean_of_squares(total - in_changed, errors.size - moving))
+        if moving < errors.size
+        else None,
+        changed_share=moving / errors.size,
         render_seconds=seconds,
     )
 
