@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from captures import all_numbers, numbers, write_clip, write_panoptic
 from structgstream.data.json_videos import open_json_videos
 from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig, resized, section
+from structgstream.data.wrappers import WithRig, of_cameras, resized, section
 from structgstream.errors import CaptureError, ConfigError
 
 
@@ -76,3 +77,28 @@ def test_another_rig_keeps_the_frames(source: FrameSource) -> None:
     assert other.rig.testing == (names[1],)
     assert all_numbers(other.frames(4)) == all_numbers(source.frames(4))
     assert (other.name, other.fps, len(other), other.points) == (source.name, source.fps, 6, None)
+
+
+@pytest.mark.parametrize(("wanted", "kept"), [((2, 1), [1, 2]), ((3,), [0, 3])])
+def test_the_cameras_that_are_asked_for_give_the_same_pictures(
+    source: FrameSource, wanted: tuple[int, ...], kept: list[int]
+) -> None:
+    """Through every wrapper, and one more camera where a rig would have one alone."""
+    whole = section(WithRig(resized(source, 0.5), resized(source, 0.5).rig), start=1, frames=4)
+    names = [*whole.rig]
+    part = of_cameras(whole, tuple(names[i] for i in wanted))
+    assert [*part.rig] == [names[i] for i in kept]
+    assert len(part) == len(whole) == 4
+    for frame, expected in zip(part.frames(1), whole.frames(1), strict=True):
+        assert (frame.index, frame.pts_seconds) == (expected.index, expected.pts_seconds)
+        assert [*frame.images] == [*part.rig]
+        for name, image in frame.images.items():
+            np.testing.assert_array_equal(image, expected.images[name])
+
+
+def test_a_source_of_another_kind_keeps_its_cameras(source: FrameSource) -> None:
+    class Other:
+        rig = source.rig
+
+    other: Any = Other()
+    assert of_cameras(other, (*source.rig,)[:2]) is other

@@ -2,14 +2,14 @@
 """A capture seen differently: smaller, shorter, or with other cameras held out."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.images import opencv
+from structgstream.data.images import ImageSource, opencv
 from structgstream.data.source import FrameSource
 from structgstream.data.video import VideoSource
 from structgstream.errors import CaptureError, ConfigError
@@ -121,3 +121,18 @@ def section(source: FrameSource, *, start: int = 0, frames: int | None = None) -
             f"{'all' if frames is None else frames} frames. Choose a range inside the capture."
         )
     return source if (start, length) == (0, len(source)) else Section(source, start, length)
+
+
+def of_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
+    """The capture with these cameras alone, so that no other's pictures are decoded.
+
+    A rig has two cameras at least: another one stays when ``names`` has one. Sources of a kind that is not known here
+    stay as they are. Nothing is held out in the result.
+    """
+    kept = names if len(names) > 1 else (*names, *[name for name in source.rig if name not in names][:1])
+    rig = CameraRig({name: source.rig[name] for name in source.rig if name in kept})
+    if isinstance(source, ImageSource | VideoSource):
+        return replace(source, rig=rig)
+    if isinstance(source, WithRig):
+        return replace(source, source=of_cameras(source.source, names), other=rig)
+    return replace(source, source=of_cameras(source.source, names)) if isinstance(source, Wrapped) else source

@@ -26,7 +26,7 @@ def affine_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
     left[3, :3] = left[:3, 3] = sums[:3] / 255.0
     left[3, 3] = len(both)
     right = np.concatenate([products[:3, 3:] / 255.0**2, sums[None, 3:] / 255.0])
-    return np.linalg.lstsq(left, right, rcond=None)[0].T
+    return np.linalg.lstsq(left, right, rcond=None)[0].T.astype(np.float64)
 
 
 def corrected(picture: NDArray[np.uint8], matrix: NDArray[np.float64]) -> NDArray[np.float32]:

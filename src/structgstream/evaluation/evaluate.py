@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import of_cameras
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.affine import psnr_affine
 from structgstream.evaluation.environment import environment
@@ -79,7 +80,7 @@ def evaluate(
     views = {name: reader.header.similarity.camera(reader.header.rig[name]) for name in names}
     first: dict[str, Picture] = {}
     frames = []
-    for frame, (info, scene) in zip(source.frames(), reader.scenes(0)):
+    for frame, (info, scene) in zip(of_cameras(source, names).frames(), reader.scenes(0)):
         compared = []
         placed = on_device(scene, backend.device)
         for name in names:
@@ -205,7 +206,7 @@ def compared_frames(
     """
     check_same_rig(reader.header, source, (camera,))
     view = reader.header.similarity.camera(reader.header.rig[camera])
-    for frame, (_, scene) in zip(source.frames(), reader.scenes(0)):
+    for frame, (_, scene) in zip(of_cameras(source, (camera,)).frames(), reader.scenes(0)):
         yield frame.images[camera], rendered(on_device(scene, backend.device), view, backend)[0]
 
 
