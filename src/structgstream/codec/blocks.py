@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from structgstream.codec.stored import Stored
 from structgstream.errors import StreamError
 from structgstream.scene.state import STATE_TABLE, FieldName
 
@@ -49,7 +50,7 @@ def packed_block(name: FieldName, value: Tensor) -> bytes:
     return head + struct.pack(f"<{array.ndim}I", *array.shape) + array.tobytes()
 
 
-def blocks_in(payload: bytes, start: int, *, where: str) -> Iterator[Block]:
+def blocks_in(payload: Stored, start: int, *, where: str) -> Iterator[Block]:
     """Every block from byte ``start`` to the end.
 
     Raises:
@@ -59,7 +60,7 @@ def blocks_in(payload: bytes, start: int, *, where: str) -> Iterator[Block]:
     while start < len(payload):
         if start + BLOCK.size > len(payload):
             raise StreamError(f"{where} ends within the head of a field block.")
-        code, coding, dtype, dimensions = BLOCK.unpack_from(payload, start)
+        code, coding, dtype, dimensions = BLOCK.unpack(payload[start : start + BLOCK.size])
         if code not in _NAMES or coding != RAW or dtype not in _DTYPES or dimensions > MAX_DIMENSIONS:
             raise StreamError(
                 f"{where} holds a field block (field {code}, coding {coding}, type {dtype}, {dimensions} dimensions) "
@@ -71,7 +72,7 @@ def blocks_in(payload: bytes, start: int, *, where: str) -> Iterator[Block]:
         data = start + BLOCK.size + 4 * dimensions
         if data > len(payload):
             raise StreamError(f"{where} ends within the shape of field {_NAMES[code]}.")
-        shape = struct.unpack_from(f"<{dimensions}I", payload, start + BLOCK.size)
+        shape = struct.unpack(f"<{dimensions}I", payload[start + BLOCK.size : data])
         end = data + math.prod(shape) * _DTYPES[dtype].itemsize
         # An empty tensor has no bytes to be checked against, so its other sizes get a bound of their own.
         if end > len(payload) or math.prod(max(size, 1) for size in shape) > MAX_ELEMENTS:

@@ -1,12 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a stream: header, packets, scenes; whole files and files that were cut anywhere."""
+"""Reading a stream: header, packets, scenes; whole files and files that were cut anywhere.
 
-from collections.abc import Iterator, Mapping
+Note [Nothing is kept]
+~~~~~~~~~~~~~~~~~~~~~~
+A stream is as long as the event. A reader keeps the header and eight bytes a packet, and reads everything else when it
+is asked for: what a packet is, from the heads of its record and fields; a scene, from its record, whose checksum is
+verified then. With the ``raw`` codec every packet stands alone, so any frame is as near as any other.
+"""
+
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import overload
 
-from structgstream.codec.decoder import SceneDecoder, packet_of
+from structgstream.codec.blocks import blocks_in
+from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
 from structgstream.codec.header import unpacked_header
+from structgstream.codec.index import indexed_offsets
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.records import (
     CHECKSUM,
@@ -15,11 +27,13 @@ from structgstream.codec.records import (
     Record,
     RecordType,
     check_prefix,
+    head_at,
     prefix,
     record_at,
     scanned,
     why_stopped,
 )
+from structgstream.codec.stored import Part, Stored, StoredFile
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName
@@ -39,8 +53,61 @@ class PacketInfo:
     field_bytes: Mapping[FieldName, int]
 
 
+class Packets(Sequence[PacketInfo]):
+    """The packets of a stream in order. Only their offsets are in memory; asking for one reads its heads.
+
+    Raises:
+        StreamError: on asking for a packet that was damaged after the stream was opened.
+    """
+
+    def __init__(self, data: Stored, name: str) -> None:
+        self._data = data
+        self._name = name
+        self.offsets: array[int] = array("Q")
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    @overload
+    def __getitem__(self, index: int) -> PacketInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        index = range(len(self))[index]
+        offset = self.offsets[index]
+        head = head_at(self._data, offset)
+        if head is None or head[0] not in _KINDS or head[1] < FRAME.size:
+            raise self.damaged(index)
+        start = offset + RECORD.size
+        payload = Part(self._data, start, start + head[1])
+        number, pts_seconds = FRAME.unpack(payload[: FRAME.size])
+        if number != index:
+            raise self.damaged(index)
+        blocks = blocks_in(payload, FRAME.size, where=f"Packet {index}")
+        field_bytes: dict[FieldName, int] = {block.name: block.end - block.start for block in blocks}
+        size = RECORD.size + head[1] + CHECKSUM.size
+        return PacketInfo(_KINDS[RecordType(head[0])], index, pts_seconds, offset, size, field_bytes)
+
+    def damaged(self, index: int) -> StreamError:
+        """What to raise when a packet is not what it was at opening."""
+        return StreamError(f"Packet {index} of {self._name}, at byte {self.offsets[index]}, is damaged.")
+
+
 class StreamReader:
-    """A stream in memory. Every record's checksum is verified once, on opening; what comes after damage is not read.
+    """A stream in memory or in a file; memory does not grow with its length (Note [Nothing is kept]).
+
+    Every record's checksum is verified once, on opening, one record at a time; what comes after damage is not read.
+    With ``by_index`` the index tells where packets are, if it agrees with their records' heads, and a checksum is
+    verified when its record is read; without a good index that is the same as without the argument.
+
+    Args:
+        data: the bytes, or an open file, which the reader then closes.
+        name: what messages call it.
+        by_index: open without reading every byte.
 
     Attributes:
         header: what the init record says.
@@ -52,111 +119,129 @@ class StreamReader:
         StreamError: not a stream, another major version, no whole init record, or records that contradict each other.
     """
 
-    def __init__(self, data: bytes | memoryview, *, name: str = "The stream") -> None:
+    def __init__(self, data: Stored, *, name: str = "The stream", by_index: bool = False) -> None:
         check_prefix(data, name)
         self._data = data
         self._name = name
         self.total_bytes = len(data)
         self.complete = False
-        self.packets: list[PacketInfo] = []
-        records = scanned(data)
-        init = next(records, None)
+        self.packets = Packets(data, name)
+        init = record_at(data, PREFIX.size)
         if init is None:
             raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
         if init.type != RecordType.INIT:
             raise StreamError(f"{name} begins with a record of type {init.type}; an init record was expected.")
         self.header = unpacked_header(init.payload)
         self.header_bytes = end = init.end
-        for record in records:
+        offsets = indexed_offsets(data, end) if by_index else None
+        if offsets is not None:
+            self.packets.offsets = offsets
+            self.complete = True
+        else:
+            end = self._scan(end)
+        self.cut_reason = None if self.complete else why_stopped(data, end)
+        self._decoder = SceneDecoder(self.header)
+
+    def _scan(self, end: int) -> int:
+        """Verify every record from byte ``end`` on; returns where the last whole one ends."""
+        pts_seconds = 0.0
+        for record in scanned(self._data, end):
             end = record.end
             if record.type == RecordType.INDEX:
                 self.complete = True
                 break
-            self._add(record)
-        self.cut_reason = None if self.complete else why_stopped(data, end)
-        self._decoder = SceneDecoder(self.header)
+            pts_seconds = self._add(record, pts_seconds)
+        return end
 
-    def _add(self, record: Record) -> None:
+    def _add(self, record: Record, before_seconds: float) -> float:
+        """Note a packet's place; returns when it is presented, or the time of the one before for another record."""
         if record.type == RecordType.INIT:
             raise StreamError(f"{self._name} has a second init record, at byte {record.offset}.")
         if record.type not in _KINDS:
-            return
+            return before_seconds
         packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
         if packet.index != len(self.packets):
             raise StreamError(f"{self._name} has packet {packet.index} where packet {len(self.packets)} belongs.")
         if packet.index == 0 and packet.kind is not PacketKind.KEY:
             raise StreamError(f"{self._name} begins with a delta packet; the first must be a key packet.")
-        if packet.index and packet.pts_seconds <= self.packets[-1].pts_seconds:
+        if packet.index and packet.pts_seconds <= before_seconds:
             raise StreamError(f"In {self._name} packet {packet.index} is not presented after the one before it.")
-        size = record.end - record.offset
-        self.packets.append(
-            PacketInfo(packet.kind, packet.index, packet.pts_seconds, record.offset, size, packet.field_bytes)
-        )
+        self.packets.offsets.append(record.offset)
+        return packet.pts_seconds
 
     def __len__(self) -> int:
         return len(self.packets)
+
+    def __enter__(self) -> "StreamReader":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file, if there is one; what is asked for later raises. Unneeded before the reader is dropped."""
+        if isinstance(self._data, StoredFile):
+            self._data.close()
 
     def scene(self, index: int) -> Scene:
         """The scene of one frame, in normalised units.
 
         Raises:
-            StreamError: there is no such frame.
+            StreamError: there is no such frame, or it has been damaged.
         """
         if not 0 <= index < len(self):
             have = f"frames 0 to {len(self) - 1}" if self.packets else "no whole frame"
             raise StreamError(f"{self._name} has {have}; there is no frame {index}.")
-        info = self.packets[index]
-        record = record_at(self._data, info.offset)
-        if record is None:
-            raise StreamError(f"Packet {index} of {self._name}, at byte {info.offset}, is damaged.")
-        return self._decoder.decode(packet_of(record.payload, info.kind))
+        record = record_at(self._data, self.packets.offsets[index])
+        if record is None or record.type not in _KINDS:
+            raise self.packets.damaged(index)
+        packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
+        if packet.index != index:
+            raise self.packets.damaged(index)
+        return self._decoder.decode(packet)
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
-        """Every frame from ``start`` on."""
-        for info in self.packets[start:]:
-            yield info, self.scene(info.index)
+        """Every frame from ``start`` on, one at a time."""
+        for index in range(*slice(start, None).indices(len(self))):
+            scene = self.scene(index)
+            yield self.packets[index], scene
+            del scene
 
 
-def open_stream(path: Path | str) -> StreamReader:
-    """Read a stream file.
+def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
+    """Read a stream file, which stays open as long as the reader is used (it closes itself, also in a ``with`` block).
+
+    Args:
+        path: the file.
+        by_index: find packets by the file's index instead of verifying every byte first, as :class:`StreamReader`.
 
     Raises:
         StreamError: there is no such file, or it is not a stream.
     """
-    data = stored_bytes(path)
-    if not data:
+    data = StoredFile(path)
+    if not len(data):
         raise StreamError(f"{path} is empty; expected a stream made by structgstream reconstruct.")
-    return StreamReader(data, name=str(path))
+    return StreamReader(data, name=str(path), by_index=by_index)
 
 
-def stored_bytes(path: Path | str) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        StreamError: it cannot be read.
-    """
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise StreamError(f"Cannot read {path} ({error.strerror}); expected a stream file.") from error
-
-
-def record_after_damage(data: bytes, offset: int) -> bool:
+def record_after_damage(data: Stored, offset: int) -> bool:
     """Whether a whole record follows a damaged one at ``offset``: no crash leaves that, only a medium that forgets."""
     if offset + RECORD.size > len(data) or record_at(data, offset) is not None:
         return False
-    length = RECORD.unpack_from(data, offset)[3]
+    length = RECORD.unpack(data[offset : offset + RECORD.size])[3]
     return record_at(data, offset + RECORD.size + length + CHECKSUM.size) is not None
 
 
-def readable_part(data: bytes, *, name: str) -> int | None:
+def readable_part(data: Stored, *, name: str) -> int | None:
     """Where the last whole packet ends, the index and what follows left out; None when the init record was cut.
 
     Raises:
         StreamError: not a stream, another major version, or an init record that is there and damaged: starting again
             would throw away what follows it.
     """
-    if prefix().startswith(data):
+    if prefix().startswith(bytes(data[: PREFIX.size + 1])):
         return None  # Cut within the prefix, or empty.
     check_prefix(data, name)
     end = PREFIX.size

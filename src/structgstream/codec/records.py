@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
+from structgstream.codec.stored import Stored
 from structgstream.errors import StreamError
 
 MAGIC = b"\x89SGS\r\n\x1a\n"
@@ -61,7 +62,7 @@ def packed(kind: RecordType, payload: bytes) -> bytes:
     return head + payload + CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(head)))
 
 
-def check_prefix(data: bytes | memoryview, name: str) -> None:
+def check_prefix(data: Stored, name: str) -> None:
     """Refuse what is not a stream of this major version.
 
     Raises:
@@ -71,41 +72,47 @@ def check_prefix(data: bytes | memoryview, name: str) -> None:
         raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
     if len(data) < PREFIX.size:
         raise StreamError(f"{name} is cut at byte {len(data)}, before anything that can be shown.")
-    _, major, minor = PREFIX.unpack_from(data)
+    _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
         raise StreamError(
             f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. Install a newer structgstream."
         )
 
 
-def record_at(data: bytes | memoryview, offset: int) -> Record | None:
-    """The whole, undamaged record at ``offset``, or None. Nothing is allocated before its length is known to fit."""
+def head_at(data: Stored, offset: int) -> tuple[int, int] | None:
+    """Type and payload length that the record at ``offset`` states, when it is long enough to hold them."""
     if offset + RECORD.size + CHECKSUM.size > len(data):
         return None
-    kind, _, _, length = RECORD.unpack_from(data, offset)
-    end = offset + RECORD.size + length
-    if end + CHECKSUM.size > len(data):
-        return None
-    (stated,) = CHECKSUM.unpack_from(data, end)
-    if zlib.crc32(memoryview(data)[offset:end]) != stated:
-        return None
-    return Record(kind, bytes(data[offset + RECORD.size : end]), offset)
+    kind, _, _, length = RECORD.unpack(data[offset : offset + RECORD.size])
+    return None if offset + RECORD.size + length + CHECKSUM.size > len(data) else (kind, length)
 
 
-def why_stopped(data: bytes | memoryview, offset: int) -> str:
+def record_at(data: Stored, offset: int) -> Record | None:
+    """The whole, undamaged record at ``offset``, or None. Nothing is allocated before its length is known to fit."""
+    if (head := head_at(data, offset)) is None:
+        return None
+    start = offset + RECORD.size
+    end = start + head[1]
+    payload = bytes(data[start:end])
+    checksum = CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(data[offset:start])))
+    if len(payload) < head[1] or bytes(data[end : end + CHECKSUM.size]) != checksum:
+        return None
+    return Record(head[0], payload, offset)
+
+
+def why_stopped(data: Stored, offset: int) -> str:
     """What is at ``offset``, where :func:`record_at` found no whole record."""
     if offset == len(data):
         return f"it ends at byte {offset} without an index"
     if offset + RECORD.size <= len(data):
-        length = RECORD.unpack_from(data, offset)[3]
+        length = RECORD.unpack(data[offset : offset + RECORD.size])[3]
         if offset + RECORD.size + length + CHECKSUM.size <= len(data):
             return f"the record at byte {offset} of {len(data)} is damaged"
     return f"it is cut at byte {len(data)}, within the record that begins at byte {offset}"
 
 
-def scanned(data: bytes | memoryview) -> Iterator[Record]:
-    """Every record up to the first that is cut or damaged."""
-    offset = PREFIX.size
+def scanned(data: Stored, offset: int = PREFIX.size) -> Iterator[Record]:
+    """Every record from byte ``offset`` on, up to the first that is cut or damaged."""
     while (record := record_at(data, offset)) is not None:
         yield record
         offset = record.end

@@ -3,20 +3,18 @@
 
 import io
 import os
-import struct
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.codec.header import packed_header
+from structgstream.codec.index import INDEX_ENTRY, packed_index
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.reader import StreamReader, readable_part, stored_bytes
+from structgstream.codec.reader import StreamReader, readable_part
 from structgstream.codec.records import RecordType, packed, prefix
+from structgstream.codec.stored import Part, Stored, StoredFile
 from structgstream.errors import StorageError
 
-INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
-FOOTER = struct.Struct("<Q8s")
-FOOTER_MAGIC = b"SGSINDEX"
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 
 
@@ -31,12 +29,13 @@ class _Writer:
         self._file = file
         self._name = name
         self._end = 0
-        self._entries: dict[int, tuple[int, int]] = {}  # by offset; those from _end on did not come to be
+        self._entries = bytearray()  # INDEX_ENTRY after INDEX_ENTRY; those that say _end or more did not come to be
         self._failed = False
 
     def continue_at(self, end: int, reader: StreamReader) -> None:
         """Go on after byte ``end`` of a file that holds the packets of ``reader``."""
-        self._entries = {info.offset: (info.index, int(_TYPES[info.kind])) for info in reader.packets}
+        entries = (INDEX_ENTRY.pack(info.index, _TYPES[info.kind], info.offset) for info in reader.packets)
+        self._entries = bytearray(b"".join(entries))
         self._end = end
         self._file.truncate(end)
 
@@ -45,18 +44,20 @@ class _Writer:
 
     def write(self, packet: Packet) -> int:
         kind = _TYPES[packet.kind]
-        self._entries[self._end] = (packet.index, int(kind))
+        self._entries += INDEX_ENTRY.pack(packet.index, kind, self._end)
         return self._append(packed(kind, packet.payload))
 
     def finish(self) -> None:
         """Write index and footer and cut what an interrupted write left; nothing after a failed write."""
         if self._failed:
             return
-        offset = self._end
-        entries = [(*entry, at) for at, entry in self._entries.items() if at < offset]
-        index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
-        self._append(packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC))
+        self._append(packed_index(self._written().values(), self._end))
         self._file.truncate(self._end)
+
+    def _written(self) -> dict[int, tuple[int, int, int]]:
+        """Offset to index entry of every whole packet; of a write that was interrupted and repeated, the later."""
+        entries = INDEX_ENTRY.iter_unpack(self._entries)
+        return {offset: (index, kind, offset) for index, kind, offset in entries if offset < self._end}
 
     def _append(self, data: bytes) -> int:
         try:
@@ -70,9 +71,9 @@ class _Writer:
             self._failed = True
             with suppress(OSError):  # If even this fails, readers stop at the record that is not whole.
                 self._file.truncate(self._end)
-            whole = sum(at < self._end for at in self._entries)
             raise StorageError(
-                f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). The {whole} frames "
+                f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). "
+                f"The {len(self._written())} frames "
                 "before are safe in it; make room and continue with --resume."
             ) from error
         self._end += len(data)
@@ -100,9 +101,9 @@ class FileSink:
             StreamError: the file is something else, or damaged where nothing can be saved.
         """
         sink = cls(path, overwrite=True)
-        data = stored_bytes(path) if sink.path.exists() else b""
+        data: Stored = StoredFile(path) if sink.path.exists() else b""
         end = readable_part(data, name=str(path))
-        reader = None if end is None else StreamReader(memoryview(data)[:end], name=str(path))
+        reader = None if end is None else StreamReader(Part(data, 0, end), name=str(path))
         if end is None or reader is None or not reader.packets:
             return sink, None
         sink._resumed = (end, reader)

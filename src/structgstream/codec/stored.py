@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bytes that are looked up by place: in memory, in a file that stays on the disk, or a part of either."""
+
+import threading
+import weakref
+from io import FileIO
+from pathlib import Path
+from typing import Protocol
+
+from structgstream.errors import StreamError
+
+
+class Stored(Protocol):
+    """What ``bytes``, ``memoryview``, :class:`StoredFile` and :class:`Part` have in common: a length, and slices."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, key: slice, /) -> bytes | memoryview: ...
+
+
+class StoredFile:
+    """A file, read piece by piece; only the piece asked for is ever in memory.
+
+    The length is that at opening: what a running reconstruction appends later is not seen. A file that has become
+    shorter gives shorter pieces, which no checksum fits. Several threads may read. The file is closed by
+    :meth:`close`, at the end of a ``with`` block, or when the object is gone.
+
+    Raises:
+        StreamError: it cannot be read.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self._path = path
+        try:
+            self._file = FileIO(path)
+            # The finalizer holds the file itself, so that a reader that nobody closes leaves no open file behind.
+            self._finalizer = weakref.finalize(self, self._file.close)
+            self._size = self._file.seek(0, 2)
+        except OSError as error:
+            raise StreamError(f"Cannot read {path} ({error.strerror}); expected a stream file.") from error
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, key: slice, /) -> bytes:
+        start, stop, _ = key.indices(self._size)
+        try:
+            with self._lock:
+                self._file.seek(start)
+                return self._read(max(stop - start, 0))
+        except OSError as error:
+            raise StreamError(f"Cannot read {self._path} ({error.strerror}); it could be read before.") from error
+        except ValueError as error:
+            raise StreamError(f"Cannot read {self._path}: it has been closed; open it again.") from error
+
+    def _read(self, count: int) -> bytes:
+        """Up to ``count`` bytes from where the file stands; an operating system may hand over fewer at a time."""
+        piece = self._file.read(count)
+        if len(piece) == count or not piece:
+            return piece
+        pieces = [piece]
+        while count := count - len(piece):
+            if not (piece := self._file.read(count)):
+                break
+            pieces.append(piece)
+        return b"".join(pieces)
+
+    def close(self) -> None:
+        """Closes the file. A second call does nothing."""
+        self._finalizer()
+
+
+class Part:
+    """The bytes from ``start`` to ``end`` of others, without a copy."""
+
+    def __init__(self, data: Stored, start: int, end: int) -> None:
+        self._data = data
+        self._start = start
+        self._size = max(min(end, len(data)) - start, 0)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, key: slice, /) -> bytes | memoryview:
+        start, stop, _ = key.indices(self._size)
+        return self._data[self._start + start : self._start + max(stop, start)]
