@@ -8,6 +8,7 @@ from typing import Any
 
 from benchmarks.benchmark import Benchmark, Growth
 from benchmarks.contest import TURN_SECONDS, check, spread, timed
+from benchmarks.machine import Instant, others_share
 
 
 def slope(sizes: Sequence[float], seconds: Sequence[float]) -> float:
@@ -23,6 +24,7 @@ def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: in
     """One curve, every size checked before it is timed, as plain JSON values."""
     sizes = growth.quick if quick else growth.full
     curves: dict[str, list[dict[str, Any]]] = {}
+    before = Instant.now()
     for size, arguments in sizes.items():
         entries = (growth.contestants or benchmark.contestants)(**arguments)
         check(entries, benchmark.quantities, oracle=benchmark.oracle(**arguments) if benchmark.oracle else None)
@@ -32,6 +34,7 @@ def run_growth(benchmark: Benchmark, growth: Growth, *, quick: bool, repeats: in
             curves.setdefault(entry.name, []).append(point)
     return {
         "axis": growth.axis,
+        "others_share": others_share(before, Instant.now()),
         "curves": curves,
         "slopes": {
             name: slope([point["size"] for point in points], [point["seconds"]["median"] for point in points])

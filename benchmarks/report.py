@@ -54,6 +54,12 @@ def _target(target: Mapping[str, Any]) -> str:
     return f"Target of {target['contestant']}: {asked}; got {got}: {'met' if target['met'] else 'missed'}."
 
 
+def _quietness(found: Mapping[str, Any]) -> Iterator[str]:
+    if found.get("others_share") is not None:
+        yield ""
+        yield f"Meanwhile other processes took {100 * found['others_share']:.0f} % of the machine."
+
+
 def variant_lines(benchmark: Mapping[str, Any], variant: Mapping[str, Any]) -> Iterator[str]:
     """One contest as a Markdown table."""
     yield f"**{benchmark['name']}**: {benchmark['work']}; {variant['title']}"
@@ -69,9 +75,7 @@ def variant_lines(benchmark: Mapping[str, Any], variant: Mapping[str, Any]) -> I
     for target in variant.get("targets", ()):
         yield ""
         yield _target(target)
-    if variant["others_share"] is not None:
-        yield ""
-        yield f"Meanwhile other processes took {100 * variant['others_share']:.0f} % of the machine."
+    yield from _quietness(variant)
     yield ""
 
 
@@ -89,6 +93,7 @@ def growth_lines(benchmark: Mapping[str, Any], growth: Mapping[str, Any]) -> Ite
             if fact.endswith("psnr"):
                 values = (f"{point['facts'][fact]:.2f}" for point in points)
                 yield f"| {name}: {fact}, dB | {' | '.join(values)} | |"
+    yield from _quietness(growth)
     yield ""
 
 

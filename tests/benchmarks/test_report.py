@@ -41,11 +41,12 @@ def test_growth_is_a_table_with_slopes_and_quality() -> None:
         {"size": size, "seconds": {**SECONDS, "median": seconds}, "facts": {"held-out psnr": 30.0 + seconds}}
         for size, seconds in ((1000, 0.5), (2000, 1.0))
     ]
-    growth = {"axis": "anchors", "curves": {"ours": points}, "slopes": {"ours": 1.0}}
+    growth = {"axis": "anchors", "curves": {"ours": points}, "slopes": {"ours": 1.0}, "others_share": 0.5}
     lines = list(growth_lines({"name": "thing"}, growth))
     assert "| contestant | 1,000 | 2,000 | slope |" in lines
     assert "| ours | 500 ms | 1000 ms | 1.00 |" in lines
     assert "| ours: held-out psnr, dB | 30.50 | 31.00 | |" in lines
+    assert "Meanwhile other processes took 50 % of the machine." in lines
 
 
 def test_digits_follow_the_size() -> None:
