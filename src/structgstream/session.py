@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop: frames in, packets out, and the decoded scene is where the next frame starts (Note [Closed loop])."""
 
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -17,6 +16,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.memory import PeakKind, PeakMeter
 from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, on_device, state_of
@@ -28,7 +28,11 @@ from structgstream.training.result import FitResult, StepListener
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What happened to one frame."""
+    """What happened to one frame.
+
+    Peaks of memory are by stage: ``read``, ``fit``, and ``store`` for encoding and writing. ``peak_memory_kind`` says
+    whether they are each stage's own (Note [Peaks]); ``peak_device_bytes`` has the GPU's, when there is one.
+    """
 
     index: int
     pts_seconds: float
@@ -42,17 +46,9 @@ class FrameReport:
     spawned: int
     pruned: int
     seconds: Mapping[str, float] = field(default_factory=dict)
-    peak_memory_bytes: int | None = None
-
-
-def peak_memory_bytes() -> int | None:
-    """The process's largest resident size so far; None where the system does not tell."""
-    try:
-        import resource
-    except ImportError:
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    peak_memory_bytes: Mapping[str, int] = field(default_factory=dict)
+    peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
+    peak_memory_kind: PeakKind = PeakKind.NONE
 
 
 def frame_seed(seed: int, index: int) -> int:
@@ -128,13 +124,16 @@ class Session:
         frames = self._source.frames(start - again)
         before = next(frames) if again else None
         while True:
+            peaks = PeakMeter(self._backend.device)
             started = time.perf_counter()
             frame = next(frames, None)
             if frame is None:
                 return
+            peaks.end("read")
             read = time.perf_counter()
             fit = self._fit(scene, frame, before)
             before = frame if self._config.online.motion.enabled else None
+            peaks.end("fit")
             fitted = time.perf_counter()
             if encoder is None:
                 header = self._header(fit.scene)
@@ -145,6 +144,7 @@ class Session:
             scene = encoded.reconstruction
             coded = time.perf_counter()
             size = self._sink.write(encoded.packet)
+            peaks.end("store")
             done = time.perf_counter()
             yield FrameReport(
                 index=frame.index,
@@ -166,7 +166,9 @@ class Session:
                     "write": done - coded,
                     "total": done - started,
                 },
-                peak_memory_bytes=peak_memory_bytes(),
+                peak_memory_bytes=peaks.process_bytes,
+                peak_device_bytes=peaks.device_bytes,
+                peak_memory_kind=peaks.kind,
             )
 
     @property

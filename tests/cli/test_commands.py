@@ -44,7 +44,10 @@ def test_reconstruct_writes_the_log_beside_the_stream(stream: Path) -> None:
     assert [entry["index"] for entry in entries] == [0, 1, 2]
     assert [entry["kind"] for entry in entries] == ["key", "delta", "delta"]
     assert all(entry["total_seconds"] == entry["seconds"]["total"] > 0 for entry in entries)
+    assert all(entry["peak_memory_bytes"] == max(entry["peak_memory_bytes_by_stage"].values()) for entry in entries)
+    assert all([*entry["peak_memory_bytes_by_stage"]] == ["read", "fit", "store"] for entry in entries)
     assert all(entry["peak_memory_bytes"] > 1e6 for entry in entries)
+    assert {entry["peak_memory_kind"] for entry in entries} <= {"stage", "process"}
 
 
 def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

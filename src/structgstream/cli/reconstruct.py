@@ -20,7 +20,7 @@ from structgstream.cli.options import (
     parsed_with_rest,
     resolved_config,
 )
-from structgstream.cli.progress import display
+from structgstream.cli.progress import display, human_bytes
 from structgstream.errors import StorageError, StructGStreamError
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def main(arguments: list[str]) -> None:
         markup=False,
         soft_wrap=True,
     )
-    reconstructed(
+    peaks = reconstructed(
         source,
         config,
         output=options.output,
@@ -91,6 +91,9 @@ def main(arguments: list[str]) -> None:
         metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
         resume=options.resume,
     )
+    if peaks:
+        stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
+        console.print(f"Peak memory by stage: {stages}.", highlight=False, markup=False, soft_wrap=True)
     console.print(f"Wrote {options.output}", highlight=False, markup=False, soft_wrap=True)
 
 
@@ -102,8 +105,11 @@ def reconstructed(
     backend: "Backend",
     metadata: Mapping[str, object],
     resume: bool = False,
-) -> None:
+) -> dict[str, int]:
     """Reconstructs ``source`` into the file ``output``, replacing what is there unless it is resumed.
+
+    Returns:
+        the largest peak of memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
 
     Raises:
         Interrupted: the user pressed Ctrl-C; whole frames are in the file.
@@ -116,6 +122,7 @@ def reconstructed(
 
     sink, resumed = FileSink.resume(output) if resume else (FileSink(output, overwrite=True), None)
     done = 0 if resumed is None else len(resumed)
+    peaks: dict[str, int] = {}
     try:
         with display(len(source), done=done) as progress:
             try:
@@ -135,11 +142,15 @@ def reconstructed(
             with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
                 for report in reports:
                     append_log(output, log_entry(report))
+                    on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
+                    for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
+                        peaks[stage] = max(size, peaks.get(stage, 0))
                     progress.frame(report)
                     done = report.index + 1
     except KeyboardInterrupt:
         kept = f"{output} has {done} of {len(source)} frames; go on with the same command and --resume."
         raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None
+    return peaks
 
 
 def check_output(output: Path, *, may_exist: bool) -> None:
@@ -163,8 +174,17 @@ def check_output(output: Path, *, may_exist: bool) -> None:
 
 
 def log_entry(report: "FrameReport") -> dict[str, Any]:
-    """One line of the log: the frame's report as plain values."""
-    return asdict(report) | {"kind": report.kind.name.lower(), "total_seconds": report.seconds["total"]}
+    """One line of the log: the frame's report as plain values, with seconds and memory of the whole frame beside it."""
+    entry = asdict(report)
+    del entry["peak_device_bytes"]
+    return entry | {
+        "kind": report.kind.name.lower(),
+        "total_seconds": report.seconds["total"],
+        "peak_memory_bytes": max(report.peak_memory_bytes.values(), default=None),
+        "peak_memory_bytes_by_stage": dict(report.peak_memory_bytes),
+        "peak_device_bytes_by_stage": dict(report.peak_device_bytes),
+        "peak_memory_kind": str(report.peak_memory_kind),
+    }
 
 
 def _print_config(arguments: list[str]) -> None:

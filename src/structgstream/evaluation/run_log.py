@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the trainer knows and the stream does not carry: seconds by stage, memory, PSNR on training views.
+"""What the trainer knows and the stream does not carry: seconds and memory by stage, PSNR on training views.
 
 One JSON object a line in ``OUT.log.jsonl`` beside ``OUT.sgs``, written after each frame, so that a crash
-loses none and a resumed run appends.
+loses none and a resumed run appends. ``peak_memory_bytes`` is the frame's largest; ``peak_memory_kind`` says what it
+and the sizes by stage are: each stage's own (``stage``) or the process's so far (``process``).
 """
 
 import json

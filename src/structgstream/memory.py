@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much memory the process holds, and the most it held during each stage of its work.
+
+Note [Peaks]
+~~~~~~~~~~~~
+The system keeps one high-water mark of the resident size for the whole process. Linux lets a process set it back
+(``/proc/self/clear_refs``, proc_pid_clear_refs(5)), so that the mark at the end of a stage (``VmHWM`` of
+``/proc/self/status``) is that stage's own. Elsewhere the mark only rises, and a stage's number means "up to the end of
+this stage". It counts all threads: what a frame decoded ahead holds belongs to the stage that it is decoded in. Whoever
+else reads the mark, ``ru_maxrss`` included, sees it set back.
+"""
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+
+import torch
+
+_CLEAR = Path("/proc/self/clear_refs")
+_STATUS = Path("/proc/self/status")
+_RESET_PEAK = "5"
+
+
+class PeakKind(StrEnum):
+    """What the numbers of a :class:`PeakMeter` mean."""
+
+    STAGE = "stage"  # the stage's own peak
+    PROCESS = "process"  # the process's peak up to the end of the stage
+    NONE = "none"  # the system does not tell
+
+
+class PeakMeter:
+    """Takes the peak memory of stages that follow one another (Note [Peaks]); the first begins on creation.
+
+    Args:
+        device: its memory is measured beside the process's when it is a CUDA device; torch's allocations only.
+
+    Attributes:
+        kind: what ``process_bytes`` holds.
+        process_bytes: stage to largest resident size; empty where the system does not tell.
+        device_bytes: stage to largest size of allocated tensors; empty without a CUDA device.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device if device.type == "cuda" else None
+        self.process_bytes: dict[str, int] = {}
+        self.device_bytes: dict[str, int] = {}
+        self.kind = self._restart()
+
+    def end(self, stage: str) -> None:
+        """Notes the peak of the stage that ends here; the next begins."""
+        peak = status_bytes("VmHWM") if self.kind is PeakKind.STAGE else process_peak_bytes()
+        if peak is not None:
+            self.process_bytes[stage] = peak
+        if self._device is not None:
+            self.device_bytes[stage] = torch.cuda.max_memory_allocated(self._device)
+        restarted = self._restart()
+        self.kind = self.kind if self.kind is restarted else PeakKind.PROCESS
+
+    def _restart(self) -> PeakKind:
+        if self._device is not None:
+            torch.cuda.reset_peak_memory_stats(self._device)
+        if status_bytes("VmHWM") is not None:
+            try:
+                _CLEAR.write_text(_RESET_PEAK)
+            except OSError:
+                return PeakKind.PROCESS
+            return PeakKind.STAGE
+        return PeakKind.NONE if process_peak_bytes() is None else PeakKind.PROCESS
+
+
+def resident_bytes() -> int | None:
+    """What the process holds in memory now; None where the system does not tell."""
+    return status_bytes("VmRSS")
+
+
+def status_bytes(name: str) -> int | None:
+    """A size of ``/proc/self/status``; None where there is no such line."""
+    try:
+        lines = _STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    sizes = (line.split()[1] for line in lines if line.startswith(f"{name}:"))
+    size = next(sizes, None)
+    return None if size is None else int(size) * 1024
+
+
+def process_peak_bytes() -> int | None:
+    """The process's largest resident size so far, or since Linux was told to set it back; None where unknown."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
