@@ -80,12 +80,14 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
     drawn. An id that no view generates (its opacity has fallen to zero) is left out.
     """
     found: list[Gaussians] = [_empty_like(scene)]
-    missing = ids
+    slots = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
+    missing = torch.zeros(slots, dtype=torch.bool, device=ids.device)
+    missing[ids] = True
     for view in views:
-        if missing.numel() == 0:
+        if not missing.any():
             break
         seen = scene.gaussians(view.camera, backend)
-        rows = torch.isin(seen.ids, missing).nonzero()[:, 0]
+        rows = missing[seen.ids].nonzero()[:, 0]
         found.append(
             Gaussians(
                 means=seen.means[rows],
@@ -96,7 +98,7 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
                 ids=seen.ids[rows],
             )
         )
-        missing = missing[~torch.isin(missing, seen.ids)]
+        missing[seen.ids] = False
     columns = {name: torch.cat([getattr(g, name) for g in found]) for name in Gaussians.__dataclass_fields__}
     order = columns["ids"].argsort()
     return Gaussians(**{name: column[order] for name, column in columns.items()})

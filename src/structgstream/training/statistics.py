@@ -24,12 +24,13 @@ class GradientStatistics:
     def add(self, rendering: Rendering, gradient: Tensor) -> None:
         """Add one rendering's ``screen_offsets`` gradient ``[N, 2]`` (pixels) for the Gaussians that were drawn."""
         height, width = rendering.alpha.shape
-        drawn = rendering.radii > 0
-        ndc = gradient[drawn] * gradient.new_tensor([0.5 * width, 0.5 * height])
-        ids = rendering.gaussians.ids[drawn]
-        # An id occurs once a rendering, so plain indexing is exact, fast and repeatable.
-        self.total[ids] += ndc.norm(dim=1)
-        self.count[ids] += 1.0
+        x, y = gradient.unbind(1)
+        length = ((0.5 * width * x).square_() + (0.5 * height * y).square_()).sqrt_()
+        drawn = (rendering.radii > 0).to(length)
+        # An id occurs once a rendering, so sums repeat bit for bit.
+        ids = rendering.gaussians.ids
+        self.total.index_add_(0, ids, length * drawn)
+        self.count.index_add_(0, ids, drawn)
 
     def mean(self) -> Tensor:
         """Mean gradient norm for each slot, 0 where nothing was drawn, ``[slots]`` in NDC units."""
