@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -157,3 +158,35 @@ def test_the_readable_part_leaves_out_the_index() -> None:
     assert readable_part(data[: records[3].end + 5], name="x") == records[3].end
     assert readable_part(data[:40], name="x") is None
     assert readable_part(b"", name="x") is None
+
+
+def test_a_file_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "a.sgs"
+    path.write_bytes(small_stream())
+    whole = StreamReader(path.read_bytes())
+    with open_stream(path) as reader:
+        assert [*reader.packets] == [*whole.packets]
+        assert reader.packets[-1] == reader.packets[3]
+        assert reader.packets[1:] == [*whole.packets][1:]
+        with pytest.raises(IndexError):
+            reader.packets[4]
+        assert same(reader.scene(2), whole.scene(2))
+        os.truncate(path, whole.packets[2].offset + 10)
+        assert same(reader.scene(1), whole.scene(1))
+        for ask in (reader.scene, reader.packets.__getitem__):
+            with pytest.raises(StreamError, match="a.sgs: it has become shorter"):
+                ask(2)
+    with pytest.raises(StreamError, match="has been closed"):
+        reader.scene(0)
+
+
+def test_a_file_that_became_another_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "a.sgs"
+    path.write_bytes(data := small_stream())
+    reader = open_stream(path)
+    first, second = reader.packets[1:3]
+    other = data[second.offset : second.offset + second.bytes]
+    path.write_bytes(data[: first.offset] + other + data[first.offset + len(other) :])
+    for ask in (reader.scene, reader.packets.__getitem__):
+        with pytest.raises(StreamError, match="Packet 1 .* is damaged"):
+            ask(1)

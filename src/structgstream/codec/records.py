@@ -95,7 +95,7 @@ def record_at(data: Stored, offset: int) -> Record | None:
     end = start + head[1]
     payload = bytes(data[start:end])
     checksum = CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(data[offset:start])))
-    if len(payload) < head[1] or bytes(data[end : end + CHECKSUM.size]) != checksum:
+    if bytes(data[end : end + CHECKSUM.size]) != checksum:
         return None
     return Record(head[0], payload, offset)
 

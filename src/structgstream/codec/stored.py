@@ -21,12 +21,11 @@ class Stored(Protocol):
 class StoredFile:
     """A file, read piece by piece; only the piece asked for is ever in memory.
 
-    The length is that at opening: what a running reconstruction appends later is not seen. A file that has become
-    shorter gives shorter pieces, which no checksum fits. Several threads may read. The file is closed by
-    :meth:`close`, at the end of a ``with`` block, or when the object is gone.
+    The length is that at opening: what a running reconstruction appends later is not seen. Several threads may read.
+    The file is closed by :meth:`close`, or when the object is gone.
 
     Raises:
-        StreamError: it cannot be read.
+        StreamError: it cannot be read; when a piece is asked for, also that it is closed or has become shorter.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -55,16 +54,16 @@ class StoredFile:
             raise StreamError(f"Cannot read {self._path}: it has been closed; open it again.") from error
 
     def _read(self, count: int) -> bytes:
-        """Up to ``count`` bytes from where the file stands; an operating system may hand over fewer at a time."""
-        piece = self._file.read(count)
-        if len(piece) == count or not piece:
-            return piece
-        pieces = [piece]
-        while count := count - len(piece):
+        """``count`` bytes from where the file stands; an operating system may hand over fewer at a time."""
+        pieces = []
+        while count:
             if not (piece := self._file.read(count)):
-                break
+                raise StreamError(
+                    f"Cannot read {self._path}: it has become shorter since it was opened; open it again."
+                )
             pieces.append(piece)
-        return b"".join(pieces)
+            count -= len(piece)
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def close(self) -> None:
         """Closes the file. A second call does nothing."""
