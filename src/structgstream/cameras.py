@@ -7,11 +7,20 @@ top-left pixel at (0.5, 0.5). See ``docs/conventions.md``.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from structgstream.errors import CalibrationError
+
+
+class CameraMatrices(NamedTuple):
+    """``viewmat`` ``[4, 4]``, ``K`` ``[3, 3]`` and ``center`` ``[3]`` of a camera."""
+
+    viewmat: Tensor
+    K: Tensor
+    center: Tensor
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,9 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
+    _beside: dict[tuple[torch.dtype, torch.device], CameraMatrices] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewmat", torch.as_tensor(self.viewmat, dtype=torch.float64).cpu())
@@ -62,6 +74,13 @@ class Camera:
     def center(self) -> Tensor:
         """Position of the camera in the world, ``[3]`` float64."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def beside(self, like: Tensor) -> CameraMatrices:
+        """The camera's matrices in the precision and on the device of ``like``; kept, as a copy to a GPU waits."""
+        key = (like.dtype, like.device)
+        if key not in self._beside:
+            self._beside[key] = CameraMatrices(self.viewmat.to(like), self.K.to(like), self.center.to(like))
+        return self._beside[key]
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with its picture resampled to ``width x height`` pixels.

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels.cuda_tiles import PairBudget, tile_lists
+from structgstream.kernels.cuda_tiles import PairBudget, tile_lists, with_enough_room
 from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
@@ -100,3 +100,17 @@ def test_a_budget_remembers_the_worst_picture() -> None:
     for needed, missing in ((90, 0), (130, 30), (10, 30)):
         torch.maximum(budget.needed, torch.tensor(needed), out=budget.needed)
         assert budget.shortage() == missing
+
+
+def test_work_that_was_short_of_room_is_done_again() -> None:
+    capacities = []
+
+    def work(budget: PairBudget) -> str:
+        capacities.append(budget.capacity)
+        budget.needed.fill_(100)
+        return "done"
+
+    assert with_enough_room(work, capacity=30, device=torch.device("cpu")) == "done"
+    assert capacities == [30, 170]
+    assert with_enough_room(work, capacity=100, device=torch.device("cpu")) == "done"
+    assert capacities == [30, 170, 100]

@@ -10,13 +10,17 @@ there should have been. Whoever sets a budget asks once, at the end of its work,
 one if it was short: lists do not depend on the capacity, as long as it suffices.
 """
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,21 @@ class PairBudget:
     def shortage(self) -> int:
         """Places that were missing in the worst picture, 0 when all had room. The host waits for the device here."""
         return max(0, int(self.needed) - self.capacity)
+
+
+Result = TypeVar("Result")
+
+
+def with_enough_room(work: Callable[[PairBudget], Result], *, capacity: int, device: torch.device) -> Result:
+    """What ``work`` gives within a budget; done again with more room until nothing was short."""
+    while True:
+        budget = PairBudget.of(capacity, device)
+        result = work(budget)
+        shortage = budget.shortage()
+        if shortage == 0:
+            return result
+        _log.info("Pictures needed room for %d pairs more than %d; the work is done again.", shortage, capacity)
+        capacity += 2 * shortage
 
 
 class TileLists(NamedTuple):

@@ -41,13 +41,14 @@ class Scene:
         With ``tiles`` (``kernels.raster_types``), those that may show in these tiles.
         """
         anchors = self.anchors
+        matrices = camera.beside(anchors.positions)
         visible = backend.visible_anchors(
             anchors.positions,
             anchors.log_offset_scales,
             anchors.log_base_scales,
             anchors.offsets,
-            camera.viewmat.to(anchors.positions),
-            camera.K.to(anchors.positions),
+            matrices.viewmat,
+            matrices.K,
             width=camera.width,
             height=camera.height,
             near=camera.near,
@@ -60,7 +61,7 @@ class Scene:
             anchors.offsets,
             anchors.features,
             self.mlps,
-            camera.center.to(anchors.positions),
+            matrices.center,
             visible,
             distance_input=self.distance_input,
         )

@@ -98,8 +98,7 @@ def _weights(scene: Scene, camera: Camera, changed: Tensor, config: MotionConfig
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
-        small.viewmat.to(gaussians.means),
-        small.K.to(gaussians.means),
+        *small.beside(gaussians.means)[:2],
         torch.stack([torch.ones_like(part), part], dim=-1),
         near=small.near,
     )

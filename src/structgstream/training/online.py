@@ -16,7 +16,8 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, without_waiting
+from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
@@ -127,20 +128,31 @@ def fit_next_frame(
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
-    generator = torch.Generator().manual_seed(seed)
-    watch = Stopwatch(backend.device)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
     views = training_views(frame, rig, backend.device)
-    fit = _Fit(config, backend, frame.index, generator, watch, on_step)
-    if before is None or not config.motion.enabled or _is_full(config.motion, frame.index):
-        return fit.run(scene, views)
-    with watch.stage("find motion"):
-        earlier = training_views(before, rig, backend.device)
-        which = moving_parts(scene, views, earlier, config=config.motion, backend=backend)
-        partition = Partition.of(scene, which)
-    result = fit.run(partition.moving, views, partition=partition)
-    return replace(result, scene=partition.together(result.scene))
+    full = before is None or not config.motion.enabled or _is_full(config.motion, frame.index)
+    earlier = None if before is None or full else training_views(before, rig, backend.device)
+
+    def fitted(stepping: Backend) -> FitResult:
+        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
+        fit = _Fit(config, backend, stepping, frame.index, generator, watch, on_step)
+        if earlier is None:
+            return fit.run(scene, views)
+        with watch.stage("find motion"):
+            which = moving_parts(scene, views, earlier, config=config.motion, backend=backend)
+            partition = Partition.of(scene, which)
+        result = fit.run(partition.moving, views, partition=partition)
+        return replace(result, scene=partition.together(result.scene))
+
+    if backend.device.type != "cuda":
+        return fitted(backend)
+    # The host runs ahead of a GPU as long as no iteration waits for it.
+    return with_enough_room(
+        lambda budget: fitted(without_waiting(backend, budget)),
+        capacity=max(1 << 18, 8 * _slots(scene)),
+        device=backend.device,
+    )
 
 
 def _is_full(motion: MotionConfig, frame_index: int) -> bool:
@@ -149,10 +161,11 @@ def _is_full(motion: MotionConfig, frame_index: int) -> bool:
 
 @dataclass
 class _Fit:
-    """The optimisation of one frame."""
+    """The optimisation of one frame; ``stepping`` is what the iterations run on."""
 
     config: OnlineConfig
     backend: Backend
+    stepping: Backend
     frame_index: int
     generator: torch.Generator
     watch: Stopwatch
@@ -172,13 +185,14 @@ class _Fit:
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
+        tells_every = 1 if self.backend.device.type == "cpu" else 10  # Asking a GPU for the loss waits for it.
         spawned = pruned = 0
         for iteration in range(1, iterations + 1):
             view = next(order)
             loss = view_loss(
                 parameters.scene(scene),
                 view,
-                backend=self.backend,
+                backend=self.stepping,
                 weights=config.losses,
                 voxel_size=0.0,
                 track_screen=patching.spawn != "off" and patching.collect_from < iteration <= patch_at,
@@ -207,7 +221,7 @@ class _Fit:
                         backend=self.backend,
                         generator=self.generator,
                     )
-            if self.on_step is not None:
+            if self.on_step is not None and iteration % tells_every == 0:
                 free = parameters.values["free_means"].shape[0] + still_free
                 self.on_step(Step(iteration, iterations, float(loss.total.detach()), len(scene.anchors), free))
         return FitResult(

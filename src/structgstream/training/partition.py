@@ -106,7 +106,7 @@ def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pi
     rows, columns = tiles_of(camera.width, camera.height)
     drawn = shown & (rendering.radii > 0)
     means = rendering.gaussians.means[drawn]
-    viewmat, K = (matrix.to(means) for matrix in (camera.viewmat, camera.K))
+    viewmat, K, _ = camera.beside(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     centers = (points @ K.T)[:, :2] / points[:, 2:]
     reach = 0.6 * rendering.radii[drawn, None] + margin_pixels

@@ -87,7 +87,7 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
         if not missing.any():
             break
         seen = scene.gaussians(view.camera, backend)
-        rows = missing[seen.ids].nonzero()[:, 0]
+        rows = (missing[seen.ids] & (seen.opacities > 0)).nonzero()[:, 0]
         found.append(
             Gaussians(
                 means=seen.means[rows],
@@ -98,7 +98,7 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
                 ids=seen.ids[rows],
             )
         )
-        missing[seen.ids] = False
+        missing[seen.ids[rows]] = False
     columns = {name: torch.cat([getattr(g, name) for g in found]) for name in Gaussians.__dataclass_fields__}
     order = columns["ids"].argsort()
     return Gaussians(**{name: column[order] for name, column in columns.items()})

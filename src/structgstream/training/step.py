@@ -37,13 +37,14 @@ class ViewLoss:
         """The rendering as the camera would have recorded it: what was compared, ``[H, W, 3]``."""
         return self.rendering.image * self.gains + self.biases
 
-    def squared_error(self, view: View) -> float:
-        """Mean squared error of the clamped rendering against the picture, where it was drawn."""
+    def squared_error(self, view: View) -> Tensor:
+        """Mean squared error of the clamped rendering against the picture, where it was drawn, ``[]``."""
         with torch.no_grad():
             squares = (self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square()
-            if self.focus is not None:
-                squares = squares[pixels_of_tiles(self.focus.tiles, view.camera.width, view.camera.height)]
-            return float(squares.mean())
+            if self.focus is None:
+                return squares.mean()
+            inside = pixels_of_tiles(self.focus.tiles, view.camera.width, view.camera.height)[..., None].to(squares)
+            return (squares * inside).sum() / (3.0 * inside.sum())
 
 
 def view_loss(
@@ -73,7 +74,7 @@ def view_loss(
         terms = {"l1": l1, "ssim": 1.0 - ssim}
         total = weights.l1 * l1 + weights.ssim * terms["ssim"]
         if weights.volume:
-            terms["volume"] = volume(gaussians.scales, reduction=weights.volume_reduction)
+            terms["volume"] = volume(gaussians.scales, gaussians.opacities, reduction=weights.volume_reduction)
             total = total + weights.volume * terms["volume"]
         if weights.offset_distance:
             terms["offset_distance"] = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights)
@@ -100,25 +101,25 @@ def gradients_of(
 
 
 class LastPass:
-    """Mean loss terms and PSNR over the last pass through the cameras."""
+    """Mean loss terms and PSNR over the last pass through the cameras. Numbers are read when they are asked for."""
 
     def __init__(self) -> None:
-        self._terms: dict[str, list[float]] = {}
-        self._squared_errors: list[float] = []
+        self._terms: dict[str, list[Tensor]] = {}
+        self._squared_errors: list[Tensor] = []
 
     def add(self, loss: ViewLoss, view: View) -> None:
         """Note one view's result."""
         self._squared_errors.append(loss.squared_error(view))
         for name, value in loss.terms.items():
-            self._terms.setdefault(name, []).append(float(value.detach()))
+            self._terms.setdefault(name, []).append(value.detach())
 
     @property
     def psnr(self) -> float:
         """Mean over views of the PSNR in dB, NaN before any view."""
-        values = [-10.0 * math.log10(max(error, 1e-10)) for error in self._squared_errors]
+        values = [-10.0 * math.log10(max(float(error), 1e-10)) for error in self._squared_errors]
         return sum(values) / len(values) if values else math.nan
 
     @property
     def terms(self) -> dict[str, float]:
         """Mean of each loss term."""
-        return {name: sum(values) / len(values) for name, values in self._terms.items()}
+        return {name: float(torch.stack(values).mean()) for name, values in self._terms.items()}
