@@ -48,7 +48,8 @@ class Reconstruct:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """rig (default: any rig), fast (a try in minutes), paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
+    """rig (default: any rig), motion (fits only what moves), fast (a try in minutes), paper-n3dv, paper-meetroom,
+    paper-immersive, tiny (tests)."""
     device: Device = "auto"
     """What computes; auto takes the first of cuda, cpu, reference that is there."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None

@@ -2,6 +2,7 @@
 """``structgstream render``."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -71,7 +72,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.codec.reader import open_stream
     from structgstream.kernels.backend import select_backend
 
-    reader = open_stream(options.stream)
+    reader = open_stream(options.stream, by_index=options.frame is not None)
     output = options.output or default_output(options, reader)
     if output.suffix.lower() == ".png" and options.frame is None:
         raise UsageError("a PNG holds one picture: choose it with --frame, or write an .mp4 or a folder.")
@@ -101,10 +102,12 @@ def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps
     Raises:
         StorageError: something cannot be written.
     """
+    from structgstream.data.prefetch import ahead
     from structgstream.data.video_writer import VideoWriter
     from structgstream.evaluation.png import write_png
 
-    with Console(stderr=True).status("rendering") as status:
+    # The next picture is drawn while the last one is compressed.
+    with closing(ahead(iter(pictures), depth=1)) as pictures, Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
             with VideoWriter(output, fps=fps) as video:
                 for number, picture in enumerate(pictures):
