@@ -2,7 +2,6 @@
 """``structgstream render``."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -102,12 +101,10 @@ def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps
     Raises:
         StorageError: something cannot be written.
     """
-    from structgstream.data.prefetch import ahead
     from structgstream.data.video_writer import VideoWriter
     from structgstream.evaluation.png import write_png
 
-    # The next picture is drawn while the last one is compressed.
-    with closing(ahead(iter(pictures), depth=1)) as pictures, Console(stderr=True).status("rendering") as status:
+    with Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
             with VideoWriter(output, fps=fps) as video:
                 for number, picture in enumerate(pictures):
