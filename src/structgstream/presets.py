@@ -11,6 +11,7 @@ from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.optim import Rate
+from structgstream.training.patching import PatchingConfig
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,10 @@ RIG = StreamConfig(
         growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=45_000),
         losses=LossWeights(offset_distance=0.005),
     ),
+    online=OnlineConfig(patching=PatchingConfig(max_free=100_000)),
 )
-"""The paper's online method on any rig: exposures are equalised, frame 0 is annealed and starts on small pictures."""
+"""The paper's online method on any rig: exposures are equalised, frame 0 is annealed and starts on small pictures, and
+the free set, which the paper lets grow without end, is bounded."""
 
 MOTION = replace(
     RIG,
