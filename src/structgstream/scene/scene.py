@@ -74,7 +74,7 @@ class Scene:
         return Gaussians(
             means=free.means,
             quats=free.quats,
-            scales=free.log_scales.exp(),
+            scales=free.log_scales.contiguous().exp(),  # of strided columns it takes four times as long
             opacities=free.logit_opacities.sigmoid(),
             colors=free.colors,
             ids=torch.arange(first, first + len(free), device=free.means.device),
