@@ -17,6 +17,7 @@ from structgstream.evaluation.metrics import PSNR_OF_EQUALS
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
+from structgstream.memory import resident_bytes
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.similarity import Similarity
@@ -189,14 +190,43 @@ def test_sizes_and_rates_are_those_of_the_file(world: World) -> None:
 def test_the_log_of_the_trainer_is_merged(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     log = {
-        i: {"index": i, "total_seconds": 10.0 if i == 0 else 2.0, "peak_memory_bytes": 100 + i, "seconds": {}}
+        i: {
+            "index": i,
+            "total_seconds": 10.0 if i == 0 else 2.0,
+            "peak_memory_bytes": 100 + i,
+            "peak_memory_bytes_by_stage": {"fit": 100 + i % 3, "store": 90 - i},
+            "seconds": {},
+        }
         for i in range(4)
     }
     report = run(reader, Source(world.rig, world.frames), log=log)
     assert report.stream["seconds_first"] == 10.0
     assert report.stream["seconds_online_mean"] == 2.0
     assert report.stream["peak_memory_bytes"] == 103
+    assert report.stream["peak_memory_bytes_by_stage"] == {
+        "first frame, fit": 100,
+        "first frame, store": 90,
+        "online, fit": 102,
+        "online, store": 89,
+    }
     assert as_json(report)["mean"]["seconds"] == 4.0
+
+
+@pytest.mark.skipif(resident_bytes() is None, reason="the system does not tell the resident size")
+def test_the_evaluations_own_memory_is_reported(world: World) -> None:
+    """A picture set that is there while frames are scored counts."""
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    held = []
+    before = resident_bytes()
+    assert before is not None
+    report = run(
+        reader,
+        Source(world.rig, world.frames),
+        observer=lambda index, compared: held.append(np.ones(2**24, np.uint8)),
+    )
+    assert report.environment["peak_memory_bytes"] > before + 0.9 * len(held) * 2**24
+    assert report.environment["peak_memory_kind"] in ("stage", "process")
+    assert report.environment["peak_device_bytes"] is None
 
 
 def test_the_observer_sees_every_picture(world: World) -> None:

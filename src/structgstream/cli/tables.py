@@ -99,10 +99,15 @@ def _facts(report: "Report") -> Table:
             "training",
             f"first frame {first}, each further one {online}, peak memory {memory}",
         )
+        stages = s["peak_memory_bytes_by_stage"]
+        if stages:
+            table.add_row("memory by stage", "; ".join(f"{name} {human_bytes(size)}" for name, size in stages.items()))
     table.add_row("rendering", f"{1 / max(report.mean.render_seconds, 1e-9):.1f} pictures a second")
     e = report.environment
     machine = f"{e['gpu'] or e['cpu']}, {e['cores']} cores, back-end {e['backend']}, torch {e['torch']}"
     table.add_row("machine", Text(machine))
+    if e["peak_memory_bytes"]:
+        table.add_row("this evaluation", f"peak memory {human_bytes(e['peak_memory_bytes'])}")
     return table
 
 

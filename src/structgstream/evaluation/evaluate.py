@@ -21,6 +21,7 @@ from structgstream.evaluation.masks import changed_pixels
 from structgstream.evaluation.metrics import decibels, mean_of_squares, quantised, squared_errors, ssim
 from structgstream.evaluation.report import FrameScores, Report, Scores, course, mean_scores
 from structgstream.kernels.backend import Backend
+from structgstream.memory import PeakMeter
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
@@ -40,6 +41,9 @@ class Compared:
     picture: Picture
     scores: Scores
 
+
+EVALUATION = "evaluation"
+"""Name of the stage of memory that scoring is."""
 
 Observer = Callable[[int, Compared], None]
 
@@ -80,6 +84,7 @@ def evaluate(
     views = {name: reader.header.similarity.camera(reader.header.rig[name]) for name in names}
     first: dict[str, Picture] = {}
     frames = []
+    peaks = PeakMeter(backend.device)
     for frame, (info, scene) in zip(of_cameras(source, names).frames(), reader.scenes(0)):
         compared = []
         placed = on_device(scene, backend.device)
@@ -96,7 +101,9 @@ def evaluate(
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in names}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
     facts = stream_facts(reader, names) | course([frame.mean.psnr for frame in frames]) | _training_facts(frames)
-    return Report(frames, by_camera, mean, facts, environment() | {"backend": backend.name})
+    peaks.end(EVALUATION)
+    machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
+    return Report(frames, by_camera, mean, facts, machine)
 
 
 def score(picture: Picture, truth: Picture, first: Picture, *, backend: Backend, seconds: float = 0.0) -> Scores:
@@ -235,4 +242,23 @@ def _training_facts(frames: list[FrameScores]) -> dict[str, Any]:
         "seconds_first": next((log["total_seconds"] for log in logs if log["index"] == 0), None),
         "seconds_online_mean": float(np.mean(online)) if online else None,
         "peak_memory_bytes": max(log["peak_memory_bytes"] or 0 for log in logs) or None,
+        "peak_memory_bytes_by_stage": _largest_by_stage(logs),
+    }
+
+
+def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
+    """The largest peak of each stage, frame 0 apart from the others, which have other work."""
+    largest: dict[str, int] = {}
+    for log in logs:
+        part = "online" if log["index"] else "first frame"
+        for stage, size in log.get("peak_memory_bytes_by_stage", {}).items():
+            largest[f"{part}, {stage}"] = max(size, largest.get(f"{part}, {stage}", 0))
+    return largest
+
+
+def _evaluation_memory(peaks: PeakMeter) -> dict[str, Any]:
+    return {
+        "peak_memory_bytes": peaks.process_bytes.get(EVALUATION),
+        "peak_device_bytes": peaks.device_bytes.get(EVALUATION),
+        "peak_memory_kind": str(peaks.kind),
     }

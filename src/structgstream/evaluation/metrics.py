@@ -71,7 +71,7 @@ def ssim_map(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Tensor:
 def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:
     """Mean of :func:`ssim_map` over pixels and channels: the value that Gaussian splatting papers print.
 
-    ``backend`` computes; all agree within 1e-6.
+    ``backend`` computes; on real pictures all agree within 1e-5, of which the C++ is the nearest to float64.
     """
     device = backend.device
     image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(device) for p in (picture, truth))
