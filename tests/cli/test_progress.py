@@ -2,6 +2,7 @@
 """Plain lines for files, bars for terminals, the same numbers in both."""
 
 import io
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -20,6 +21,7 @@ REPORT = FrameReport(
     field_bytes={},
     train_psnr=31.204,
     anchors=34_512,
+    moving=34_512,
     free=2_301,
     spawned=5,
     pruned=1,
@@ -47,6 +49,13 @@ def test_a_line_for_each_frame() -> None:
         shown.step(Step(1, 100, 0.5, 34_512, 0))
         shown.frame(REPORT)
     assert text(out) == "frame  2/20  train 31.20 dB   812.3 kB     5.1 s  34,512 anchors  2,301 free\n"
+
+
+def test_a_line_tells_how_many_anchors_moved_when_not_all_could() -> None:
+    out = console(terminal=False)
+    with display(20, done=1, console=out) as shown:
+        shown.frame(replace(REPORT, moving=5_001))
+    assert "  34,512 anchors (5,001 moving)  2,301 free" in text(out)
 
 
 def test_a_long_frame_speaks_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,10 +44,11 @@ def display(frames: int, *, done: int = 0, console: Console | None = None) -> Di
 
 def summary(report: "FrameReport", frames: int) -> str:
     """One frame in one line."""
+    moving = f" ({report.moving:,} moving)" if report.index and report.moving < report.anchors else ""
     return (
         f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
-        f"{report.anchors:,} anchors  {report.free:,} free"
+        f"{report.anchors:,} anchors{moving}  {report.free:,} free"
     )
 
 
