@@ -152,7 +152,7 @@ void* sgs_raster_forward(
         raster->trained = trained;
         raster->splats.resize(count);
         project_dispatched({means, quats, scales, opacities, colors, screen_offsets, count}, *raster, radii, threads);
-        bin(*raster, threads);
+        bin(*raster);
         rasterize_dispatched(*raster, background, image, alpha, threads);
         return raster.release();
     } catch (const std::bad_alloc&) {
@@ -174,7 +174,7 @@ int sgs_raster_weights(
         std::vector<float> radii(count);
         // Colours play no part; any numbers of the right count will do.
         project_dispatched({means, quats, scales, opacities, means, nullptr, count}, raster, radii.data(), threads);
-        bin(raster, threads);
+        bin(raster);
         std::vector<float> sums(2 * raster.pairs.size());
         weigh_dispatched(raster, maps, sums.data(), threads);
         for (int64_t i = 0; i < count; ++i) {
