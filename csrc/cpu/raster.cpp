@@ -98,28 +98,39 @@ struct Tile {
           bottom(std::min(top + kTile, r.camera.height)) {}
 };
 
+// Visits the pixels of a tile: their place in the picture, and in the tile's order of blocks. Rows of a block together, so
+// that compilers make vectors of them.
+template <typename Visit>
+inline void for_pixels(const Tile& t, int width, Visit visit) {
+    const int columns = t.right - t.left;
+    for (int y = t.top; y < t.bottom; ++y) {
+        const int row = (y - t.top) / kBlockY * kBlocksX * kLanes + (y - t.top) % kBlockY * kBlockX;
+        const size_t first = static_cast<size_t>(y) * width + t.left;
+        int x = 0;
+        for (; x + kBlockX <= columns; x += kBlockX)
+#pragma GCC unroll 4
+            for (int i = 0; i < kBlockX; ++i) visit(first + x + i, row + x / kBlockX * kLanes + i);
+        for (; x < columns; ++x) visit(first + x, row + x / kBlockX * kLanes + x % kBlockX);
+    }
+}
+
 // Pixels of a tile between their picture order and their block order. Outside the picture: zero.
 template <int Channels>
 void gather(const float* picture, int width, const Tile& t, float (*planes)[kTilePixels]) {
-    std::memset(planes, 0, sizeof(float) * Channels * kTilePixels);
-    for (int y = t.top; y < t.bottom; ++y)
-        for (int x = t.left; x < t.right; ++x) {
-            const int bx = (x - t.left) / kBlockX, by = (y - t.top) / kBlockY;
-            const int at = (by * kBlocksX + bx) * kLanes + (y - t.top) % kBlockY * kBlockX + (x - t.left) % kBlockX;
-            for (int c = 0; c < Channels; ++c)
-                planes[c][at] = picture[(static_cast<size_t>(y) * width + x) * Channels + c];
-        }
+    if (t.right - t.left < kTile || t.bottom - t.top < kTile)
+        std::memset(planes, 0, sizeof(float) * Channels * kTilePixels);
+    for_pixels(t, width, [&](size_t pixel, int at) {
+#pragma GCC unroll 3
+        for (int c = 0; c < Channels; ++c) planes[c][at] = picture[pixel * Channels + c];
+    });
 }
 
 template <int Channels>
 void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float* picture) {
-    for (int y = t.top; y < t.bottom; ++y)
-        for (int x = t.left; x < t.right; ++x) {
-            const int bx = (x - t.left) / kBlockX, by = (y - t.top) / kBlockY;
-            const int at = (by * kBlocksX + bx) * kLanes + (y - t.top) % kBlockY * kBlockX + (x - t.left) % kBlockX;
-            for (int c = 0; c < Channels; ++c)
-                picture[(static_cast<size_t>(y) * width + x) * Channels + c] = planes[c][at];
-        }
+    for_pixels(t, width, [&](size_t pixel, int at) {
+#pragma GCC unroll 3
+        for (int c = 0; c < Channels; ++c) picture[pixel * Channels + c] = planes[c][at];
+    });
 }
 
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {

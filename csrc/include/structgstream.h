@@ -72,6 +72,11 @@ void sgs_anchors_backward(
     const struct sgs_anchors* anchors, const struct sgs_selection* selection, const struct sgs_gaussians* drawn,
     const struct sgs_gaussian_gradients* from, const struct sgs_anchor_gradients* to, int threads);
 
+/* Sum of the products of three scales [N,3], returned, and the number of opacities [N] above zero; gradient [N,3] of
+ * `scale` times the sum. */
+double sgs_volume(const float* scales, const float* opacities, int64_t count, int64_t* drawn);
+void sgs_volume_backward(const float* scales, int64_t count, float scale, float* gradient);
+
 /* Adam, in place. rows: null, or `count` row numbers (int64) of `width` numbers each. */
 void sgs_adam_step(
     float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,

@@ -33,6 +33,7 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
     for name in _POINTER_RESULTS:
         getattr(library, name).restype = ctypes.c_void_p
     library.sgs_anchors_visible.restype = ctypes.c_int64
+    library.sgs_volume.restype = ctypes.c_double
     return library, None
 
 

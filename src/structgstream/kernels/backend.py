@@ -34,6 +34,7 @@ class Backend:
         rasterize: see ``kernels.reference_raster.rasterize``.
         blending_weights: see ``kernels.reference_raster.blending_weights``.
         l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
+        volume: ``(scales, opacities) -> (sum, count)``, see ``kernels.reference_volume.volume``.
         changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
         visible_anchors: see ``kernels.reference_anchors.visible_anchors``.
         generate_structured: see ``kernels.reference_anchors.generate_structured``.
@@ -45,6 +46,7 @@ class Backend:
     rasterize: Callable[..., RasterOutput]
     blending_weights: Callable[..., Tensor]
     l1_ssim: Callable[..., tuple[Tensor, Tensor]]
+    volume: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
     changed_pixels: Callable[..., Tensor]
     visible_anchors: Callable[..., Tensor]
     generate_structured: Callable[..., StructuredGaussians]
@@ -59,6 +61,7 @@ def reference_backend() -> Backend:
         reference_change,
         reference_raster,
         reference_ssim,
+        reference_volume,
     )
 
     return Backend(
@@ -67,6 +70,7 @@ def reference_backend() -> Backend:
         rasterize=reference_raster.rasterize,
         blending_weights=partial(reference_raster.blending_weights, reference_raster.rasterize),
         l1_ssim=reference_ssim.l1_ssim,
+        volume=reference_volume.volume,
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,
         generate_structured=reference_anchors.generate_structured,
@@ -80,7 +84,7 @@ def cpu_backend() -> Backend:
     Raises:
         BackendError: the native library was not built or cannot be loaded.
     """
-    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_change, cpu_raster, cpu_ssim
+    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_change, cpu_raster, cpu_ssim, cpu_volume
     from structgstream.kernels._load import native_library
 
     native_library()
@@ -90,6 +94,7 @@ def cpu_backend() -> Backend:
         rasterize=cpu_raster.rasterize,
         blending_weights=cpu_raster.blending_weights,
         l1_ssim=cpu_ssim.l1_ssim,
+        volume=cpu_volume.volume,
         changed_pixels=cpu_change.changed_pixels,
         visible_anchors=cpu_anchors.visible_anchors,
         generate_structured=cpu_anchors.generate_structured,
@@ -111,6 +116,7 @@ def cuda_backend() -> Backend:
         reference_change,
         reference_raster,
         reference_ssim,
+        reference_volume,
     )
     from structgstream.kernels._nvcc import loss_library
     from structgstream.kernels.cuda import cuda_reason, rasterize
@@ -126,6 +132,7 @@ def cuda_backend() -> Backend:
         rasterize=rasterize,
         blending_weights=partial(reference_raster.blending_weights, rasterize),
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
+        volume=reference_volume.volume,
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,
         generate_structured=cuda_anchors.generate_structured,

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from structgstream.kernels.backend import Backend
 from structgstream.scene.anchors import AnchorCloud
 
 
@@ -30,16 +31,13 @@ class LossWeights:
     """Compared with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the length of O * l_v."""
 
 
-def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum"]) -> Tensor:
+def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum"], backend: Backend) -> Tensor:
     """L_vol: the product of the three scales ``[N, 3]`` of every Gaussian with an opacity ``[N]`` above zero.
 
     The others must have no scale: then their number, which a GPU alone may know, is all that they could change.
     """
-    if scales.shape[0] == 0:
-        return scales.sum()
-    x, y, z = scales.unbind(1)
-    products = x * y * z
-    return products.sum() / (opacities > 0).sum().clamp(min=1) if reduction == "mean" else products.sum()
+    total, drawn = backend.volume(scales, opacities)
+    return total / drawn.clamp(min=1) if reduction == "mean" else total
 
 
 def offset_distance(anchors: AnchorCloud, *, voxel_size: float, weights: LossWeights) -> Tensor:

@@ -74,7 +74,9 @@ def view_loss(
         terms = {"l1": l1, "ssim": 1.0 - ssim}
         total = weights.l1 * l1 + weights.ssim * terms["ssim"]
         if weights.volume:
-            terms["volume"] = volume(gaussians.scales, gaussians.opacities, reduction=weights.volume_reduction)
+            terms["volume"] = volume(
+                gaussians.scales, gaussians.opacities, reduction=weights.volume_reduction, backend=backend
+            )
             total = total + weights.volume * terms["volume"]
         if weights.offset_distance:
             terms["offset_distance"] = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights)
