@@ -89,6 +89,25 @@ struct Coverage {
     }
 };
 
+// How much light still passes each pixel of a tile. A block whose pixels have all stopped is done.
+struct Front {
+    alignas(kAlignment) float T[kTilePixels];
+    bool done[kBlocks] = {};
+    int live = kBlocks;
+    Front() {
+        for (float& t : T) t = 1.0f;
+    }
+    // What is behind a splat that covered a block with transmittance `before`.
+    [[gnu::always_inline]] void pass(int block, vf before, const Coverage& c) {
+        float* t = T + block * kLanes;
+        const vf after = before * (1.0f - c.alpha);
+        store(t, after);
+        if (!any(c.stopped)) return;
+        store(t, choose(c.stopped, -before, after));
+        if (!any(above(load(t), splat(0.0f)))) done[block] = true, --live;
+    }
+};
+
 struct Tile {
     int left, top, right, bottom;
     Tile(const Raster& r, int index)
@@ -136,11 +155,9 @@ void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
     const Tile tile(raster, index);
     const Lanes lanes;
-    alignas(kAlignment) float T[kTilePixels], color[3][kTilePixels] = {};
-    for (float& t : T) t = 1.0f;
-    int live = kBlocks;
-    bool done[kBlocks] = {};
-    for (int n = raster.starts[index]; n < raster.starts[index + 1] && live > 0; ++n) {
+    alignas(kAlignment) float color[3][kTilePixels] = {};
+    Front front;
+    for (int n = raster.starts[index]; n < raster.starts[index + 1] && front.live > 0; ++n) {
         const Splat& s = raster.splats[raster.pairs[n]];
         // Neighbours in depth are far apart in memory: ask early.
         __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
@@ -148,22 +165,18 @@ void blend(const Raster& raster, int index, const float* background, float* imag
         for (int by = blocks.y0; by < blocks.y1; ++by)
             for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
                 const int block = by * kBlocksX + bx, at = block * kLanes;
-                if (done[block]) continue;
-                const vf before = load(T + at);
+                if (front.done[block]) continue;
+                const vf before = load(front.T + at);
                 Coverage c;
                 if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
                 const vf weight = c.alpha * before;
                 for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
-                const vf after = before * (1.0f - c.alpha);
-                store(T + at, after);
-                if (!any(c.stopped)) continue;
-                store(T + at, choose(c.stopped, -before, after));
-                if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
+                front.pass(block, before, c);
             }
     }
     alignas(kAlignment) float coverage[1][kTilePixels];
     for (int i = 0; i < kTilePixels; i += kLanes) {
-        const vf rest = absolute(load(T + i));
+        const vf rest = absolute(load(front.T + i));
         store(coverage[0] + i, 1.0f - rest);
         for (int k = 0; k < 3 && background; ++k) store(color[k] + i, load(color[k] + i) + rest * background[k]);
     }
@@ -177,7 +190,8 @@ void blend_backward(
     const Tile tile(raster, index);
     const Lanes lanes;
     const int width = raster.camera.width;
-    alignas(kAlignment) float T[kTilePixels], rest[kTilePixels];
+    alignas(kAlignment) float rest[kTilePixels];
+    Front front;
     alignas(kAlignment) float gradient[3][kTilePixels], color[3][kTilePixels];
     alignas(kAlignment) float grad_coverage[1][kTilePixels] = {}, coverage[1][kTilePixels];
     gather<3>(grad_image, width, tile, gradient);
@@ -185,7 +199,6 @@ void blend_backward(
     gather<1>(alpha, width, tile, coverage);
     if (grad_alpha) gather<1>(grad_alpha, width, tile, grad_coverage);
     for (int i = 0; i < kTilePixels; ++i) {
-        T[i] = 1.0f;
         // The background is seen through what coverage leaves: it acts on the coverage's gradient.
         if (background)
             for (int k = 0; k < 3; ++k) grad_coverage[0][i] -= background[k] * gradient[k][i];
@@ -195,10 +208,8 @@ void blend_backward(
             rest[i] += (color[k][i] - behind) * gradient[k][i];
         }
     }
-    int live = kBlocks;
-    bool done[kBlocks] = {};
     int n = raster.starts[index];
-    for (; n < raster.starts[index + 1] && live > 0; ++n) {
+    for (; n < raster.starts[index + 1] && front.live > 0; ++n) {
         const Splat& s = raster.splats[raster.pairs[n]];
         // Neighbours in depth are far apart in memory: ask early.
         __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
@@ -211,8 +222,8 @@ void blend_backward(
         for (int by = blocks.y0; by < blocks.y1; ++by)
             for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
                 const int block = by * kBlocksX + bx, at = block * kLanes;
-                if (done[block]) continue;
-                const vf before = load(T + at);
+                if (front.done[block]) continue;
+                const vf before = load(front.T + at);
                 Coverage c;
                 if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
                 hit = true;
@@ -229,11 +240,7 @@ void blend_backward(
                     m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
                     m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
                 }
-                const vf after = before * (1.0f - c.alpha);
-                store(T + at, after);
-                if (!any(c.stopped)) continue;
-                store(T + at, choose(c.stopped, -before, after));
-                if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
+                front.pass(block, before, c);
             }
         if (!trained) continue;
         if (hit) {
@@ -251,15 +258,13 @@ void blend_backward(
 void weigh(const Raster& raster, int index, const float* maps, float* sums) {
     const Tile tile(raster, index);
     const Lanes lanes;
-    alignas(kAlignment) float T[kTilePixels], values[2][kTilePixels];
+    alignas(kAlignment) float values[2][kTilePixels];
+    Front front;
     gather<2>(maps, raster.camera.width, tile, values);
-    for (float& t : T) t = 1.0f;
-    int live = kBlocks;
-    bool done[kBlocks] = {};
     for (int n = raster.starts[index]; n < raster.starts[index + 1]; ++n) {
         float* out = sums + 2 * static_cast<size_t>(raster.pair_slots[n]);
         out[0] = out[1] = 0.0f;
-        if (live == 0) continue;
+        if (front.live == 0) continue;
         const Splat& s = raster.splats[raster.pairs[n]];
         __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
         const Blocks blocks(s, tile.left, tile.top);
@@ -267,17 +272,13 @@ void weigh(const Raster& raster, int index, const float* maps, float* sums) {
         for (int by = blocks.y0; by < blocks.y1; ++by)
             for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
                 const int block = by * kBlocksX + bx, at = block * kLanes;
-                if (done[block]) continue;
-                const vf before = load(T + at);
+                if (front.done[block]) continue;
+                const vf before = load(front.T + at);
                 Coverage c;
                 if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
                 const vf weight = c.alpha * before;
                 m[0] += weight * load(values[0] + at), m[1] += weight * load(values[1] + at);
-                const vf after = before * (1.0f - c.alpha);
-                store(T + at, after);
-                if (!any(c.stopped)) continue;
-                store(T + at, choose(c.stopped, -before, after));
-                if (!any(above(load(T + at), splat(0.0f)))) done[block] = true, --live;
+                front.pass(block, before, c);
             }
         for (int k = 0; k < 2; ++k) {
             float parts[kLanes];
