@@ -32,6 +32,7 @@ class FrameReport:
 
     Peaks of memory are by stage: ``read``, ``fit``, and ``store`` for encoding and writing. ``peak_memory_kind`` says
     whether they are each stage's own (Note [Peaks]); ``peak_device_bytes`` has the GPU's, when there is one.
+    ``cpu_seconds`` is the time of all the process's threads together, which other processes do not lengthen.
     """
 
     index: int
@@ -49,6 +50,7 @@ class FrameReport:
     peak_memory_bytes: Mapping[str, int] = field(default_factory=dict)
     peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
     peak_memory_kind: PeakKind = PeakKind.NONE
+    cpu_seconds: float = 0.0
 
 
 def frame_seed(seed: int, index: int) -> int:
@@ -66,6 +68,8 @@ class Session:
         backend: what computes.
         resumed: the reader of what the sink already holds, to continue after it.
         metadata: plain JSON values for the header (nothing that differs between runs: resuming is exact).
+        first: frame 0 as it was fitted before, with the same capture, seed and ``config.initial``; variants that differ
+            in later frames alone can share it.
         on_step: called after every optimisation step.
 
     Raises:
@@ -81,6 +85,7 @@ class Session:
         *,
         resumed: StreamReader | None = None,
         metadata: Mapping[str, object] | None = None,
+        first: FitResult | None = None,
         on_step: StepListener | None = None,
     ) -> None:
         self._source = source
@@ -89,6 +94,7 @@ class Session:
         self._backend = backend
         self._resumed = resumed
         self._metadata = {"capture": source.name, **(metadata or {})}
+        self._first = first
         self._on_step = on_step
         self._similarity = normalising_similarity(source.rig, radius=config.normalised_radius)
         self._rig = self._similarity.rig(source.rig)
@@ -125,7 +131,7 @@ class Session:
         before = next(frames) if again else None
         while True:
             peaks = PeakMeter(self._backend.device)
-            started = time.perf_counter()
+            started, cpu_started = time.perf_counter(), time.process_time()
             frame = next(frames, None)
             if frame is None:
                 return
@@ -169,6 +175,7 @@ class Session:
                 peak_memory_bytes=peaks.process_bytes,
                 peak_device_bytes=peaks.device_bytes,
                 peak_memory_kind=peaks.kind,
+                cpu_seconds=time.process_time() - cpu_started,
             )
 
     @property
@@ -178,6 +185,8 @@ class Session:
     def _fit(self, scene: Scene | None, frame: MultiViewFrame, before: MultiViewFrame | None) -> FitResult:
         seed = frame_seed(self._config.seed, frame.index)
         if scene is None:
+            if self._first is not None:
+                return self._first
             points = self._initial_points(frame)
             return fit_first_frame(
                 frame,

@@ -4,9 +4,9 @@
 import os
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
-    from structgstream.session import FrameReport
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def reconstructed(
     """
     from structgstream.codec.sinks import FileSink
     from structgstream.data.prefetch import Prefetch
-    from structgstream.evaluation.run_log import append_log, begin_log
+    from structgstream.evaluation.run_log import append_log, begin_log, log_entry
     from structgstream.session import Session
 
     sink, resumed = FileSink.resume(output) if resume else (FileSink(output, overwrite=True), None)
@@ -172,20 +171,6 @@ def check_output(output: Path, *, may_exist: bool) -> None:
         raise StorageError(f"The folder {output.parent} cannot be made ({error.strerror}).") from None
     if not os.access(output if output.exists() else output.parent, os.W_OK):
         raise StorageError(f"{output} cannot be written (no permission).")
-
-
-def log_entry(report: "FrameReport") -> dict[str, Any]:
-    """One line of the log: the frame's report as plain values, with seconds and memory of the whole frame beside it."""
-    entry = asdict(report)
-    del entry["peak_device_bytes"]
-    return entry | {
-        "kind": report.kind.name.lower(),
-        "total_seconds": report.seconds["total"],
-        "peak_memory_bytes": max(report.peak_memory_bytes.values(), default=None),
-        "peak_memory_bytes_by_stage": dict(report.peak_memory_bytes),
-        "peak_device_bytes_by_stage": dict(report.peak_device_bytes),
-        "peak_memory_kind": str(report.peak_memory_kind),
-    }
 
 
 def _print_config(arguments: list[str]) -> None:

@@ -136,3 +136,30 @@ def of_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
     if isinstance(source, WithRig):
         return replace(source, source=of_cameras(source.source, names), other=rig)
     return replace(source, source=of_cameras(source.source, names)) if isinstance(source, Wrapped) else source
+
+
+@dataclass(frozen=True)
+class Thinned(Wrapped):
+    """Every ``step``-th frame, counted and timed from 0 as if they followed each other."""
+
+    step: int
+
+    def __len__(self) -> int:
+        return -(-len(self.source) // self.step)
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        for index in range(start, len(self)):
+            # Asking for each frame by its number skips those between without decoding, where the source can.
+            images = next(self.source.frames(index * self.step)).images
+            yield MultiViewFrame(index, index / self.fps, images)
+
+
+def thinned(source: FrameSource, step: int) -> FrameSource:
+    """Every ``step``-th frame of the capture, from the first.
+
+    Raises:
+        ConfigError: ``step`` is less than 1.
+    """
+    if step < 1:
+        raise ConfigError(f"Frames can be taken by steps of 1 and more, got {step}.")
+    return source if step == 1 else Thinned(source, step)

@@ -7,11 +7,16 @@ and the sizes by stage are: each stage's own (``stage``) or the process's so far
 """
 
 import json
+import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from structgstream.errors import StorageError
+
+if TYPE_CHECKING:
+    from structgstream.session import FrameReport
 
 
 def log_path(stream: Path) -> Path:
@@ -36,6 +41,21 @@ def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
         StorageError: the file cannot be written.
     """
     _write(log_path(stream), [entry], mode="a")
+
+
+def log_entry(report: "FrameReport") -> dict[str, Any]:
+    """One line of the log: the frame's report as plain values, with seconds and memory of the whole frame beside it."""
+    entry = asdict(report)
+    del entry["peak_device_bytes"]
+    return entry | {
+        "kind": report.kind.name.lower(),
+        "train_psnr": report.train_psnr if math.isfinite(report.train_psnr) else None,
+        "total_seconds": report.seconds["total"],
+        "peak_memory_bytes": max(report.peak_memory_bytes.values(), default=None),
+        "peak_memory_bytes_by_stage": dict(report.peak_memory_bytes),
+        "peak_device_bytes_by_stage": dict(report.peak_device_bytes),
+        "peak_memory_kind": str(report.peak_memory_kind),
+    }
 
 
 def read_log(stream: Path) -> dict[int, dict[str, Any]]:

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One experiment's outcome as a JSON file that says everything a figure in a document must carry.
+
+``identity`` (method, configuration, seed, capture with its fingerprint) decides whether a result is still the answer
+to a question; the commit and the machine are noted beside it, and numbers are what ``evaluate`` read from the file.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from structgstream.errors import StorageError
+
+if TYPE_CHECKING:
+    from structgstream.evaluation.report import Report
+
+FRAME_KEYS_OF_LOG = ("total_seconds", "cpu_seconds", "train_psnr", "spawned", "pruned")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What an experiment gave.
+
+    Args:
+        identity: what was asked (see the module).
+        mean: the mean of each score over frames and held-out cameras.
+        cameras: camera name to its means.
+        stream: facts of the file.
+        frames: one entry for each frame: scores, bytes, counts, seconds.
+        environment: commit and machine of the evaluation.
+        trained_by: commit and machine of the training.
+    """
+
+    identity: Mapping[str, Any]
+    mean: Mapping[str, Any]
+    cameras: Mapping[str, Any]
+    stream: Mapping[str, Any]
+    frames: list[Mapping[str, Any]]
+    environment: Mapping[str, Any]
+    trained_by: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """The variant's or method's key."""
+        return self.identity["key"]
+
+    @property
+    def seed(self) -> int:
+        """Seed of frame 0 and of everything random after it."""
+        return self.identity["seed"]
+
+    @property
+    def capture(self) -> str:
+        """Name of the capture."""
+        return self.identity["capture"]["name"]
+
+
+def result_of(report: "Report", *, identity: Mapping[str, Any], trained_by: Mapping[str, Any]) -> Result:
+    """The result of an evaluation; what the report says camera by camera and stage by stage is averaged or left out."""
+    from structgstream.evaluation.report import as_json
+
+    content = as_json(report)
+    frames = []
+    for frame in content["frames"]:
+        log = frame.pop("log")
+        del frame["cameras"]
+        frames.append(frame | {key: log[key] for key in FRAME_KEYS_OF_LOG if key in log})
+    stream = {key: value for key, value in content["stream"].items() if key != "metadata"}
+    return Result(
+        identity=identity,
+        mean=content["mean"] | _online_means(frames),
+        cameras=content["cameras"],
+        stream=stream,
+        frames=frames,
+        environment=content["environment"],
+        trained_by=trained_by,
+    )
+
+
+def _online_means(frames: list[dict[str, Any]]) -> dict[str, float | None]:
+    """Means over the frames after the first, which cost something else."""
+    online = [frame for frame in frames if frame["index"] > 0]
+
+    def mean(values: list[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return sum(known) / len(known) if known else None
+
+    return {
+        "online_bytes": mean([frame["bytes"] for frame in online]),
+        "online_free_bytes": mean([_free_bytes(frame["field_bytes"]) for frame in online]),
+        "online_seconds": mean([frame.get("total_seconds") for frame in online]),
+        "online_cpu_seconds": mean([frame.get("cpu_seconds") for frame in online]),
+    }
+
+
+def _free_bytes(fields: Mapping[str, int]) -> int:
+    return sum(size for name, size in fields.items() if name.startswith("free"))
+
+
+def write_result(path: Path, result: Result) -> None:
+    """Writes a result so that it is there whole or not at all.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    partial = path.with_suffix(".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(json.dumps(rounded(vars(result)), allow_nan=False, separators=(",", ":")) + "\n")
+        partial.replace(path)
+    except OSError as error:
+        raise StorageError(f"The result {path} cannot be written ({error.strerror}).") from None
+
+
+def rounded(value: Any) -> Any:
+    """Floats to six significant digits: what was measured has fewer, and files stay small."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}")
+    if isinstance(value, Mapping):
+        return {key: rounded(item) for key, item in value.items()}
+    return [rounded(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def read_result(path: Path) -> Result | None:
+    """The result in ``path``; None when there is none.
+
+    Raises:
+        StorageError: there is something else.
+    """
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise StorageError(f"The result {path} cannot be read ({error.strerror}).") from None
+    try:
+        return Result(**json.loads(text))
+    except (ValueError, TypeError):
+        raise StorageError(f"{path} is not a result of an experiment; remove it and run again.") from None
+
+
+def read_results(folder: Path) -> list[Result]:
+    """Every result below ``folder``, by capture, key and seed.
+
+    Raises:
+        StorageError: a file cannot be read or is something else.
+    """
+    found = [result for path in sorted(folder.rglob("*.json")) if (result := read_result(path)) is not None]
+    return sorted(found, key=lambda result: (result.capture, result.key, result.seed))

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps of an experiment as values that a process of its own can do, and do again without doing it twice."""
+
+import hashlib
+import json
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from structgstream.experiments.captures import CapturePart, capture_facts
+from structgstream.experiments.results import Result, read_result, result_of, rounded, write_result
+from structgstream.presets import StreamConfig, to_json
+from structgstream.training.online import OnlineConfig
+
+if TYPE_CHECKING:
+    from structgstream.kernels.backend import Backend
+    from structgstream.training.result import FitResult
+
+
+@dataclass(frozen=True)
+class FirstFrame:
+    """Fits frame 0 once for all the variants that begin with it."""
+
+    capture: CapturePart
+    config: StreamConfig
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """What it is called in logs; the same for tasks that give the same frame 0."""
+        decides = {key: value for key, value in to_json(self.config).items() if key != "online"}
+        text = json.dumps([decides, {**vars(self.capture), "folder": str(self.capture.folder), "frames": None}])
+        return f"first-{hashlib.sha256(text.encode()).hexdigest()[:8]}.seed{self.config.seed}"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Nothing comes before it."""
+        return ()
+
+    @property
+    def frames(self) -> int:
+        """How many frames it fits."""
+        return 1
+
+    @property
+    def stream(self) -> Path:
+        """The stream of one frame."""
+        return self.folder / "first" / f"{self.name}.sgs"
+
+    def done(self) -> bool:
+        """Whether the frame is there; a stream that was interrupted has none."""
+        from structgstream.codec.reader import open_stream
+        from structgstream.errors import StreamError
+
+        if not self.stream.exists():
+            return False
+        try:
+            return len(open_stream(self.stream)) == 1
+        except StreamError:
+            return False
+
+    def run(self, backend: "Backend") -> None:
+        """Fits and stores it."""
+        if self.done():
+            return
+        alone = replace(self.config, online=OnlineConfig())
+        _reconstruct(replace(self.capture, frames=1), alone, self.stream, backend, first=None)
+
+    def fitted(self) -> "FitResult":
+        """The frame as ``Session`` takes it, read from the file."""
+        from structgstream.codec.reader import open_stream
+        from structgstream.training.result import FitResult
+
+        return FitResult(
+            scene=open_stream(self.stream).scene(0),
+            iterations=self.config.initial.iterations,
+            train_psnr=float(self.log()["train_psnr"]),
+        )
+
+    def log(self) -> dict[str, Any]:
+        """What the trainer noted about it."""
+        from structgstream.evaluation.run_log import read_log
+
+        return read_log(self.stream)[0]
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Reconstructs and scores one variant of the method with one seed."""
+
+    key: str
+    capture: CapturePart
+    config: StreamConfig
+    folder: Path
+    frames: int
+
+    @property
+    def name(self) -> str:
+        """What it is called in logs and files."""
+        return f"{self.key}.seed{self.config.seed}"
+
+    @property
+    def first(self) -> FirstFrame:
+        """Its frame 0, which other variants may share."""
+        return FirstFrame(self.capture, self.config, self.folder)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the tasks that come before it."""
+        return (self.first.name,)
+
+    @property
+    def stream(self) -> Path:
+        """The stream."""
+        return self.folder / "streams" / f"{self.name}.sgs"
+
+    @property
+    def result(self) -> Path:
+        """Its scores."""
+        return self.folder / "results" / f"{self.name}.json"
+
+    def done(self) -> bool:
+        """Whether there is a result for this very question; the pictures are looked at when it runs."""
+        found = read_result(self.result)
+        return found is not None and {**found.identity, "capture": None} == rounded(self._asked() | {"capture": None})
+
+    def _asked(self) -> dict[str, Any]:
+        return {"key": self.key, "method": "struct-gstream", "seed": self.config.seed, "config": to_json(self.config)}
+
+    def run(self, backend: "Backend") -> None:
+        """Reconstructs what is missing of the stream, then scores the file."""
+        _reconstruct(self.capture, self.config, self.stream, backend, first=self.first)
+        write_result(self.result, self.scored(backend))
+
+    def scored(self, backend: "Backend") -> Result:
+        """The scores of the finished stream."""
+        from structgstream.codec.reader import open_stream
+        from structgstream.evaluation.evaluate import evaluate
+        from structgstream.evaluation.run_log import read_log
+
+        source, log = self.capture.open(), read_log(self.stream)
+        report = evaluate(open_stream(self.stream), source, backend=backend, log=log)
+        identity = self._asked() | {"capture": capture_facts(self.capture, source)}
+        return result_of(report, identity=identity, trained_by=log.get(0, {}).get("trained_by", {}))
+
+
+def _reconstruct(
+    capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrame | None
+) -> None:
+    """Reconstructs into ``stream``, going on after the frames that it holds."""
+    from structgstream.codec.sinks import FileSink
+    from structgstream.data.prefetch import Prefetch
+    from structgstream.evaluation.environment import environment
+    from structgstream.evaluation.run_log import append_log, begin_log, log_entry
+    from structgstream.session import Session
+
+    source = capture.open()
+    stream.parent.mkdir(parents=True, exist_ok=True)
+    sink, resumed = FileSink.resume(stream)
+    done = 0 if resumed is None else len(resumed)
+    if done == len(source):
+        return
+    fitted = first.fitted() if first is not None and done == 0 else None
+    metadata = {"start": capture.start, "scale": capture.scale}
+    session = Session(Prefetch(source), sink, config, backend, resumed=resumed, metadata=metadata, first=fitted)
+    begin_log(stream, frames=done)
+    machine = environment() | {"backend": backend.name}
+    with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
+        for report in reports:
+            entry = log_entry(report)
+            if report.index == 0:
+                # What frame 0 cost is what it cost when it was fitted, also where it is shared.
+                shared = first.log() if first is not None else {}
+                entry = entry | shared | {"trained_by": machine}
+            append_log(stream, entry)
