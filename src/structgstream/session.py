@@ -12,6 +12,7 @@ from structgstream.cameras import CameraRig
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader
+from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
@@ -20,7 +21,7 @@ from structgstream.memory import PeakKind, PeakMeter
 from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, on_device, state_of
-from structgstream.similarity import normalising_similarity
+from structgstream.similarity import Similarity, normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame
 from structgstream.training.result import FitResult, StepListener
@@ -56,6 +57,19 @@ class FrameReport:
 def frame_seed(seed: int, index: int) -> int:
     """A seed of its own for each frame, so that a frame can be repeated alone."""
     return (seed * 1_000_003 + index) % 2**63
+
+
+def initial_points_of(
+    source: FrameSource, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
+) -> torch.Tensor:
+    """Points ``[P, 3]`` of the capture or made from ``frame``, normalised, after a look at the poses."""
+    from structgstream.data.pose_check import check_poses
+
+    check_poses(frame, source.rig)
+    given = source.points
+    if given is None:
+        given = initial_points(frame, source.rig, config=config, seed=seed).positions
+    return similarity.points(torch.from_numpy(given))
 
 
 class Session:
@@ -187,7 +201,13 @@ class Session:
         if scene is None:
             if self._first is not None:
                 return self._first
-            points = self._initial_points(frame)
+            points = initial_points_of(
+                self._source,
+                frame,
+                config=self._config.points,
+                seed=self._config.seed,
+                similarity=self._similarity,
+            )
             return fit_first_frame(
                 frame,
                 self._rig,
@@ -207,19 +227,6 @@ class Session:
             before=before,
             on_step=self._on_step,
         )
-
-    def _initial_points(self, frame: MultiViewFrame) -> torch.Tensor:
-        """Points of the capture or made from its first frame, normalised, after a look at the poses."""
-        from structgstream.data.points import initial_points
-        from structgstream.data.pose_check import check_poses
-
-        check_poses(frame, self._source.rig)
-        given = self._source.points
-        if given is None:
-            given = initial_points(
-                frame, self._source.rig, config=self._config.points, seed=self._config.seed
-            ).positions
-        return self._similarity.points(torch.from_numpy(given))
 
     def _header(self, scene: Scene) -> StreamHeader:
         dynamic = self._config.online.dynamic

@@ -55,8 +55,8 @@ class PeerFit(Generic[State_co]):
 class PeerMethod(Protocol[State, Memory]):
     """A method behind the loop. Its state is what a receiver holds; the next frame starts from the decoded one.
 
-    ``Memory`` is what the encoder alone keeps from frame to frame; it is made from the decoded frame 0 and the seed, so that
-    a resumed run has the same.
+    ``Memory`` is what the encoder alone keeps from frame to frame; it is made from the decoded frame 0 and the seed,
+    so that a resumed run has the same.
     """
 
     @property
