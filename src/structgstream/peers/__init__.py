@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Other methods behind the same loop and the same evaluator (docs/peers.md)."""
