@@ -4,6 +4,7 @@
 import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,22 @@ import torch
 
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.errors import CaptureError, ConfigError
+from structgstream.data.images import ImageSource
+from structgstream.data.wrappers import section
+from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.evaluate import compared_frames, evaluate, score
+from structgstream.evaluation.facts import start_of
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
+from structgstream.evaluation.recording import placed
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
+from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.memory import resident_bytes
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.similarity import Similarity
-from worlds import World, moving_world
+from worlds import World, emerging_ball, moving_world
 
 SPEED = 0.03
 
@@ -279,6 +285,41 @@ def test_another_capture_is_refused(world: World, spoil: Any, words: str) -> Non
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     with pytest.raises(CaptureError, match=words):
         run(reader, spoil(Source(world.rig, world.frames)))
+
+
+def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader.header = replace(reader.header, metadata={"start": 2})
+    whole: Any = Source(world.rig, world.frames * 2)
+    assert start_of(whole) is None
+    assert start_of(section(whole, start=1)) is None
+    pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 8 for name in world.rig})
+    assert [start_of(pictures), start_of(section(section(pictures, start=1), start=1, frames=4))] == [0, 2]
+    with pytest.raises(CaptureError, match="begins at frame 2 .* at frame 1.*start=2"):
+        run(reader, section(pictures, start=1))
+
+
+@dataclass
+class Ball:
+    """A drawable that is no scene."""
+
+    radius: float
+
+    def __len__(self) -> int:
+        return 1
+
+    def gaussians(self, camera: Any, backend: Any) -> Gaussians:
+        return emerging_ball(0.9 * self.radius)
+
+
+def test_another_methods_file_is_scored_alike(world: World) -> None:
+    reader: Any = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader.decoded = [Ball(1.0), Ball(1.0), Ball(0.5), Ball(0.5)]
+    report = run(reader, Source(world.rig, world.frames))
+    assert [(frame.anchors, frame.free) for frame in report.frames] == [(0, 1)] * 4
+    assert 5 < report.mean.psnr < 40
+    with pytest.raises(BackendError, match="Ball cannot be drawn on meta"):
+        placed(Ball(1.0), torch.device("meta"))
 
 
 def replace_camera(source: Source, camera: Any) -> Source:

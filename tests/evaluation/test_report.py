@@ -16,6 +16,7 @@ from structgstream.evaluation.report import (
     Scores,
     as_json,
     course,
+    drawing_facts,
     mean_scores,
     slope,
     write_json,
@@ -40,6 +41,7 @@ def small_report() -> Report:
                 field_bytes={"anchor_positions": 800, "free": 100 * index},
                 anchors=50,
                 free=index,
+                decode_seconds=0.1,
                 cameras=cameras,
                 mean=mean_scores(cameras.values()),
                 log={
@@ -51,7 +53,7 @@ def small_report() -> Report:
             )
         )
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in ("left", "right")}
-    facts = course([frame.mean.psnr for frame in frames])
+    facts = course([frame.mean.psnr for frame in frames]) | drawing_facts(frames)
     return Report(frames, by_camera, mean_scores(frame.mean for frame in frames), facts, {"python": "3"})
 
 
@@ -67,6 +69,12 @@ def test_the_course_of_psnr() -> None:
     assert slope([30.0]) == 0.0
 
 
+def test_pictures_a_second_with_and_without_the_decoding() -> None:
+    facts = drawing_facts(small_report().frames)
+    assert facts["render_fps"] == pytest.approx(10.0)
+    assert facts["decode_and_render_fps"] == pytest.approx(5.0)
+
+
 def test_json_has_the_documented_keys(tmp_path: Path) -> None:
     write_json(tmp_path / "deep" / "report.json", as_json(small_report()))
     content = json.loads((tmp_path / "deep" / "report.json").read_text())
@@ -79,7 +87,8 @@ def test_json_has_the_documented_keys(tmp_path: Path) -> None:
     assert content["mean"]["seconds"] == 2.0
     assert len(content["frames"]) == 4
     assert set(content["frames"][0]) == scores | {
-        "index", "pts_seconds", "kind", "bytes", "field_bytes", "anchors", "free", "cameras", "log",
+        "index", "pts_seconds", "kind", "bytes", "field_bytes", "anchors", "free", "decode_seconds",
+        "cameras", "log",
     }  # fmt: skip
     assert content["frames"][0]["psnr_changed"] is None
     assert set(content["cameras"]["left"]) == scores

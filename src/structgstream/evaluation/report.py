@@ -47,7 +47,8 @@ class FrameScores:
         bytes: length of the packet's record in the file.
         field_bytes: bytes by field of the state table.
         anchors: anchors of the decoded scene.
-        free: free Gaussians of the decoded scene.
+        free: free Gaussians of the decoded scene; of another method's drawable all of them.
+        decode_seconds: wall-clock time from the file to the scene where it is drawn.
         cameras: scores by camera name.
         mean: their mean.
         log: what the trainer wrote down about the frame beside the stream; empty when that file is missing.
@@ -60,6 +61,7 @@ class FrameScores:
     field_bytes: Mapping[str, int]
     anchors: int
     free: int
+    decode_seconds: float
     cameras: Mapping[str, Scores]
     mean: Scores
     log: Mapping[str, Any]
@@ -107,6 +109,17 @@ def course(psnrs: Sequence[float]) -> dict[str, float]:
         "psnr_worst": min(psnrs),
         "drift_db_per_frame": slope(psnrs),
         "drop_from_first_db": psnrs[0] - min(psnrs),
+    }
+
+
+def drawing_facts(frames: Sequence[FrameScores]) -> dict[str, float]:
+    """Pictures of a camera a second: of a scene that is there, and with the frame's decoding before each picture."""
+    drawing = float(np.mean([frame.mean.render_seconds for frame in frames]))
+    decoding = float(np.mean([frame.decode_seconds for frame in frames]))
+    return {
+        "decode_seconds": decoding,
+        "render_fps": 1.0 / max(drawing, 1e-9),
+        "decode_and_render_fps": 1.0 / max(drawing + decoding, 1e-9),
     }
 
 

@@ -2,6 +2,7 @@
 """A scene and a camera give a picture."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,7 +11,6 @@ from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
-from structgstream.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,13 @@ def draw(
     return Rendering(output.image, output.alpha, output.radii[:count], gaussians, offsets)
 
 
-def render(scene: Scene, camera: Camera, backend: Backend) -> Rendering:
+class Drawable(Protocol):
+    """What gives a camera its Gaussians: a ``Scene``, or another method's model."""
+
+    def gaussians(self, camera: Camera, backend: Backend) -> Gaussians: ...
+
+
+def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
     """Draw ``scene`` as ``camera`` (in the scene's units) sees it, with the mean colour correction: the identity."""
     with torch.no_grad():
         return draw(scene.gaussians(camera, backend), camera, backend)

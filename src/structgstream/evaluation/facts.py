@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a recording, its capture and its log say without a picture being looked at."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.data.images import ImageSource
+from structgstream.data.source import FrameSource
+from structgstream.data.video import VideoSource
+from structgstream.data.wrappers import Section, Wrapped
+from structgstream.errors import CaptureError, ConfigError
+from structgstream.evaluation.recording import Recording
+
+
+def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
+    """The cameras to score: the named ones, or all that were held out.
+
+    Raises:
+        ConfigError: an unknown name, or nothing was held out and nothing named.
+    """
+    if cameras is None:
+        if not header.rig.testing:
+            raise ConfigError(
+                "The stream has no held-out camera to score; name cameras with --cameras (trained ones), "
+                "or reconstruct with --held-out."
+            )
+        return header.rig.testing
+    if unknown := [name for name in cameras if name not in header.rig.cameras]:
+        raise ConfigError(f"The stream has no camera {unknown[0]!r}; it has {', '.join(header.rig)}.")
+    return cameras
+
+
+def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
+    """The capture's cameras of these names are those of the stream.
+
+    Raises:
+        CaptureError: one is missing, stands elsewhere, or has pictures of another size.
+    """
+    for name in names:
+        ours = header.rig[name]
+        theirs = source.rig.cameras.get(name)
+        if theirs is None:
+            raise CaptureError(
+                f"The capture {source.name} has no camera {name!r}, which the stream has; its cameras are "
+                f"{', '.join(source.rig)}. Evaluate the stream on the capture it was made from."
+            )
+        if (theirs.width, theirs.height) != (ours.width, ours.height):
+            raise CaptureError(
+                f"Camera {name!r} has {theirs.width}x{theirs.height} pixels in the capture {source.name} and "
+                f"{ours.width}x{ours.height} in the stream; give the --scale of the reconstruction."
+            )
+        if not (torch.allclose(theirs.viewmat, ours.viewmat, atol=1e-4) and torch.allclose(theirs.K, ours.K, atol=0.1)):
+            raise CaptureError(
+                f"Camera {name!r} of the capture {source.name} has another calibration than in the stream; "
+                "evaluate the stream on the capture it was made from."
+            )
+
+
+def check_same_frames(recording: Recording, source: FrameSource) -> None:
+    """The capture has the frames of the recording.
+
+    Raises:
+        CaptureError: there are fewer, or both say where in the whole capture they begin, and differ.
+    """
+    if len(source) < len(recording.packets):
+        raise CaptureError(
+            f"The stream has {len(recording.packets)} frames and this part of the capture {source.name} only "
+            f"{len(source)}; evaluate it on the capture it was made from."
+        )
+    theirs, ours = start_of(source), recording.header.metadata.get("start")
+    if theirs is not None and ours is not None and int(ours) != theirs:
+        raise CaptureError(
+            f"The stream begins at frame {int(ours)} of its capture and this part of the capture {source.name} at "
+            f"frame {theirs}; open the capture with start={int(ours)}."
+        )
+
+
+def start_of(source: FrameSource) -> int | None:
+    """Where in its whole capture a source begins; None for a source of a kind that does not say."""
+    if isinstance(source, Section):
+        inner = start_of(source.source)
+        return None if inner is None else inner + source.first
+    if isinstance(source, Wrapped):
+        return start_of(source.source)
+    return 0 if isinstance(source, ImageSource | VideoSource) else None
+
+
+def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:
+    """Sizes and rates of the file. Bytes are lengths of records in the file; megabits are 10^6 bits."""
+    header, packets = reader.header, reader.packets
+    seconds = len(packets) / header.fps
+    packet_bytes = sum(info.bytes for info in packets)
+    fields: dict[str, int] = {}
+    for info in packets:
+        for name, size in info.field_bytes.items():
+            fields[name] = fields.get(name, 0) + size
+    keys = [info for info in packets if info.kind == PacketKind.KEY]
+    return {
+        "frames": len(packets),
+        "key_frames": len(keys),
+        "fps": header.fps,
+        "codec": header.codec,
+        "complete": reader.complete,
+        "cameras": {name: "held out" if name in header.rig.held_out else "training" for name in names},
+        "training_cameras": len(header.rig.training),
+        "header_bytes": reader.header_bytes,
+        "packet_bytes": packet_bytes,
+        "total_bytes": reader.total_bytes,
+        "field_bytes": fields,
+        "megabits_per_second": packet_bytes * 8e-6 / seconds,
+        "megabits_per_second_with_header": reader.total_bytes * 8e-6 / seconds,
+        "metadata": dict(header.metadata),
+    }
+
+
+def training_facts(logs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Seconds and peak memory of the training run, from its log; nothing without one."""
+    logs = [log for log in logs if log]
+    if not logs:
+        return {}
+    online = [log["total_seconds"] for log in logs if log["index"] > 0]
+    return {
+        "seconds_first": next((log["total_seconds"] for log in logs if log["index"] == 0), None),
+        "seconds_online_mean": float(np.mean(online)) if online else None,
+        "peak_memory_bytes": max(log["peak_memory_bytes"] or 0 for log in logs) or None,
+        "peak_memory_bytes_by_stage": _largest_by_stage(logs),
+    }
+
+
+def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
+    """The largest peak of each stage, frame 0 apart from the others, which have other work."""
+    largest: dict[str, int] = {}
+    for log in logs:
+        part = "online" if log["index"] else "first frame"
+        for stage, size in log.get("peak_memory_bytes_by_stage", {}).items():
+            largest[f"{part}, {stage}"] = max(size, largest.get(f"{part}, {stage}", 0))
+    return largest

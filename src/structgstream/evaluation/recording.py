@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be scored: any file that gives something to draw for each frame, of this project or another."""
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol, cast, runtime_checkable
+
+import torch
+
+from structgstream.codec.packets import StreamHeader
+from structgstream.codec.reader import PacketInfo
+from structgstream.errors import BackendError
+from structgstream.scene.render import Drawable
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+
+
+@runtime_checkable
+class Movable(Drawable, Protocol):
+    """A drawable whose tensors can be on another device."""
+
+    def on_device(self, device: torch.device) -> Drawable: ...
+
+
+class Recording(Protocol):
+    """An opened file with one packet for each frame; ``StreamReader`` is one.
+
+    ``scenes`` decodes from the file, frame by frame, what a camera sees in normalised units; ``complete`` tells whether
+    the run that wrote the file came to its end. A frame that is no ``Scene`` has a length, its number of Gaussians,
+    and, if it is to be drawn elsewhere than on the CPU, ``on_device`` (:class:`Movable`).
+    """
+
+    @property
+    def header(self) -> StreamHeader: ...
+
+    @property
+    def packets(self) -> Sequence[PacketInfo]: ...
+
+    @property
+    def header_bytes(self) -> int: ...
+
+    @property
+    def total_bytes(self) -> int: ...
+
+    @property
+    def complete(self) -> bool: ...
+
+    def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Drawable]]: ...
+
+
+def counts(drawable: Drawable) -> dict[str, int]:
+    """``anchors`` and ``free`` Gaussians; all Gaussians of what has no anchors are free."""
+    if isinstance(drawable, Scene):
+        return {"anchors": len(drawable.anchors), "free": len(drawable.free)}
+    return {"anchors": 0, "free": len(cast(Sequence, drawable))}
+
+
+def placed(drawable: Drawable, device: torch.device) -> Drawable:
+    """The drawable with its tensors on ``device``.
+
+    Raises:
+        BackendError: it can only be drawn on the CPU.
+    """
+    if isinstance(drawable, Scene):
+        return on_device(drawable, device)
+    if device.type == "cpu":
+        return drawable
+    if not isinstance(drawable, Movable):
+        raise BackendError(f"A {type(drawable).__name__} cannot be drawn on {device}; choose --device cpu.")
+    return drawable.on_device(device)
