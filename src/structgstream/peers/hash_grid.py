@@ -11,9 +11,9 @@ modulo the rows. The network has no biases.
 
 Note [Rows asked for once]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~
-The positions do not change while a frame is fitted, so that which rows they need, and with which weights, is found once:
-the lookup is a sparse matrix times the table, and its gradient the transposed matrix times the gradient. Both are kept
-as bags of rows (``embedding_bag``), whose gradient torch's own takes twenty times as long on a CPU.
+The positions do not change while a frame is fitted, so that which rows they need, and with which weights, is found
+once: the lookup is a sparse matrix times the table, its gradient the transposed matrix times the gradient above. Both
+are kept as bags of rows for ``embedding_bag``, whose own gradient takes twenty times as long on a CPU.
 """
 
 import math
@@ -155,11 +155,8 @@ def corners(positions: Tensor, config: GridConfig) -> tuple[Tensor, Tensor]:
         low = at.floor()
         share = (at - low)[:, None, :]
         x, y, z = (low.long()[:, None, :] + steps).unbind(2)
-        if points**3 <= size:
-            inside = x + points * (y + points * z)
-        else:
-            inside = (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])
-        rows[:, level] = first + inside % size
+        row = x + points * (y + points * z) if points**3 <= size else x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]
+        rows[:, level] = first + row % size
         weights[:, level] = torch.where(steps.bool(), share, 1.0 - share).prod(2)
         first += size
     return rows.reshape(-1, 8), weights.reshape(-1, 8)

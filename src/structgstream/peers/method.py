@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a peer is: another method's way from pictures to a frame, behind this project's loop."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -10,23 +10,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from structgstream.scene.render import Drawable
 from structgstream.training.result import StepListener
 
 Arrays = dict[str, NDArray[Any]]
 """A frame's fields by name, as they are stored: float16, float32, uint8 or int64."""
 
 
-class Drawable(Protocol):
-    """What can be shown from a camera in scene units; its length is its number of Gaussians."""
-
-    def gaussians(self, camera: Camera, backend: Backend) -> Gaussians: ...
-
-    def __len__(self) -> int: ...
-
+PointsMaker = Callable[[], Tensor]
+"""Gives initial points ``[P, 3]`` of a frame in normalised units; making them may take a while."""
 
 State = TypeVar("State", bound=Drawable)
 State_co = TypeVar("State_co", bound=Drawable, covariant=True)
@@ -78,13 +73,13 @@ class PeerMethod(Protocol[State, Memory]):
         self,
         frame: MultiViewFrame,
         rig: CameraRig,
-        points: Tensor,
+        points: PointsMaker,
         *,
         backend: Backend,
         seed: int,
         on_step: StepListener | None = None,
     ) -> PeerFit[State]:
-        """Fit frame 0 from ``points`` ``[P, 3]``; everything in normalised units."""
+        """Fit frame 0; everything in normalised units."""
         ...
 
     def prepared(self, state: State, *, backend: Backend, seed: int) -> Memory:
@@ -97,13 +92,13 @@ class PeerMethod(Protocol[State, Memory]):
         memory: Memory,
         frame: MultiViewFrame,
         rig: CameraRig,
-        points: Tensor,
+        points: PointsMaker,
         *,
         backend: Backend,
         seed: int,
         on_step: StepListener | None = None,
     ) -> PeerFit[State]:
-        """Fit a later frame, from the decoded one before it. ``points`` are those of frame 0."""
+        """Fit a later frame, from the decoded one before it. ``points`` are this frame's."""
         ...
 
     def arrays(self, state: State) -> Arrays:
