@@ -10,6 +10,7 @@
     |-- StorageError            the stream cannot be written (disk full, no permission)
     |-- BackendError            a compute back-end is not available on this machine
     |-- ConfigError             an option has a value that cannot work
+    |-- ExperimentError         a step of a sweep failed; the others are done
     `-- MissingExtraError       an optional dependency is not installed
 
 Each message is one sentence or two that say what was got, what was expected, and what to do. The command line prints it
@@ -43,6 +44,10 @@ class BackendError(StructGStreamError):
 
 class ConfigError(StructGStreamError):
     """A configuration value cannot work."""
+
+
+class ExperimentError(StructGStreamError):
+    """Steps of a sweep failed; what the others gave is stored."""
 
 
 class MissingExtraError(StructGStreamError):

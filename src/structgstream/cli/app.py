@@ -19,6 +19,8 @@ COMMANDS = {
     "evaluate": "score a stream against the cameras that training did not see",
     "render": "render a camera or a camera path to mp4 or PNG",
     "inspect": "show what a stream file holds",
+    "ablate": "run the paper's ablations on a capture, ours beside the paper's figures",
+    "compare": "run several methods on a capture and score their files alike",
     "doctor": "show what this machine has, what is missing, and how to mend it",
 }
 DONE, PROBLEM, USAGE, INTERRUPTED = 0, 1, 2, 130

@@ -22,6 +22,7 @@ class CapturePart:
         frames: number of frames; None for all.
         near: nothing nearer is drawn, in the capture's units; None for the capture's own.
         every: only every so many-th of these frames, for methods that fit each frame alone.
+        scored: the held-out cameras that count; None for all of them. Choices are made by some, reports by others.
     """
 
     folder: Path
@@ -31,6 +32,7 @@ class CapturePart:
     frames: int | None = None
     near: float | None = None
     every: int = 1
+    scored: tuple[str, ...] | None = None
 
     def open(self) -> "FrameSource":
         """The frames.
@@ -66,6 +68,7 @@ def capture_facts(part: CapturePart, source: "FrameSource") -> dict[str, Any]:
         "sizes": [list(size) for size in sizes],
         "training_cameras": len(source.rig.training),
         "held_out": list(source.rig.testing),
+        "scored": list(source.rig.testing if part.scored is None else part.scored),
     }
 
 

@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from structgstream.presets import StreamConfig, to_json
 from structgstream.training.online import OnlineConfig
 
 if TYPE_CHECKING:
+    from structgstream.evaluation.recording import Recording
     from structgstream.kernels.backend import Backend
     from structgstream.training.result import FitResult
 
@@ -30,7 +32,9 @@ class FirstFrame:
     def name(self) -> str:
         """What it is called in logs; the same for tasks that give the same frame 0."""
         decides = {key: value for key, value in to_json(self.config).items() if key != "online"}
-        text = json.dumps([decides, {**vars(self.capture), "folder": str(self.capture.folder), "frames": None}])
+        text = json.dumps(
+            [decides, {**vars(self.capture), "folder": str(self.capture.folder), "frames": None, "scored": None}]
+        )
         return f"first-{hashlib.sha256(text.encode()).hexdigest()[:8]}.seed{self.config.seed}"
 
     @property
@@ -101,14 +105,19 @@ class Variation:
         return f"{self.key}.seed{self.config.seed}"
 
     @property
+    def seed(self) -> int:
+        """Of frame 0 and everything random after it."""
+        return self.config.seed
+
+    @property
     def first(self) -> FirstFrame:
         """Its frame 0, which other variants may share."""
         return FirstFrame(self.capture, self.config, self.folder)
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the tasks that come before it."""
-        return (self.first.name,)
+        """Names of the tasks that come before it: frame 0, unless the stream has it already."""
+        return () if self._begun() else (self.first.name,)
 
     @property
     def stream(self) -> Path:
@@ -121,9 +130,13 @@ class Variation:
         return self.folder / "results" / f"{self.name}.json"
 
     def done(self) -> bool:
-        """Whether there is a result for this very question; the pictures are looked at when it runs."""
-        found = read_result(self.result)
-        return found is not None and {**found.identity, "capture": None} == rounded(self._asked() | {"capture": None})
+        """Whether there is a result for this very question."""
+        return answers(self.result, self._asked(), self.capture)
+
+    def _begun(self) -> bool:
+        from structgstream.evaluation.run_log import read_log
+
+        return self.stream.exists() and 0 in read_log(self.stream)
 
     def _asked(self) -> dict[str, Any]:
         return {"key": self.key, "method": "struct-gstream", "seed": self.config.seed, "config": to_json(self.config)}
@@ -131,18 +144,40 @@ class Variation:
     def run(self, backend: "Backend") -> None:
         """Reconstructs what is missing of the stream, then scores the file."""
         _reconstruct(self.capture, self.config, self.stream, backend, first=self.first)
-        write_result(self.result, self.scored(backend))
+        write_result(self.result, scored(self.recording(), self.stream, self.capture, backend, asked=self._asked()))
 
-    def scored(self, backend: "Backend") -> Result:
-        """The scores of the finished stream."""
+    def recording(self) -> "Recording":
+        """The stream, opened."""
         from structgstream.codec.reader import open_stream
-        from structgstream.evaluation.evaluate import evaluate
-        from structgstream.evaluation.run_log import read_log
 
-        source, log = self.capture.open(), read_log(self.stream)
-        report = evaluate(open_stream(self.stream), source, backend=backend, log=log)
-        identity = self._asked() | {"capture": capture_facts(self.capture, source)}
-        return result_of(report, identity=identity, trained_by=log.get(0, {}).get("trained_by", {}))
+        return open_stream(self.stream)
+
+
+def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart) -> bool:
+    """Whether a result is there and is the answer to this very question, on the part of the capture that is asked."""
+    found = read_result(result)
+    if found is None:
+        return False
+    identity = dict(found.identity)
+    of = identity.pop("capture")
+    frames = capture.frames is None or of["frames"] == -(-capture.frames // capture.every)
+    part = (of["start"], of["scale"], of["every"]) == (capture.start, capture.scale, capture.every)
+    split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
+    cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
+    return identity == rounded(asked) and frames and part and split and cameras
+
+
+def scored(
+    recording: "Recording", stream: Path, capture: CapturePart, backend: "Backend", *, asked: Mapping[str, Any]
+) -> Result:
+    """The scores of a finished file, with what was asked and who trained it."""
+    from structgstream.evaluation.evaluate import evaluate
+    from structgstream.evaluation.run_log import read_log
+
+    source, log = capture.open(), read_log(stream)
+    report = evaluate(recording, source, backend=backend, cameras=capture.scored, log=log)
+    identity = {**asked, "capture": capture_facts(capture, source)}
+    return result_of(report, identity=identity, trained_by=log.get(0, {}).get("trained_by", {}))
 
 
 def _reconstruct(

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of documents, made from results: what stands between two markers is replaced, the rest stays.
+
+A marker is a comment of Markdown on a line of its own::
+
+    <!-- ablation structured basketball -->
+    ...
+    <!-- end -->
+
+with ``ablation TABLE CAPTURE``, ``methods CAPTURE``, ``readings CAPTURE`` or ``made-by CAPTURE``.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from structgstream.errors import ConfigError
+from structgstream.experiments.readings import READINGS, readings_sheet
+from structgstream.experiments.results import Result, read_results
+from structgstream.experiments.sheets import ablation_sheet, comparison_sheet, markdown
+from structgstream.experiments.studies import COMPARED, method_key, method_titles, variant_titles
+from structgstream.experiments.variants import TABLES
+
+MARKED = re.compile(r"<!-- (?P<what>[a-z-]+)(?P<rest>(?: [\w.-]+)*) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
+
+
+def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
+    """Renews the tables of ``documents`` from the results below a folder; returns the documents that changed.
+
+    Raises:
+        ConfigError: a marker asks for something that is not known.
+        StorageError: a result cannot be read.
+    """
+    found = read_results(results)
+    changed = []
+    for path in documents:
+        old = path.read_text()
+        new = refreshed(old, found)
+        if new != old:
+            path.write_text(new)
+            changed.append(path)
+    return changed
+
+
+def refreshed(text: str, results: Sequence[Result]) -> str:
+    """``text`` with every marked part made from ``results``.
+
+    Raises:
+        ConfigError: a marker asks for something that is not known.
+    """
+
+    def renewed(match: re.Match[str]) -> str:
+        what, rest = match["what"], match["rest"].split()
+        if what not in _MAKERS or len(rest) != _MAKERS[what][0]:
+            raise ConfigError(f"A document asks for {match['what']}{match['rest']}; known are {', '.join(_MAKERS)}.")
+        return f"<!-- {what}{match['rest']} -->\n{_MAKERS[what][1](rest, results)}<!-- end -->"
+
+    return MARKED.sub(renewed, text)
+
+
+def _ablation(words: Sequence[str], results: Sequence[Result]) -> str:
+    table, capture = words
+    if table not in TABLES:
+        raise ConfigError(f"A document asks for the ablation {table!r}; there are {', '.join(TABLES)}.")
+    return markdown(ablation_sheet(TABLES[table], _of(capture, results, READINGS), titles=variant_titles()))
+
+
+def _methods(words: Sequence[str], results: Sequence[Result]) -> str:
+    titles = {method_key(name): title for name, title in method_titles().items()}
+    return markdown(comparison_sheet(_of(words[0], results, READINGS), titles=titles, scores=COMPARED))
+
+
+def _readings(words: Sequence[str], results: Sequence[Result]) -> str:
+    return markdown(readings_sheet([result for result in results if result.capture == words[0]]))
+
+
+def _made_by(words: Sequence[str], results: Sequence[Result]) -> str:
+    """Commits, machines and pictures behind the numbers, in a sentence each."""
+    mine = _of(words[0], results, {})
+    if not mine:
+        return "No result yet.\n"
+    commits = sorted({str(result.trained_by.get("commit")) for result in mine})
+    machines = sorted({_machine(result.trained_by) for result in mine})
+    pictures = sorted({_pictures(result.identity["capture"]) for result in mine})
+    return (
+        f"Trained at commit {', '.join(commits)} on {'; '.join(machines)}. Pictures: {'; '.join(pictures)}.\n"
+    )  # fmt: skip
+
+
+def _machine(facts: Mapping[str, object]) -> str:
+    where = facts.get("gpu") or facts.get("cpu")
+    return f"{where}, {facts.get('threads')} of {facts.get('cores')} cores a run, torch {facts.get('torch')}"
+
+
+def _pictures(capture: Mapping[str, object]) -> str:
+    sizes = ", ".join(f"{width}x{height}" for width, height in capture["sizes"])  # type: ignore[attr-defined]
+    held_out = ", ".join(capture["held_out"])  # type: ignore[arg-type]
+    return (
+        f"{capture['name']} ({str(capture['fingerprint'])[:12]}), {capture['frames']} frames of {sizes}, "
+        f"{capture['training_cameras']} training cameras, held out {held_out}"
+    )
+
+
+def _of(capture: str, results: Sequence[Result], without: Mapping[str, object]) -> list[Result]:
+    return [result for result in results if result.capture == capture and result.key not in without]
+
+
+_MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Sequence[Result]], str]]] = {
+    "ablation": (2, _ablation),
+    "methods": (1, _methods),
+    "readings": (1, _readings),
+    "made-by": (1, _made_by),
+}

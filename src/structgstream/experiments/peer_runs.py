@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Peers as tasks of an experiment, beside the variants of our own method."""
+
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from structgstream.experiments.captures import CapturePart
+from structgstream.experiments.results import write_result
+from structgstream.experiments.tasks import answers, scored
+
+if TYPE_CHECKING:
+    from structgstream.evaluation.recording import Recording
+    from structgstream.kernels.backend import Backend
+
+PEER_TITLES: Mapping[str, str] = {
+    "3dgstream": "3DGStream's method",
+    "scaffold-gs": "Scaffold-GS, every frame from scratch",
+    "3dgs": "3DGS, every frame from scratch",
+}
+
+
+@dataclass(frozen=True)
+class PeerRun:
+    """Reconstructs and scores a capture with another method (``structgstream.peers``)."""
+
+    key: str
+    capture: CapturePart
+    seed: int
+    folder: Path
+    frames: int
+
+    @property
+    def name(self) -> str:
+        """What it is called in logs and files."""
+        return f"{self.key}.seed{self.seed}"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Nothing comes before it."""
+        return ()
+
+    @property
+    def stream(self) -> Path:
+        """The method's own file."""
+        return self.folder / "streams" / f"{self.name}.sgp"
+
+    @property
+    def result(self) -> Path:
+        """Its scores."""
+        return self.folder / "results" / f"{self.name}.json"
+
+    def done(self) -> bool:
+        """Whether there is a result for this very question."""
+        return answers(self.result, self._asked(), self.capture)
+
+    def _asked(self) -> dict[str, Any]:
+        from structgstream.peers.methods import method_named
+
+        return {"key": self.key, "method": self.key, "seed": self.seed, "config": asdict(method_named(self.key).config)}
+
+    def recording(self) -> "Recording":
+        """The file, opened."""
+        from structgstream.peers.container import open_peer
+
+        return open_peer(self.stream)
+
+    def run(self, backend: "Backend") -> None:
+        """Reconstructs what is missing of the file, then scores it."""
+        self._reconstruct(backend)
+        write_result(self.result, scored(self.recording(), self.stream, self.capture, backend, asked=self._asked()))
+
+    def _reconstruct(self, backend: "Backend") -> None:
+        from structgstream.data.prefetch import Prefetch
+        from structgstream.evaluation.environment import environment
+        from structgstream.evaluation.run_log import append_log, begin_log, log_entry
+        from structgstream.peers.methods import method_named
+        from structgstream.peers.session import PeerSession
+
+        self.stream.parent.mkdir(parents=True, exist_ok=True)
+        source = self.capture.open()
+        session = PeerSession(
+            Prefetch(source), self.stream, method_named(self.key), backend, seed=self.seed, resume=True
+        )
+        begin_log(self.stream, frames=session.stored)
+        machine = environment() | {"backend": backend.name}
+        with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
+            for report in reports:
+                entry = log_entry(report)
+                append_log(self.stream, entry | {"trained_by": machine} if report.index == 0 else entry)
