@@ -3,13 +3,14 @@
 
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from structgstream.experiments.captures import CapturePart
 from structgstream.experiments.results import write_result
 from structgstream.experiments.tasks import answers, scored
+from structgstream.presets import to_json
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
@@ -57,13 +58,13 @@ class PeerRun:
         return answers(self.result, self._asked(), self.capture)
 
     def _asked(self) -> dict[str, Any]:
-        from structgstream.peers.methods import method_named
+        from structgstream.peers.methods import METHODS
 
-        return {"key": self.key, "method": self.key, "seed": self.seed, "config": asdict(method_named(self.key).config)}
+        return {"key": self.key, "method": self.key, "seed": self.seed, "config": to_json(METHODS[self.key].config)}
 
     def recording(self) -> "Recording":
         """The file, opened."""
-        from structgstream.peers.container import open_peer
+        from structgstream.peers.methods import open_peer
 
         return open_peer(self.stream)
 
@@ -76,17 +77,18 @@ class PeerRun:
         from structgstream.data.prefetch import Prefetch
         from structgstream.evaluation.environment import environment
         from structgstream.evaluation.run_log import append_log, begin_log, log_entry
-        from structgstream.peers.methods import method_named
+        from structgstream.peers.methods import METHODS
         from structgstream.peers.session import PeerSession
 
         self.stream.parent.mkdir(parents=True, exist_ok=True)
-        source = self.capture.open()
-        session = PeerSession(
-            Prefetch(source), self.stream, method_named(self.key), backend, seed=self.seed, resume=True
-        )
-        begin_log(self.stream, frames=session.stored)
+        source = Prefetch(self.capture.open())
+        session = PeerSession(source, self.stream, METHODS[self.key], backend, seed=self.seed, resume=True)
         machine = environment() | {"backend": backend.name}
+        first = True
         with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
             for report in reports:
+                if first:
+                    begin_log(self.stream, frames=report.index)
+                    first = False
                 entry = log_entry(report)
                 append_log(self.stream, entry | {"trained_by": machine} if report.index == 0 else entry)

@@ -113,9 +113,9 @@ def method_titles() -> dict[str, str]:
 
 def fits_frames_alone(name: str) -> bool:
     """Whether a peer begins anew with every frame."""
-    from structgstream.peers.methods import method_named
+    from structgstream.peers.methods import METHODS
 
-    return name in PEER_TITLES and method_named(name).stands_alone
+    return name in METHODS and METHODS[name].stands_alone
 
 
 def needed(runs: Iterable[Variation | PeerRun]) -> list[Task]:
