@@ -123,10 +123,13 @@ class GridQuery:
     back_weights: Tensor
 
     @classmethod
-    def of(cls, positions: Tensor, config: GridConfig) -> "GridQuery":
-        """The query of ``positions`` ``[n, 3]`` in the unit cube."""
+    def of(cls, positions: Tensor, config: GridConfig, *, gradients: bool = True) -> "GridQuery":
+        """The query of ``positions`` ``[n, 3]`` in the unit cube; the transposed part only with ``gradients``."""
         rows, weights = corners(positions, config)
         flat = rows.reshape(-1)
+        if not gradients:
+            none = flat[:0].to(torch.int32)
+            return cls(rows.to(torch.int32), weights, none, none, weights.reshape(-1)[:0])
         order = flat.argsort(stable=True)
         counts = torch.bincount(flat, minlength=config.total_rows)
         index = torch.int32

@@ -249,7 +249,7 @@ class ThreeDGStream:
             raise StreamError(f"Additions have colours of degree {added.degree}, the others {previous.base.degree}.")
         rows, positions = in_box(previous.base.means, previous.box)
         state = replace(previous, added=added, cache=cache)
-        return replace(state, base=self._moved(state, rows, GridQuery.of(positions, grid)))
+        return replace(state, base=self._moved(state, rows, GridQuery.of(positions, grid, gradients=False)))
 
 
 def _later(on_step: StepListener, before: int, steps: int, base: int) -> StepListener:
