@@ -7,7 +7,8 @@ A marker is a comment of Markdown on a line of its own::
     ...
     <!-- end -->
 
-with ``ablation TABLE CAPTURE``, ``methods CAPTURE``, ``readings CAPTURE`` or ``made-by CAPTURE``.
+with ``ablation TABLE CAPTURE``, ``methods CAPTURE``, ``readings CAPTURE`` and ``made-by CAPTURE`` for text, and ``curves
+TABLE CAPTURE`` and ``plot CAPTURE`` for pictures, which go to ``images/`` beside the document.
 """
 
 import re
@@ -15,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from structgstream.errors import ConfigError
+from structgstream.experiments.figures import write_comparison, write_curves
 from structgstream.experiments.readings import READINGS, readings_sheet
 from structgstream.experiments.results import Result, read_results
 from structgstream.experiments.sheets import ablation_sheet, comparison_sheet, markdown
@@ -39,7 +41,21 @@ def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
         if new != old:
             path.write_text(new)
             changed.append(path)
+        for match in MARKED.finditer(new):
+            _draw(match["what"], match["rest"].split(), found, folder=path.parent / "images")
     return changed
+
+
+def _draw(what: str, words: Sequence[str], results: Sequence[Result], *, folder: Path) -> None:
+    if what not in _PICTURES:
+        return
+    mine = _of(words[-1], results, READINGS)
+    if mine and what == "curves":
+        keys = list(TABLES[words[0]].rows)
+        shown = [result for result in mine if result.key in keys]
+        write_curves(folder / f"{words[1]}-{words[0]}.png", shown, keys=keys, titles=variant_titles())
+    elif mine:
+        write_comparison(folder / f"{words[0]}-methods.png", mine, titles=_method_titles())
 
 
 def refreshed(text: str, results: Sequence[Result]) -> str:
@@ -66,8 +82,20 @@ def _ablation(words: Sequence[str], results: Sequence[Result]) -> str:
 
 
 def _methods(words: Sequence[str], results: Sequence[Result]) -> str:
-    titles = {method_key(name): title for name, title in method_titles().items()}
-    return markdown(comparison_sheet(_of(words[0], results, READINGS), titles=titles, scores=COMPARED))
+    sheet = comparison_sheet(_of(words[0], results, READINGS), titles=_method_titles(), scores=COMPARED)
+    return markdown(sheet)
+
+
+def _method_titles() -> dict[str, str]:
+    return {method_key(name): title for name, title in method_titles().items()}
+
+
+def _curves(words: Sequence[str], results: Sequence[Result]) -> str:
+    return f"![Scores over the frames of {words[1]}](images/{words[1]}-{words[0]}.png)\n"
+
+
+def _plot(words: Sequence[str], results: Sequence[Result]) -> str:
+    return f"![Quality against bytes and seconds, {words[0]}](images/{words[0]}-methods.png)\n"
 
 
 def _readings(words: Sequence[str], results: Sequence[Result]) -> str:
@@ -82,9 +110,7 @@ def _made_by(words: Sequence[str], results: Sequence[Result]) -> str:
     commits = sorted({str(result.trained_by.get("commit")) for result in mine})
     machines = sorted({_machine(result.trained_by) for result in mine})
     pictures = sorted({_pictures(result.identity["capture"]) for result in mine})
-    return (
-        f"Trained at commit {', '.join(commits)} on {'; '.join(machines)}. Pictures: {'; '.join(pictures)}.\n"
-    )  # fmt: skip
+    return f"Trained at commit {', '.join(commits)} on {'; '.join(machines)}. Pictures: {'; '.join(pictures)}.\n"
 
 
 def _machine(facts: Mapping[str, object]) -> str:
@@ -110,4 +136,7 @@ _MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Sequence[Result]], str
     "methods": (1, _methods),
     "readings": (1, _readings),
     "made-by": (1, _made_by),
+    "curves": (2, _curves),
+    "plot": (1, _plot),
 }
+_PICTURES = ("curves", "plot")

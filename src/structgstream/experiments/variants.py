@@ -71,6 +71,7 @@ TABLES: Mapping[str, AblationTable] = {
                 FULL: {"psnr": 33.81},
             },
             claim="l_v and F_Sigma must be trained; training F_alpha or F_c as well makes it worse",
+            scores=("psnr", "online_bytes", "e_warp", "t_lpips", "temporal_flip", "flicker"),
         ),
         AblationTable(
             key="free",
