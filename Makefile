@@ -32,3 +32,8 @@ $(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
 
 clean:
 	rm -rf $(VENV) build dist demo
+
+# Tables of the documents, from the results beside them.
+.PHONY: tables
+tables: $(VENV)/.test-ready
+	$(BIN)/python -m structgstream.experiments results docs/ablations.md docs/evaluation.md docs/method.md

@@ -7,8 +7,8 @@ A marker is a comment of Markdown on a line of its own::
     ...
     <!-- end -->
 
-with ``ablation TABLE CAPTURE``, ``methods CAPTURE``, ``readings CAPTURE`` and ``made-by CAPTURE`` for text, and ``curves
-TABLE CAPTURE`` and ``plot CAPTURE`` for pictures, which go to ``images/`` beside the document.
+with ``ablation TABLE CAPTURE``, ``methods CAPTURE``, ``readings CAPTURE`` and ``made-by CAPTURE`` for text, and
+``curves TABLE CAPTURE`` and ``plot CAPTURE`` for pictures, which go to ``images/`` beside the document.
 """
 
 import re
