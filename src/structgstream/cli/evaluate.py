@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -14,6 +14,7 @@ from structgstream.cli.tables import report_tables
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
+    from structgstream.evaluation.instruments import Selection
     from structgstream.evaluation.report import Report
     from structgstream.kernels.backend import Backend
 
@@ -41,6 +42,10 @@ class Evaluate:
     """Write every number to this file (keys: docs/evaluation.md)."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """Write report.json, plots over time and a contact sheet into this folder."""
+    metrics: Literal["all", "basic"] = "all"
+    """Scores: "basic" leaves out MS-SSIM, FLIP, LPIPS and those over time, which take longer than rendering."""
+    lpips_weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")] = None
+    """Folder or file with the networks' weights for LPIPS. Default: $STRUCTGSTREAM_LPIPS_WEIGHTS, torch's hub cache."""
     device: Device = "auto"
     """What renders."""
 
@@ -61,6 +66,8 @@ def main(arguments: list[str]) -> None:
         backend=select_backend(options.device),
         cameras=options.cameras,
         folder=options.report,
+        metrics=options.metrics,
+        lpips_weights=options.lpips_weights,
     )
     if options.json is not None:
         write_json(options.json, as_json(report))
@@ -91,6 +98,8 @@ def scored(
     backend: "Backend",
     cameras: tuple[str, ...] | None,
     folder: Path | None,
+    metrics: "Selection" = "all",
+    lpips_weights: Path | None = None,
 ) -> "Report":
     """Evaluates with a word about the progress, and writes the report into ``folder`` (None: nowhere)."""
     from structgstream.evaluation.evaluate import Compared, evaluate
@@ -110,7 +119,16 @@ def scored(
             if folder is not None and index in wanted:
                 kept.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
 
-        report = evaluate(reader, source, backend=backend, cameras=cameras, log=read_log(stream), observer=observe)
+        report = evaluate(
+            reader,
+            source,
+            backend=backend,
+            cameras=cameras,
+            log=read_log(stream),
+            observer=observe,
+            metrics=metrics,
+            lpips_weights=lpips_weights,
+        )
     if folder is not None:
         title = f"{source.name}, {stream.name}: {report.mean.psnr:.2f} dB over {frames} frames"
         write_json(folder / "report.json", as_json(report))

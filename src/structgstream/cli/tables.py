@@ -15,10 +15,28 @@ if TYPE_CHECKING:
 
 SHOWN_FRAMES = 24  # a longer stream is shown in even steps
 
+FURTHER = (  # title, key, digits
+    ("MS-SSIM", "ms_ssim", 4),
+    ("FLIP", "flip", 4),
+    ("LPIPS", "lpips_alex", 4),
+    ("VGG", "lpips_vgg", 4),
+    ("E_warp", "e_warp", 5),
+    ("tFLIP", "temporal_flip", 4),
+    ("tLPIPS", "t_lpips", 5),
+    ("flicker", "flicker", 2),
+    ("truth", "truth_flicker", 2),
+)
+
 
 def report_tables(report: "Report", *, title: str) -> Group:
     """Scores by frame and by camera, and the facts of the file."""
-    return Group(_frames(report, title), Text(), _cameras(report), Text(), _facts(report))
+    parts = [_frames(report, title), _cameras(report)]
+    if report.stream["metrics"] == "all":
+        parts.append(_further(report))
+    if report.stream["not_available"]:
+        parts.append(_not_available(report))
+    parts.append(_facts(report))
+    return Group(*(part for shown in parts for part in (shown, Text())))
 
 
 def grid() -> Table:
@@ -71,6 +89,29 @@ def _cameras(report: "Report") -> Table:
     return table
 
 
+def _further(report: "Report") -> Table:
+    """The scores of ``FURTHER`` by camera, and their mean."""
+    table = columns()
+    for name in ("camera", *(title for title, _, _ in FURTHER)):
+        table.add_column(name, justify="left" if name == "camera" else "right")
+    for name, scores in (*report.cameras.items(), ("mean", report.mean)):
+        values = [getattr(scores, key) for _, key, _ in FURTHER]
+        cells = ["-" if v is None else f"{v:.{digits}f}" for v, (_, _, digits) in zip(values, FURTHER, strict=True)]
+        table.add_row(*plain(name), *cells)
+    return table
+
+
+def _not_available(report: "Report") -> Table:
+    """Which scores are missing, and why: one row for each reason."""
+    reasons: dict[str, list[str]] = {}
+    for name, reason in report.stream["not_available"].items():
+        reasons.setdefault(reason, []).append(name)
+    table = grid()
+    for reason, names in reasons.items():
+        table.add_row("not available", Text(f"{', '.join(names)}: {reason}", overflow="fold"))
+    return table
+
+
 def _facts(report: "Report") -> Table:
     s = report.stream
     table = grid()
@@ -102,7 +143,10 @@ def _facts(report: "Report") -> Table:
         stages = s["peak_memory_bytes_by_stage"]
         if stages:
             table.add_row("memory by stage", "; ".join(f"{name} {human_bytes(size)}" for name, size in stages.items()))
-    table.add_row("rendering", f"{1 / max(report.mean.render_seconds, 1e-9):.1f} pictures a second")
+    table.add_row(
+        "rendering",
+        f"{s['render_fps']:.1f} pictures a second, {s['decode_and_render_fps']:.1f} with the decoding of the frame",
+    )
     e = report.environment
     machine = f"{e['gpu'] or e['cpu']}, {e['cores']} cores, back-end {e['backend']}, torch {e['torch']}"
     table.add_row("machine", Text(machine))

@@ -3,7 +3,8 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from structgstream.evaluation.facts import (
     stream_facts,
     training_facts,
 )
+from structgstream.evaluation.flow import Flow
+from structgstream.evaluation.instruments import Seen, Selection, instruments, measured
 from structgstream.evaluation.masks import changed_pixels
 from structgstream.evaluation.metrics import decibels, mean_of_squares, quantised, squared_errors, ssim
 from structgstream.evaluation.recording import Drawable, Recording, counts, placed
@@ -59,6 +62,9 @@ def evaluate(
     cameras: tuple[str, ...] | None = None,
     log: Mapping[int, Mapping[str, Any]] | None = None,
     observer: Observer | None = None,
+    metrics: Selection = "all",
+    flow: Flow | None = None,
+    lpips_weights: Path | None = None,
 ) -> Report:
     """Every score of every frame that the file holds and the capture shows.
 
@@ -69,18 +75,26 @@ def evaluate(
         cameras: names of the cameras to score; None for those that training did not see.
         log: the trainer's log by frame number (``run_log.read_log``).
         observer: called with frame number and comparison for every picture, for pictures and progress.
+        metrics: "basic" leaves out what takes longer than rendering: MS-SSIM, FLIP, LPIPS and the scores over time.
+        flow: where pixels were in the frame before, when the capture knows; None estimates it.
+        lpips_weights: folder or file with the weights that LPIPS needs (``lpips.py``, Note [Weights]).
 
     Raises:
         CaptureError: the capture is not the one of the stream: a camera is missing, stands elsewhere, or has pictures
             of another size; or it has fewer frames, or others.
-        ConfigError: there is no camera to score.
+        ConfigError: there is no camera to score, or weights for LPIPS are wrong.
         StreamError: a packet is damaged.
     """
     names = scored_cameras(recording.header, cameras)
     check_same_rig(recording.header, source, names)
     check_same_frames(recording, source)
     views = {name: recording.header.similarity.camera(recording.header.rig[name]) for name in names}
+    tools = None
+    if metrics == "all":
+        size = len(recording.packets)
+        tools = instruments(views.items(), frames=size, device=backend.device, flow=flow, lpips_weights=lpips_weights)
     first: dict[str, Picture] = {}
+    before: dict[str, Seen] = {}
     frames = []
     peaks = PeakMeter(backend.device)
     for frame, (info, scene, decode_seconds) in zip(
@@ -91,9 +105,13 @@ def evaluate(
             truth = frame.images[name]
             first.setdefault(name, truth)
             picture, seconds = rendered(scene, views[name], backend)
-            compared.append(
-                Compared(name, truth, picture, score(picture, truth, first[name], backend=backend, seconds=seconds))
-            )
+            scores = score(picture, truth, first[name], backend=backend, seconds=seconds)
+            if tools is not None:
+                further, before[name] = measured(
+                    tools, truth=truth, picture=picture, before=before.get(name), camera=name, index=info.index
+                )
+                scores = replace(scores, **further)
+            compared.append(Compared(name, truth, picture, scores))
             if observer is not None:
                 observer(info.index, compared[-1])
         frames.append(_frame_scores(info, scene, compared, decode_seconds, dict((log or {}).get(info.index, {}))))
@@ -101,6 +119,8 @@ def evaluate(
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
     facts = stream_facts(recording, names) | course([frame.mean.psnr for frame in frames])
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
+    facts |= {"metrics": metrics, "not_available": dict(tools.not_available) if tools else {}}
+    facts |= {"lpips_weights": dict(tools.weights) if tools else {}}
     peaks.end(EVALUATION)
     machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
     return Report(frames, by_camera, mean, facts, machine)

@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import avg_pool2d, conv2d
 
 from structgstream.kernels.backend import Backend
 
 PSNR_OF_EQUALS = 100.0  # dB; above what rounding to 8 bits can give, and a number that JSON can hold
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
+SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # exponents of MS-SSIM, finest first
+SMALLEST_OF_SCALES = (WINDOW - 1) * 2 ** (len(SCALES) - 1) + 1  # pixels: the window fits five times halved pictures
 
 
 def quantised(image: Tensor) -> NDArray[np.uint8]:
@@ -53,19 +55,48 @@ def ssim_map(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Tensor:
     Gaussian window of 11 pixels, sigma 1.5; K1 = 0.01, K2 = 0.03, weighted (biased) moments, zeros beyond the
     border.
     """
-    a, b = (torch.from_numpy(np.ascontiguousarray(p)).permute(2, 0, 1) / 255.0 for p in (picture, truth))
+    luminance, structure = _similarity(*_channels(picture, truth), padding=WINDOW // 2)
+    return luminance * structure
+
+
+def _channels(*pictures: NDArray[np.uint8]) -> tuple[Tensor, ...]:
+    """8-bit pictures as ``[3, H, W]`` in [0, 1]."""
+    return tuple(torch.from_numpy(np.ascontiguousarray(p)).permute(2, 0, 1) / 255.0 for p in pictures)
+
+
+def _similarity(a: Tensor, b: Tensor, *, padding: int) -> tuple[Tensor, Tensor]:
+    """Luminance, and contrast times structure, of every window of two ``[3, H, W]`` with a border of zeros."""
     offsets = torch.arange(WINDOW, dtype=torch.float32) - WINDOW // 2
     kernel = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    kernel = (kernel / kernel.sum()).expand(15, 1, WINDOW)
+    kernel = (kernel / kernel.sum()).expand(15, 1, WINDOW).to(a.device)
     moments = torch.cat([a, b, a * a, b * b, a * b])[None]  # [1, 15, H, W]
-    moments = conv2d(moments, kernel[:, :, None, :], padding=(0, WINDOW // 2), groups=15)
-    moments = conv2d(moments, kernel[:, :, :, None], padding=(WINDOW // 2, 0), groups=15)
-    mean_a, mean_b, square_a, square_b, product = moments.reshape(5, *a.shape)
-    variance_a, variance_b = square_a - mean_a**2, square_b - mean_b**2
+    moments = conv2d(moments, kernel[:, :, None, :], padding=(0, padding), groups=15)
+    moments = conv2d(moments, kernel[:, :, :, None], padding=(padding, 0), groups=15)
+    mean_a, mean_b, square_a, square_b, product = moments[0].unflatten(0, (5, 3))
+    variances = square_a - mean_a**2 + square_b - mean_b**2
     covariance = product - mean_a * mean_b
-    return ((2 * mean_a * mean_b + C1) * (2 * covariance + C2)) / (
-        (mean_a**2 + mean_b**2 + C1) * (variance_a + variance_b + C2)
-    )
+    luminance = (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
+    return luminance, (2 * covariance + C2) / (variances + C2)
+
+
+def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | None:
+    """Structural similarity over five scales (Wang et al., 2003), averaged over channels; None for small pictures.
+
+    Windows and constants of :func:`ssim_map`, over windows that lie in the picture (no padding). Each scale averages
+    2x2 pixels of the one before; an odd side gets a line of zeros before its first, as in pytorch-msssim. The mean of
+    contrast times structure over each scale, at the coarsest of SSIM, negative ones as 0, to the power of its weight.
+    """
+    if min(truth.shape[:2]) < SMALLEST_OF_SCALES:
+        return None
+    a, b = _channels(picture, truth)
+    product = torch.ones(3)
+    for scale, weight in enumerate(SCALES):
+        luminance, structure = _similarity(a, b, padding=0)
+        last = scale == len(SCALES) - 1
+        product *= (luminance * structure if last else structure).mean((1, 2)).relu() ** weight
+        odd = a.shape[1] % 2, a.shape[2] % 2
+        a, b = (avg_pool2d(channels, 2, padding=odd) for channels in (a, b))
+    return float(product.mean())
 
 
 def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:

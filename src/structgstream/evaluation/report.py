@@ -25,6 +25,17 @@ class Scores:
         psnr_still: dB over the others; None where there are none.
         changed_share: share of the pixels that changed.
         render_seconds: wall-clock time of the rendering, the picture in main memory.
+        ms_ssim: see ``metrics.ms_ssim``; like all that follow None where it was not asked for or is not available,
+            for which ``stream["not_available"]`` has the reason.
+        flip: mean LDR-FLIP (``flip.py``).
+        lpips_alex: LPIPS with AlexNet (``lpips.py``).
+        lpips_vgg: LPIPS with VGG16.
+        e_warp: squared warping error (``temporal.py``); like all that follow None in frame 0, for it compares with the
+            camera's frame before.
+        temporal_flip: how far the change by FLIP is from the truth's.
+        t_lpips: how far the change by LPIPS with AlexNet is from the truth's.
+        flicker: mean absolute change of the rendering where the truth did not change, in levels of 1/255.
+        truth_flicker: that of the truth: the camera's noise.
     """
 
     psnr: float
@@ -34,6 +45,15 @@ class Scores:
     psnr_still: float | None
     changed_share: float
     render_seconds: float
+    ms_ssim: float | None = None
+    flip: float | None = None
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
+    e_warp: float | None = None
+    temporal_flip: float | None = None
+    t_lpips: float | None = None
+    flicker: float | None = None
+    truth_flicker: float | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scores that need more than two pictures: an optional package, weights, or the frame before.
+
+What is missing is said once, with the reason and what to do about it; a score is then None, never a guess.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
+from structgstream.errors import MissingExtraError
+from structgstream.evaluation.flip import flip, flip_evaluator
+from structgstream.evaluation.flow import Flow, dis_flow
+from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
+from structgstream.evaluation.masks import changed_pixels
+from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim
+from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
+
+Picture = NDArray[np.uint8]
+Selection = Literal["all", "basic"]
+"""All scores, or those of two pictures that cost little: PSNR and its kinds, and SSIM."""
+
+TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """What measures, and what could not be had.
+
+    Args:
+        flip: mean FLIP of a picture and its truth, or None.
+        lpips: by name of the trunk, those whose weights were found.
+        flow: where pixels were in the frame before, or None.
+        weights: by name of the trunk, the file its weights came from.
+        not_available: name of the score to the reason why there is none.
+    """
+
+    flip: Callable[[Picture, Picture], float] | None
+    lpips: Mapping[str, Lpips]
+    flow: Flow | None
+    weights: Mapping[str, str] = field(default_factory=dict)
+    not_available: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One camera's frame, as the next one needs it: both pictures and their features for T-LPIPS."""
+
+    truth: Picture
+    picture: Picture
+    features: tuple[Features, Features] | None  # of the truth and of the picture
+
+
+def instruments(
+    cameras: Iterable[tuple[str, Camera]],
+    *,
+    frames: int,
+    device: torch.device,
+    flow: Flow | None = None,
+    lpips_weights: Path | None = None,
+) -> Instruments:
+    """All instruments that can be had here, for these cameras (names beside them) and this number of frames.
+
+    Args:
+        cameras: those that are scored: what is too small for a score at one of them is not measured there.
+        frames: with one, nothing is said of time.
+        device: where LPIPS is computed.
+        flow: exact flow; None estimates it.
+        lpips_weights: folder or file with the trunks' weights (``lpips.py``, Note [Weights]).
+
+    Raises:
+        ConfigError: a file of weights is there and is wrong.
+    """
+    missing: dict[str, str] = {}
+    measure = None
+    try:
+        flip_evaluator()
+        measure = flip
+    except MissingExtraError as error:
+        missing |= dict.fromkeys(("flip", "temporal_flip"), str(error))
+    if flow is None:
+        try:
+            flow = dis_flow()
+        except MissingExtraError as error:
+            missing["e_warp"] = str(error)
+    sides = {name: min(camera.width, camera.height) for name, camera in cameras}
+    found: dict[str, Lpips] = {}
+    weights: dict[str, str] = {}
+    for trunk in TRUNKS:
+        names = ("lpips_alex", "t_lpips") if trunk is ALEX else ("lpips_vgg",)
+        path = weights_file(trunk, lpips_weights)
+        if path is None:
+            missing |= dict.fromkeys(names, how_to_get(trunk))
+        else:
+            found[trunk.name], weights[trunk.name] = load_lpips(trunk, path, device), path.name
+            if reason := _too_small(sides, trunk.smallest):
+                missing |= dict.fromkeys(names, reason)
+    if reason := _too_small(sides, SMALLEST_OF_SCALES):
+        missing["ms_ssim"] = reason
+    if frames < 2:
+        missing |= dict.fromkeys(TEMPORAL, "the stream has one frame, and this score compares two")
+    return Instruments(measure, found, flow, weights, missing)
+
+
+def measured(
+    tools: Instruments, *, truth: Picture, picture: Picture, before: Seen | None, camera: str, index: int
+) -> tuple[dict[str, float | None], Seen]:
+    """The further scores of one picture, by their names in ``Scores``, and what the next frame needs of this one.
+
+    Args:
+        tools: what measures.
+        truth: what the camera took, ``[H, W, 3]`` uint8.
+        picture: what was rendered.
+        before: the same camera's frame before; None for the first.
+        camera: its name.
+        index: number of the frame.
+    """
+    alex, vgg = (_usable(tools, trunk.name, truth) for trunk in (ALEX, VGG))
+    scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth)}
+    scores["flip"] = None if tools.flip is None else tools.flip(picture, truth)
+    features = None if alex is None else (alex.features(truth), alex.features(picture))
+    scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
+    scores["lpips_vgg"] = None if vgg is None else vgg.distance(vgg.features(truth), vgg.features(picture))
+    if before is not None:
+        still = ~changed_pixels(truth, before.truth)
+        scores["flicker"] = flicker(picture, before.picture, still)
+        scores["truth_flicker"] = flicker(truth, before.truth, still)
+        if tools.flow is not None:
+            field = tools.flow(before.truth, truth, camera, index)
+            scores["e_warp"] = warping_error(picture, before.picture, field)
+        if tools.flip is not None:
+            scores["temporal_flip"] = difference_of_change(
+                tools.flip(picture, before.picture), tools.flip(truth, before.truth)
+            )
+        if alex is not None and features is not None and before.features is not None:
+            true, rendered = (alex.distance(*pair) for pair in zip(features, before.features, strict=True))
+            scores["t_lpips"] = difference_of_change(rendered, true)
+    return scores, Seen(truth, picture, features)
+
+
+def _usable(tools: Instruments, name: str, picture: Picture) -> Lpips | None:
+    lpips = tools.lpips.get(name)
+    return None if lpips is None or min(picture.shape[:2]) < lpips.trunk.smallest else lpips
+
+
+def _too_small(sides: Mapping[str, int], smallest: int) -> str | None:
+    small = [f"{name} ({side})" for name, side in sides.items() if side < smallest]
+    return f"pictures need {smallest} pixels a side, fewer are those of {', '.join(small)}" if small else None
