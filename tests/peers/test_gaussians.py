@@ -58,11 +58,12 @@ def test_without_camera_colour_the_correction_is_the_identity() -> None:
 
 def test_a_point_starts_with_the_colour_that_the_views_show_there() -> None:
     views = training_views(CAPTURE.pictures[0], CAPTURE.rig, BACKEND.device)
-    behind = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -50.0]])
+    point = torch.tensor([0.05, 0.03, 0.02, 1.0])
+    behind = torch.stack([point[:3], torch.tensor([0.0, 0.0, -50.0])])
     colors = point_colors(behind, views)
     shown = []
     for view in views:
-        local = view.camera.viewmat @ torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+        local = view.camera.viewmat @ point.double()
         column, row = ((view.camera.K @ local[:3])[:2] / local[2]).long().tolist()
         shown.append(view.image[row, column] / 255.0)
     torch.testing.assert_close(colors[0], torch.stack(shown).median(0).values)
