@@ -130,13 +130,13 @@ def read_result(path: Path) -> Result | None:
         StorageError: there is something else.
     """
     try:
-        text = path.read_text()
+        content = path.read_bytes()
     except FileNotFoundError:
         return None
     except OSError as error:
         raise StorageError(f"The result {path} cannot be read ({error.strerror}).") from None
     try:
-        return Result(**json.loads(text))
+        return Result(**json.loads(content))
     except (ValueError, TypeError):
         raise StorageError(f"{path} is not a result of an experiment; remove it and run again.") from None
 
