@@ -72,6 +72,7 @@ def test_a_reset_lowers_and_never_raises() -> None:
 
 def test_rounds_come_when_they_are_due() -> None:
     assert [i for i in range(1, 1001) if DensifyConfig(start=500, stop=900).due(i)] == [600, 700, 800, 900]
-    assert not CONFIG.has_reset(2000)
-    assert CONFIG.has_reset(2001)
-    assert not replace(CONFIG, reset_at=None).has_reset(10**6)
+    reset = replace(CONFIG, reset_at=2000)
+    assert not reset.has_reset(2000)
+    assert reset.has_reset(2001)
+    assert not CONFIG.has_reset(10**6)
