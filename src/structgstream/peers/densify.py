@@ -30,8 +30,8 @@ class DensifyConfig:
     max_extent: float = 0.1
     """Share of the extent above which Gaussians are dropped once opacities have been reset."""
     reset_at: int | None = None
-    """The one iteration after which opacities are cut to 0.01; None: never. 3DGS: every 3,000 of 30,000; on a schedule of
-    4,000 it costs held-out quality (docs/peers.md)."""
+    """The one iteration after which opacities are cut to 0.01; None: never. 3DGS does it every 3,000 of 30,000; on a
+    schedule of 4,000 it costs held-out quality (docs/peers.md)."""
     max_gaussians: int = 120_000
     """Of more candidates than there is room for, those with the largest gradients are densified; not in 3DGS."""
 
