@@ -18,6 +18,8 @@ from structgstream.data.wrappers import section
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.evaluate import compared_frames, evaluate, score
 from structgstream.evaluation.facts import start_of
+from structgstream.evaluation.flow import FlowField
+from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
 from structgstream.evaluation.recording import placed
 from structgstream.evaluation.report import as_json
@@ -114,6 +116,13 @@ def in_the_stream(world: World, *, similarity: Similarity, follow: bool) -> Read
         metadata={"capture": "world"},
     )
     return Reader(header, scenes)
+
+
+@pytest.fixture(autouse=True)
+def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The same answers on a machine that has weights of LPIPS."""
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -270,6 +279,66 @@ def test_every_pixel_changed_leaves_no_still_one() -> None:
     scores = score(bright, bright, dark, backend=reference_backend())
     assert (scores.changed_share, scores.psnr_still) == (1.0, None)
     assert scores.psnr_changed == PSNR_OF_EQUALS
+
+
+def test_every_score_over_time_is_wired(world: World) -> None:
+    """A world that moves, followed and not: what changes from frame to frame, and what is said of what is missing."""
+    source = Source(world.rig, world.frames)
+    follows = run(in_the_stream(world, similarity=Similarity(), follow=True), source)
+    stays = run(in_the_stream(world, similarity=Similarity(), follow=False), source)
+    assert follows.mean.flip == follows.mean.temporal_flip == 0.0
+    assert stays.mean.flip is not None
+    assert stays.mean.flip > 0.01
+    assert stays.mean.temporal_flip is not None
+    assert stays.mean.temporal_flip > 0.01
+    assert follows.mean.e_warp is not None
+    assert stays.mean.e_warp is not None
+    assert stays.mean.flicker == 0.0
+    assert follows.mean.flicker == follows.mean.truth_flicker == stays.mean.truth_flicker
+    first = stays.frames[0].mean
+    assert {first.e_warp, first.temporal_flip, first.flicker, first.truth_flicker} == {None}
+    assert first.flip == 0.0
+    missing = follows.stream["not_available"]
+    assert "161 pixels" in missing["ms_ssim"]
+    assert {"ms_ssim", "lpips_alex", "lpips_vgg", "t_lpips"} == set(missing)
+    for name in missing:
+        assert getattr(follows.mean, name) is None
+
+
+def test_exact_flow_takes_the_place_of_the_estimate(world: World) -> None:
+    asked = []
+
+    def nowhere(before: np.ndarray, now: np.ndarray, camera: str, index: int) -> FlowField:
+        asked.append((camera, index, before is not now))
+        height, width, _ = now.shape
+        return FlowField(np.zeros((height, width, 2), np.float32), np.ones((height, width), bool))
+
+    stays: Any = in_the_stream(world, similarity=Similarity(), follow=False)
+    report = run(stays, Source(world.rig, world.frames), flow=nowhere)
+    assert asked == [("cam00", index, True) for index in (1, 2, 3)]
+    assert report.mean.e_warp == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_basic_scores_are_those_of_before(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=False)
+    basic, every = (run(reader, Source(world.rig, world.frames), metrics=which) for which in ("basic", "all"))
+    assert basic.stream["metrics"] == "basic"
+    assert basic.stream["not_available"] == {}
+    assert (basic.mean.psnr, basic.mean.ssim) == (every.mean.psnr, every.mean.ssim)
+    assert basic.mean.flip is basic.mean.e_warp is basic.mean.ms_ssim is None
+
+
+def test_keys_of_the_stream_are_documented(world: World) -> None:
+    report = run(in_the_stream(world, similarity=Similarity(), follow=True), Source(world.rig, world.frames))
+    text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
+    assert not [key for key in as_json(report)["stream"] if f"`{key}`" not in text]
+    assert report.stream["render_fps"] > report.stream["decode_and_render_fps"] > 0
+
+
+def test_pictures_of_different_sizes_are_told() -> None:
+    small, large = np.zeros((8, 9, 3), np.uint8), np.zeros((16, 18, 3), np.uint8)
+    with pytest.raises(CaptureError, match="9x8 pixels .* truth of 18x16"):
+        score(small, large, large, backend=reference_backend())
 
 
 @pytest.mark.parametrize(

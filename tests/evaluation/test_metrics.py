@@ -6,11 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from pytorch_msssim import ms_ssim as their_ms_ssim
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from structgstream.evaluation.metrics import (
     PSNR_OF_EQUALS,
     mean_of_squares,
+    ms_ssim,
     psnr,
     quantised,
     squared_errors,
@@ -86,6 +88,24 @@ def test_every_backend_gives_the_mean_of_the_map(build: Callable[[], Backend]) -
     if build is cpu_backend and native_reason() is not None:
         pytest.skip(str(native_reason()))
     assert ssim(picture, truth, build()) == pytest.approx(float(ssim_map(picture, truth).mean()), abs=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width"), [(176, 208), (161, 171), (181, 200)])
+def test_ms_ssim_agrees_with_pytorch_msssim(height: int, width: int) -> None:
+    picture, truth = pictures(height, width)
+    ours, theirs = ms_ssim(picture, truth), []
+    for dtype in (torch.float32, torch.float64):
+        a, b = (torch.from_numpy(p).permute(2, 0, 1)[None].to(dtype) for p in (picture, truth))
+        theirs.append(float(their_ms_ssim(a, b, data_range=255)))
+    assert theirs[0] < 0.99
+    assert ours == pytest.approx(theirs[1], abs=1e-5)
+
+
+def test_ms_ssim_of_equals_opposites_and_small_pictures() -> None:
+    _, truth = pictures(170, 180)
+    assert ms_ssim(truth, truth) == pytest.approx(1.0)
+    assert ms_ssim(255 - truth, truth) == 0.0  # negative structure counts as none
+    assert ms_ssim(*pictures(160, 200)) is None
 
 
 def test_squared_errors_are_exact() -> None:

@@ -16,6 +16,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import PacketInfo
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import of_cameras
+from structgstream.errors import CaptureError
 from structgstream.evaluation.affine import psnr_affine
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.facts import (
@@ -138,7 +139,17 @@ def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[Packet
 
 
 def score(picture: Picture, truth: Picture, first: Picture, *, backend: Backend, seconds: float = 0.0) -> Scores:
-    """The scores of a rendering against ``truth``; ``first`` is the camera's picture of frame 0."""
+    """The scores of a rendering against ``truth``; ``first`` is the camera's picture of frame 0.
+
+    Raises:
+        CaptureError: the pictures have different sizes.
+    """
+    for other, what in ((truth, "truth"), (first, "truth of frame 0")):
+        if picture.shape != other.shape:
+            raise CaptureError(
+                f"A rendering of {picture.shape[1]}x{picture.shape[0]} pixels cannot be scored against a {what} of "
+                f"{other.shape[1]}x{other.shape[0]}; open the capture at the scale of the reconstruction."
+            )
     errors, changed = squared_errors(picture, truth), changed_pixels(truth, first)
     total, moving = int(errors.sum(dtype=np.int64)), int(np.count_nonzero(changed))
     in_changed = int(np.sum(errors, where=changed, dtype=np.int64))

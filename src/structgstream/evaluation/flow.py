@@ -52,7 +52,7 @@ def dis_flow() -> Flow:
 
     def field(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: str, index: int) -> FlowField:
         earlier, later = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (before, now))
-        # A start of zeros: the search would go on from whatever memory an output without one holds.
+        # calc goes on from the flow that it is given, and writes into it.
         zeros = np.zeros((*earlier.shape, 2), np.float32)
         backward = np.asarray(search.calc(later, earlier, zeros.copy()), np.float32)
         forward = np.asarray(search.calc(earlier, later, zeros), np.float32)

@@ -16,13 +16,15 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's colours, which all common kinds of colour vision tell apart.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#222222")
+DISTANCES = (("flip", "FLIP"), ("lpips_alex", "LPIPS, AlexNet"), ("lpips_vgg", "LPIPS, VGG16"))
+FLICKER = (("flicker", "rendering"), ("truth_flicker", "truth"))
 INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
 
 def write_plots(path: Path, report: Report, *, title: str) -> None:
-    """Panels over the frame number: PSNR by camera, bytes by field, counts, and seconds by stage.
+    """Panels over the frame number: PSNR by camera, distances, flicker, bytes by field, counts, and seconds by stage.
 
-    The last one is there when the trainer's log was.
+    The last one is there when the trainer's log was; distances (FLIP, LPIPS) and flicker when they were measured.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -32,7 +34,11 @@ def write_plots(path: Path, report: Report, *, title: str) -> None:
         from matplotlib.figure import Figure
     except ImportError:
         raise MissingExtraError("matplotlib", "report") from None
-    panels: list[Callable[[Axes, Report], None]] = [_quality, _bytes, _counts]
+    panels: list[Callable[[Axes, Report], None]] = [_quality]
+    for panel, lines in ((_distances, DISTANCES), (_flicker, FLICKER)):
+        if any(_known(report, key) for key, _ in lines):
+            panels.append(panel)
+    panels += [_bytes, _counts]
     if any(_stages(frame) for frame in report.frames):
         panels.append(_seconds)
     figure = Figure(figsize=(10, 2.6 * len(panels) + 0.6), dpi=110, facecolor="white", layout="constrained")
@@ -66,10 +72,33 @@ def _quality(axis: "Axes", report: Report) -> None:
         )
     if len(report.cameras) > 1:
         axis.plot(index, [frame.mean.psnr for frame in report.frames], color=INK, linewidth=2, label="mean")
-    changed = [(frame.index, frame.mean.psnr_changed) for frame in report.frames if frame.mean.psnr_changed is not None]
-    if changed:
+    if changed := _known(report, "psnr_changed"):
         axis.plot(*zip(*changed), color=INK, linewidth=1, linestyle=":", label="changed pixels")
     axis.set_ylabel("PSNR, dB", fontsize=9)
+
+
+def _distances(axis: "Axes", report: Report) -> None:
+    _lines(axis, report, DISTANCES)
+    axis.set_ylabel("distance", fontsize=9)
+
+
+def _flicker(axis: "Axes", report: Report) -> None:
+    _lines(axis, report, FLICKER)
+    axis.set_ylabel("flicker, levels", fontsize=9)
+
+
+def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> None:
+    """The mean over cameras of scores that are 0 at best, each in its colour, whether or not the others are there."""
+    for colour, (key, label) in zip(COLOURS, keys):
+        if points := _known(report, key):
+            axis.plot(*zip(*points), color=colour, linewidth=1.5, label=label)
+    axis.set_ylim(bottom=0)
+
+
+def _known(report: Report, key: str) -> list[tuple[int, float]]:
+    """Frame number and mean of a score, where there is one."""
+    values = [(frame.index, getattr(frame.mean, key)) for frame in report.frames]
+    return [(index, value) for index, value in values if value is not None]
 
 
 def _bytes(axis: "Axes", report: Report) -> None:

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores over time in closed form, and with the exact flow of a synthetic capture."""
+
+import numpy as np
+import pytest
+import torch
+
+from rigs import look_at
+from structgstream.cameras import Camera
+from structgstream.evaluation.flow import FlowField, dis_flow, inside
+from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
+
+WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 80.0, 4.0
+
+
+def noise(seed: int = 0, height: int = 12, width: int = 16) -> np.ndarray:
+    return np.random.default_rng(seed).integers(20, 200, (height, width, 3)).astype(np.uint8)
+
+
+def field(dx: float, dy: float, height: int = 12, width: int = 16) -> FlowField:
+    offsets = np.broadcast_to(np.array([dx, dy], np.float32), (height, width, 2)).copy()
+    return FlowField(offsets, inside(offsets))
+
+
+def test_a_picture_that_moves_with_its_flow_has_no_error() -> None:
+    before = noise()
+    now = np.roll(before, (1, 3), (0, 1))
+    assert warping_error(now, before, field(-3, -1)) == pytest.approx(0.0, abs=1e-10)
+    assert warping_error(now, before, field(0, 0)) > 1e-2
+
+
+def test_a_change_of_brightness_is_its_square() -> None:
+    before = noise()
+    assert warping_error(before + np.uint8(20), before, field(0, 0)) == pytest.approx((20 / 255) ** 2, rel=1e-6)
+
+
+def test_only_seen_pixels_count() -> None:
+    before, now = noise(), noise()
+    now[3, 4] = 255 - now[3, 4]
+    still = field(0, 0)
+    assert warping_error(now, before, still) > 0
+    still.seen[3, 4] = False
+    assert warping_error(now, before, still) == pytest.approx(0.0, abs=1e-10)
+    still.seen[:] = False
+    assert warping_error(now, before, still) is None
+
+
+def wall(time: float) -> tuple[np.ndarray, FlowField]:
+    """A painted wall that slides right and away from a camera, and the exact flow to it from the time before."""
+
+    def depth(t: float) -> float:
+        return DISTANCE * (1 + 0.05 * t)
+
+    def on_the_wall(t: float) -> tuple[np.ndarray, np.ndarray]:
+        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        return (x - WIDTH / 2) * depth(t) / FOCAL - 0.1 * t, (y - HEIGHT / 2) * depth(t) / FOCAL
+
+    u, v = on_the_wall(time)
+    paint = [127 + 90 * np.sin(3 * u + phase) * np.cos(4 * v - phase) for phase in (0.0, 1.0, 2.0)]
+    before = np.stack(
+        [(u + 0.1 * (time - 1)) * FOCAL / depth(time - 1) + WIDTH / 2, v * FOCAL / depth(time - 1) + HEIGHT / 2], 2
+    )
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    offsets = (before - np.stack([x, y], 2)).astype(np.float32)
+    return np.rint(np.stack(paint, 2)).astype(np.uint8), FlowField(offsets, inside(offsets))
+
+
+def test_exact_flow_of_a_synthetic_capture_leaves_what_sampling_loses() -> None:
+    before, _ = wall(0)
+    now, exact = wall(1)
+    error = warping_error(now, before, exact)
+    assert error is not None
+    assert error < 1e-4  # bilinear sampling of waves 80 pixels long, and rounding
+    nothing = FlowField(np.zeros_like(exact.offsets), exact.seen)
+    assert warping_error(now, before, nothing) > 50 * error
+    estimated = dis_flow()(before, now, "cam", 1)
+    both = estimated.seen & exact.seen
+    assert np.median(np.linalg.norm(estimated.offsets - exact.offsets, axis=2)[both]) < 0.3
+
+
+def test_the_walls_camera_is_the_packages() -> None:
+    """The closed form of the wall is the projection of :class:`Camera`."""
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).double()
+    eye, target = torch.tensor([0.0, 0, -DISTANCE]).double(), torch.zeros(3).double()
+    camera = Camera(look_at(eye, target), K, WIDTH, HEIGHT, near=0.1)
+    seen = camera.K @ (camera.viewmat[:3, :3] @ torch.tensor([0.1, 0.2, 0.0]).double() + camera.viewmat[:3, 3])
+    expected = torch.tensor([0.1 * FOCAL / DISTANCE + WIDTH / 2, 0.2 * FOCAL / DISTANCE + HEIGHT / 2]).double()
+    torch.testing.assert_close(seen[:2] / seen[2], expected)
+
+
+def test_flicker_is_the_mean_change_of_still_pixels_in_levels() -> None:
+    before = noise()
+    now, still = before.copy(), np.ones(before.shape[:2], bool)
+    now[:6] += 4
+    assert flicker(now, before, still) == pytest.approx(2.0)
+    still[:6] = False
+    assert flicker(now, before, still) == 0.0
+    still[:] = False
+    assert flicker(now, before, still) is None
+
+
+def test_too_much_and_too_little_change_are_both_wrong() -> None:
+    assert difference_of_change(0.3, 0.1) == pytest.approx(0.2)
+    assert difference_of_change(0.0, 0.1) == pytest.approx(0.1)
