@@ -10,7 +10,7 @@ from captures import all_numbers, numbers, write_clip, write_panoptic
 from structgstream.data.json_videos import open_json_videos
 from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig, of_cameras, resized, section
+from structgstream.data.wrappers import WithRig, of_cameras, resized, section, thinned
 from structgstream.errors import CaptureError, ConfigError
 
 
@@ -102,3 +102,23 @@ def test_a_source_of_another_kind_keeps_its_cameras(source: FrameSource) -> None
 
     other: Any = Other()
     assert of_cameras(other, (*source.rig,)[:2]) is other
+
+
+def test_every_third_frame_counts_and_times_from_zero(source: FrameSource) -> None:
+    few = thinned(source, 3)
+    assert len(few) == 2
+    assert all_numbers(few.frames()) == [all_numbers(source.frames())[i] for i in (0, 3)]
+    assert [(frame.index, frame.pts_seconds) for frame in few.frames()] == [(0, 0.0), (1, 1 / source.fps)]
+    assert [frame.index for frame in few.frames(1)] == [1]
+    assert all_numbers(few.frames(1)) == [all_numbers(source.frames())[3]]
+    assert list(few.frames(2)) == []
+
+
+def test_steps_of_a_thinned_capture(source: FrameSource) -> None:
+    assert thinned(source, 1) is source
+    assert [len(thinned(source, step)) for step in (2, 4, 5, 6, 7)] == [3, 2, 2, 1, 1]
+    part = thinned(section(source, start=1, frames=5), 4)
+    assert all_numbers(part.frames()) == [all_numbers(source.frames())[i] for i in (1, 5)]
+    for step in (0, -1):
+        with pytest.raises(ConfigError, match="steps of 1"):
+            thinned(source, step)

@@ -64,6 +64,7 @@ def capture_facts(part: CapturePart, source: "FrameSource") -> dict[str, Any]:
         "start": part.start,
         "every": part.every,
         "scale": part.scale,
+        "near": part.near,
         "fps": source.fps,
         "sizes": [list(size) for size in sizes],
         "training_cameras": len(source.rig.training),

@@ -23,7 +23,7 @@ from structgstream.experiments.sheets import ablation_sheet, comparison_sheet, m
 from structgstream.experiments.studies import COMPARED, method_key, method_titles, variant_titles
 from structgstream.experiments.variants import TABLES
 
-MARKED = re.compile(r"<!-- (?P<what>[a-z-]+)(?P<rest>(?: [\w.-]+)*) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
+MARKED = re.compile(r"<!-- (?P<what>[a-z-]+)(?P<rest>(?: [\w.-]+)*) -->\n(?:(?!<!-- ).)*<!-- end -->", re.DOTALL)
 
 
 def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
@@ -62,7 +62,7 @@ def refreshed(text: str, results: Sequence[Result]) -> str:
     """``text`` with every marked part made from ``results``.
 
     Raises:
-        ConfigError: a marker asks for something that is not known.
+        ConfigError: a marker asks for something that is not known, or has no end.
     """
 
     def renewed(match: re.Match[str]) -> str:
@@ -71,7 +71,13 @@ def refreshed(text: str, results: Sequence[Result]) -> str:
             raise ConfigError(f"A document asks for {match['what']}{match['rest']}; known are {', '.join(_MAKERS)}.")
         return f"<!-- {what}{match['rest']} -->\n{_MAKERS[what][1](rest, results)}<!-- end -->"
 
-    return MARKED.sub(renewed, text)
+    new = MARKED.sub(renewed, text)
+    begun = sum(len(re.findall(f"<!-- {what} .*-->", text)) for what in _MAKERS)
+    if begun > len(MARKED.findall(text)):
+        raise ConfigError(
+            "A document begins a table that it does not end; put <!-- end --> on a line of its own below."
+        )
+    return new
 
 
 def _ablation(words: Sequence[str], results: Sequence[Result]) -> str:

@@ -55,7 +55,7 @@ class PeerRun:
 
     def done(self) -> bool:
         """Whether there is a result for this very question."""
-        return answers(self.result, self._asked(), self.capture)
+        return answers(self.result, self._asked(), self.capture, frames=self.frames)
 
     def _asked(self) -> dict[str, Any]:
         from structgstream.peers.methods import METHODS

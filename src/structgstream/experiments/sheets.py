@@ -112,7 +112,8 @@ def _without_empty_columns(sheet: Sheet) -> Sheet:
 
 
 def _line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    # A bar inside a cell would begin another one.
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def written(value: Spread | None, name: str, *, signed: bool = False) -> str:

@@ -131,7 +131,7 @@ class Variation:
 
     def done(self) -> bool:
         """Whether there is a result for this very question."""
-        return answers(self.result, self._asked(), self.capture)
+        return answers(self.result, self._asked(), self.capture, frames=self.frames)
 
     def _begun(self) -> bool:
         from structgstream.evaluation.run_log import read_log
@@ -153,18 +153,18 @@ class Variation:
         return open_stream(self.stream)
 
 
-def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart) -> bool:
-    """Whether a result is there and is the answer to this very question, on the part of the capture that is asked."""
+def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart, *, frames: int) -> bool:
+    """Whether a result is there and is the answer to this very question, on these ``frames`` of the capture."""
     found = read_result(result)
     if found is None:
         return False
     identity = dict(found.identity)
     of = identity.pop("capture")
-    frames = capture.frames is None or of["frames"] == -(-capture.frames // capture.every)
-    part = (of["start"], of["scale"], of["every"]) == (capture.start, capture.scale, capture.every)
-    split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
-    cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
-    return identity == rounded(asked) and frames and part and split and cameras
+    part = (of["start"], of["scale"], of["every"], of.get("near"), of["frames"])
+    same_part = part == (capture.start, rounded(capture.scale), capture.every, rounded(capture.near), frames)
+    same_split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
+    same_cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
+    return identity == rounded(asked) and same_part and same_split and same_cameras
 
 
 def scored(
