@@ -69,6 +69,25 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.Ca
     assert max(len(line) for line in table.splitlines() if str(folder) not in line) <= 80
 
 
+def test_evaluate_says_what_it_could_not_measure(
+    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STRUCTGSTREAM_LPIPS_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    evaluate = ["evaluate", str(stream), CLIP, "--device", "reference"]
+    assert main(evaluate) == 0
+    table = " ".join(capsys.readouterr().out.split())
+    assert "lpips_alex, t_lpips: the weights of AlexNet were not found" in table
+    assert "ms_ssim: pictures need 161 pixels a side" in table
+    assert "tFLIP" in table
+    assert main([*evaluate, "--metrics", "basic"]) == 0
+    table = capsys.readouterr().out
+    assert "tFLIP" not in table
+    assert "not available" not in table
+    nowhere = [*evaluate, "--lpips-weights", str(tmp_path / "none")]
+    assert "none, where the path given has the weights" in error_of(nowhere, capsys, status=1)
+
+
 def test_inspect_lists_header_and_packets(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", str(stream), "--json", str(tmp_path / "i.json")]) == 0
     content = json.loads((tmp_path / "i.json").read_text())
