@@ -51,6 +51,7 @@ TINY_METHODS: Mapping[str, AnyMethod] = {
                 grid=GridConfig(levels=4, log2_rows=10, base=4, hidden=16),
                 warm_up=WarmUpConfig(iterations=300, rate=2e-3, batch=128, batches=4),
                 iterations=30,
+                shift_scale=1.0,
                 collect_from=20,
                 additions=AdditionsConfig(iterations=10, interval=5),
             )

@@ -51,8 +51,9 @@ class ThreeDGStreamConfig:
     rate: float = 2e-3
     eps: float = 1e-8
     """Adam's, as torch has it: the published code sets none."""
-    shift_scale: float = 1.0
-    """Scene units of a shift of one; the published network's shifts are in the capture's units."""
+    shift_scale: float = 0.1
+    """Scene units of a shift of one. The published network's shifts are in the units of its captures, whose boxes are
+    some twenty units wide; here they are about two (docs/peers.md)."""
     collect_from: int = 130
     """View-space gradients are collected after this iteration."""
     additions: AdditionsConfig = field(default_factory=AdditionsConfig)
