@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import MissingExtraError
-from structgstream.evaluation.masks import changed_pixels
 from structgstream.evaluation.plots import COLOURS, FAINT, INK
 from structgstream.experiments.results import Result
 from structgstream.experiments.sheets import SCORES
@@ -74,20 +73,19 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
     _save(figure, path)
 
 
-def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, first: Picture, *, title: str) -> None:
-    """The part of a picture that changed most since frame 0, as each variant shows it and as it was, magnified.
+def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *, title: str) -> None:
+    """The part of a picture in which the variants differ most, as each shows it and as it was, magnified.
 
     Args:
         path: the PNG.
         pictures: rendering ``[H, W, 3]`` by title.
         truth: what the camera took.
-        first: what it took in frame 0.
         title: a line above.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    top, left, height, width = busiest(changed_pixels(truth, first))
+    top, left, height, width = busiest(disagreement([*pictures.values(), truth]))
     cells = {**pictures, "ground truth": truth}
     columns = min(len(cells), 4)
     rows = -(-len(cells) // columns)
@@ -102,10 +100,16 @@ def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, f
     _save(figure, path)
 
 
-def busiest(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
-    """Top, left, height and width of the detail of ``mask`` ``[H, W]`` with the most of it."""
-    height, width = mask.shape[0] // CROP_SHARE, mask.shape[1] // CROP_SHARE
-    total = np.pad(mask.cumsum(0, dtype=np.int64).cumsum(1), ((1, 0), (1, 0)))
+def disagreement(pictures: Sequence[Picture]) -> NDArray[np.int64]:
+    """How far the pictures ``[H, W, 3]`` are apart in each pixel, ``[H, W]``: the range, summed over channels."""
+    stack = np.stack(pictures).astype(np.int64)
+    return (stack.max(0) - stack.min(0)).sum(-1)
+
+
+def busiest(weights: NDArray[np.int64]) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the detail of ``weights`` ``[H, W]`` with the largest sum."""
+    height, width = weights.shape[0] // CROP_SHARE, weights.shape[1] // CROP_SHARE
+    total = np.pad(weights.cumsum(0, dtype=np.int64).cumsum(1), ((1, 0), (1, 0)))
     inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
     top, left = np.unravel_index(int(inside.argmax()), inside.shape)
     return int(top), int(left), height, width

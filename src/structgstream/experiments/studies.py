@@ -177,28 +177,28 @@ def _write_sheet(path: Path, sheet: Sheet) -> None:
 def _write_details(
     path: Path, runs: Sequence[Variation | PeerRun], *, titles: Mapping[str, str], backend: "Backend"
 ) -> None:
-    """Each run's picture of the frame and the held-out camera in which most has changed, all of one seed."""
+    """Each run's picture, at the first held-out camera, of the frame in which the runs of one seed differ most."""
     from structgstream.data.wrappers import of_cameras
     from structgstream.evaluation.evaluate import rendered
 
-    done = [run for run in runs if run.result.exists()]
-    done = [run for run in done if run.seed == done[0].seed]
-    # Some methods show every so many-th frame only: one that all of them have.
-    source = replace(done[0].capture, every=1).open()
+    results = {run: found for run in runs if (found := read_result(run.result)) is not None}
+    seed = next(iter(results)).seed
+    results = {run: found for run, found in results.items() if run.seed == seed}
+    source = replace(next(iter(results)).capture, every=1).open()
     camera = source.rig.testing[0]
-    every = max(run.capture.every for run in done)
-    index = max(range(0, len(source), every), key=lambda i: _changed_share(done[0], i // done[0].capture.every))
-    alone = of_cameras(source, (camera,))
-    truth, first = (next(alone.frames(i)).images[camera] for i in (index, 0))
+    # Some methods show every so many-th frame only: one that all of them have.
+    every = max(run.capture.every for run in results)
+
+    def spread(index: int) -> float:
+        values = [found.frames[index // run.capture.every]["psnr"] for run, found in results.items()]
+        return max(values) - min(values)
+
+    index = max(range(0, len(source), every), key=spread)
+    truth = next(of_cameras(source, (camera,)).frames(index)).images[camera]
     pictures: dict[str, Picture] = {}
-    for run in done:
+    for run in results:
         recording = run.recording()
         view = recording.header.similarity.camera(recording.header.rig[camera])
         _, scene = next(iter(recording.scenes(index // run.capture.every)))
         pictures[titles[run.key]] = rendered(scene, view, backend)[0]
-    write_details(path, pictures, truth, first, title=f"{source.name}, camera {camera}, frame {index}")
-
-
-def _changed_share(run: Variation | PeerRun, index: int) -> float:
-    found = read_result(run.result)
-    return 0.0 if found is None else found.frames[index]["changed_share"]
+    write_details(path, pictures, truth, title=f"{source.name}, camera {camera}, frame {index}")
