@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes plain Gaussians of a scene whose Gaussians depend on the camera.
+
+Note [Baking]
+~~~~~~~~~~~~~
+Opacity, shape and colour of a structured Gaussian are what the MLPs say for one camera; its mean is the same for all.
+A plain Gaussian has one opacity and one shape. They are averages over the training cameras, in which Gaussians are
+matched by id, and the colour is a least-squares fit of spherical harmonics to the colours that these cameras see.
+A ridge pulls all but the constant coefficient to zero: a dozen cameras on one side say little about the others.
+What was chosen among the values of :class:`Baking`, and by which measurement, is in ``docs/export.md``.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.errors import StreamError
+from structgstream.export.baked import BakedGaussians, sh_basis
+from structgstream.gaussians import Gaussians
+from structgstream.geometry import quaternion_matrices
+from structgstream.kernels.backend import Backend
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+
+LEAST_OPACITY = 1.0 / 255.0
+"""What a rasteriser no longer draws."""
+
+
+@dataclass(frozen=True)
+class Baking:
+    """How a scene becomes plain Gaussians.
+
+    Args:
+        degree: of the spherical harmonics, 0 to 2.
+        ridge: weight of the squares of all coefficients but the constant one, against a mean of squared errors.
+        opacity: ``seen`` averages over the cameras that see the anchor, those that do not draw the Gaussian counting
+            as 0; ``drawn`` over those that draw it.
+        shape: ``parts`` averages logarithms of scales, and quaternions of one sign; ``covariance`` covariances.
+        weight: what a camera counts in colour and shape: the Gaussian's ``opacity`` there, or its ``blend`` weight,
+            summed over the picture, which is less behind others.
+    """
+
+    degree: int = 1
+    ridge: float = 0.01
+    opacity: Literal["seen", "drawn"] = "seen"
+    shape: Literal["parts", "covariance"] = "parts"
+    weight: Literal["opacity", "blend"] = "opacity"
+
+
+def baked(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: Baking | None = None) -> BakedGaussians:
+    """Plain Gaussians that look from ``cameras``, and between them, like ``scene`` (Note [Baking]).
+
+    Args:
+        scene: on the device of ``backend``.
+        cameras: in the scene's units; the training cameras of a stream.
+        backend: what computes.
+        baking: how; the measured choice when None.
+
+    Returns:
+        In the scene's units, in the order of ids, without those that nothing shows of.
+
+    Raises:
+        StreamError: no camera draws any Gaussian.
+    """
+    baking = baking or Baking()
+    anchors = scene.anchors
+    sums = _Sums(anchors.offsets.shape[0] * anchors.offsets_per_anchor + len(scene.free), anchors.positions, baking)
+    with torch.no_grad():
+        for camera in cameras:
+            generated, visible = scene.structured(camera, backend)
+            slots = visible[:, None] * anchors.offsets_per_anchor
+            slots = (slots + torch.arange(anchors.offsets_per_anchor, device=slots.device)).flatten()
+            free = torch.arange(sums.seen.shape[0] - len(scene.free), sums.seen.shape[0], device=slots.device)
+            sums.add(scene.dressed(generated), camera, backend, seen=torch.cat([slots, free]))
+        return sums.result()
+
+
+def blend_weights(gaussians: Gaussians, camera: Camera, backend: Backend) -> Tensor:
+    """How much each Gaussian gives to the picture, ``[N]`` in pixels: the gradient of its sum by the colours."""
+    colors = torch.zeros_like(gaussians.colors, requires_grad=True)
+    shown = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.ids)
+    with torch.enable_grad():
+        image = draw(shown, camera, backend).image[..., 0]
+        (gradient,) = torch.autograd.grad(image.sum(), colors)
+    return gradient[:, 0]
+
+
+class _Sums:
+    """Sums over cameras, one row for each id."""
+
+    def __init__(self, count: int, like: Tensor, baking: Baking) -> None:
+        terms = (baking.degree + 1) ** 2
+        self.baking = baking
+        self.means, self.weight = like.new_zeros(count, 3), like.new_zeros(count)
+        self.seen, self.drawn, self.opacity = like.new_zeros(count), like.new_zeros(count), like.new_zeros(count)
+        self.log_scales, self.quats = like.new_zeros(count, 3), like.new_zeros(count, 4)
+        self.covariance = like.new_zeros(count, 3, 3) if baking.shape == "covariance" else None
+        self.normal, self.right = like.new_zeros(count, terms, terms), like.new_zeros(count, terms, 3)
+
+    def add(self, gaussians: Gaussians, camera: Camera, backend: Backend, *, seen: Tensor) -> None:
+        """One camera's Gaussians; ``seen`` are the ids of all that its visible anchors have."""
+        ids = gaussians.ids
+        self.seen[seen] += 1.0
+        self.drawn[ids] += 1.0
+        self.opacity[ids] += gaussians.opacities
+        self.means[ids] = gaussians.means
+        weight = gaussians.opacities
+        if self.baking.weight == "blend":
+            # What is hidden everywhere still needs a shape and a colour.
+            weight = blend_weights(gaussians, camera, backend) + 1e-3 * weight
+        self.weight[ids] += weight
+        self._add_shapes(gaussians, weight)
+        center = camera.beside(gaussians.means).center
+        basis = sh_basis(torch.nn.functional.normalize(gaussians.means - center, dim=1), self.baking.degree)
+        weighted = basis * weight[:, None]
+        self.normal[ids] += weighted[:, :, None] * basis[:, None, :]
+        self.right[ids] += weighted[:, :, None] * (gaussians.colors - 0.5)[:, None, :]
+
+    def _add_shapes(self, gaussians: Gaussians, weight: Tensor) -> None:
+        ids = gaussians.ids
+        quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
+        if self.covariance is not None:
+            axes = quaternion_matrices(quats) * gaussians.scales[:, None, :]
+            self.covariance[ids] += weight[:, None, None] * (axes @ axes.transpose(1, 2))
+            return
+        self.log_scales[ids] += weight[:, None] * gaussians.scales.log()
+        before = self.quats[ids]
+        # A quaternion and its negative are one rotation: each is turned to the side of the sum so far.
+        side = torch.where((before * quats).sum(1, keepdim=True) < 0.0, -1.0, 1.0)
+        self.quats[ids] = before + weight[:, None] * side * quats
+
+    def result(self) -> BakedGaussians:
+        """The averages and the fit."""
+        counted = self.seen if self.baking.opacity == "seen" else self.drawn
+        opacities = self.opacity / counted.clamp(min=1.0)
+        rows = torch.nonzero((self.drawn > 0) & (self.weight > 0) & (opacities >= LEAST_OPACITY))[:, 0]
+        if not len(rows):
+            raise StreamError("No training camera sees any Gaussian of the scene, so there is nothing to export.")
+        weight = self.weight[rows]
+        quats, scales = self._shapes(rows)
+        return BakedGaussians(
+            means=self.means[rows],
+            quats=torch.where(quats[:, :1] < 0.0, -quats, quats),
+            scales=scales,
+            opacities=opacities[rows],
+            sh=self._coefficients(rows, weight),
+        )
+
+    def _shapes(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        weight = self.weight[rows, None]
+        if self.covariance is None:
+            return torch.nn.functional.normalize(self.quats[rows], dim=1), (self.log_scales[rows] / weight).exp()
+        variances, axes = torch.linalg.eigh((self.covariance[rows] / weight[..., None]).double())
+        axes = axes * torch.linalg.det(axes)[:, None, None]  # a rotation, not a mirror: three axes change sign
+        return matrix_quaternions(axes).to(weight.dtype), variances.clamp(min=1e-14).sqrt().to(weight.dtype)
+
+    def _coefficients(self, rows: Tensor, weight: Tensor) -> Tensor:
+        terms = self.normal.shape[1]
+        penalty = torch.full((terms,), self.baking.ridge, dtype=torch.float64, device=weight.device)
+        penalty[0] = 0.0
+        normal = self.normal[rows].double() / weight[:, None, None].double() + torch.diag(penalty)
+        right = self.right[rows].double() / weight[:, None, None].double()
+        return torch.linalg.solve(normal, right).to(weight.dtype)
+
+
+def matrix_quaternions(matrices: Tensor) -> Tensor:
+    """Unit quaternions ``[N, 4]`` wxyz of rotation matrices ``[N, 3, 3]``, from the largest of four pivots."""
+    m = matrices
+    diagonal = m.diagonal(dim1=1, dim2=2)
+    x, y, z = diagonal.unbind(1)
+    squares = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], dim=1)
+    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    xy, xz, yz = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
+    products = torch.stack(
+        [
+            torch.stack([squares[:, 0], wx, wy, wz], dim=1),
+            torch.stack([wx, squares[:, 1], xy, xz], dim=1),
+            torch.stack([wy, xy, squares[:, 2], yz], dim=1),
+            torch.stack([wz, xz, yz, squares[:, 3]], dim=1),
+        ],
+        dim=1,
+    )
+    best = squares.argmax(1)
+    return torch.nn.functional.normalize(products[torch.arange(len(m), device=m.device), best], dim=1)

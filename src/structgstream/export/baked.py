@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plain Gaussians, as files of 3D Gaussian splatting hold them: one shape, one opacity, colours by direction.
+
+Note [Spherical harmonics]
+~~~~~~~~~~~~~~~~~~~~~~~~~~
+A colour is ``0.5 + sum Y_i c_i``, from below cut off at 0. ``Y`` are the real spherical harmonics with the
+Condon-Shortley phase of the unit direction from the camera to the Gaussian's mean, order by order, each from ``-m`` to
+``m``: what 3D Gaussian splatting (Kerbl et al. 2023) writes to its files and every viewer of them evaluates.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend
+from structgstream.similarity import Similarity
+
+Y0 = 0.5 / math.sqrt(math.pi)
+MAX_DEGREE = 2
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics ``[N, (degree + 1)^2]`` of unit ``directions`` ``[N, 3]`` up to ``degree`` <= 2."""
+    x, y, z = directions.unbind(1)
+    found = [torch.full_like(x, Y0)]
+    if degree >= 1:
+        a = math.sqrt(3.0 / (4.0 * math.pi))
+        found += [-a * y, a * z, -a * x]
+    if degree >= 2:
+        a, b = math.sqrt(15.0 / (4.0 * math.pi)), math.sqrt(5.0 / (16.0 * math.pi))
+        found += [a * x * y, -a * y * z, b * (3.0 * z * z - 1.0), -a * x * z, 0.5 * a * (x * x - y * y)]
+    return torch.stack(found, dim=1)
+
+
+@dataclass(frozen=True)
+class BakedGaussians:
+    """``N`` Gaussians that no longer depend on the camera, but for their colour.
+
+    Args:
+        means: ``[N, 3]``.
+        quats: ``[N, 4]`` wxyz, unit length, ``w`` not negative.
+        scales: ``[N, 3]`` standard deviations, in the unit of ``means``.
+        opacities: ``[N]`` in (0, 1).
+        sh: ``[N, (degree + 1)^2, 3]`` sRGB coefficients (Note [Spherical harmonics]).
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    def select(self, rows: Tensor) -> "BakedGaussians":
+        """The rows that a mask ``[N]`` or an index ``[n]`` names, in its order."""
+        return BakedGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def to(self, device: torch.device) -> "BakedGaussians":
+        """The same on ``device``."""
+        return BakedGaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def colors(self, center: Tensor) -> Tensor:
+        """sRGB colours ``[N, 3]`` seen from ``center`` ``[3]``."""
+        basis = sh_basis(torch.nn.functional.normalize(self.means - center, dim=1), self.degree)
+        return (0.5 + torch.einsum("ns,nsc->nc", basis, self.sh)).clamp(min=0.0)
+
+    def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
+        """What ``camera`` sees. The back-end is not needed: it is part of what a drawable is."""
+        return Gaussians(
+            means=self.means,
+            quats=self.quats,
+            scales=self.scales,
+            opacities=self.opacities,
+            colors=self.colors(camera.beside(self.means).center),
+            ids=torch.arange(len(self), device=self.means.device),
+        )
+
+    def in_capture_units(self, similarity: Similarity) -> "BakedGaussians":
+        """The same in the units and at the place of the capture; a similarity has no rotation, so axes stay."""
+        means = similarity.inverse_points(self.means.cpu().double()).to(self.means)
+        return replace(self, means=means, scales=self.scales / similarity.scale)
