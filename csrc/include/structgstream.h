@@ -82,6 +82,16 @@ void sgs_adam_step(
     float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,
     double lr, int64_t step, double beta1, double beta2, double eps, int threads);
 
+/* Interleaved rANS (docs/entropy.md). symbols [count], contexts [count] rows of frequencies [context_count, alphabet];
+ * lanes is 1, 4 or 32; states [lanes]; words has room for `count` (encode). Return 0; 1 where memory does not suffice;
+ * 2 where states and words contradict each other (decode); 3 where symbols, contexts or frequencies do not fit. */
+int sgs_rans_encode(
+    const uint8_t* symbols, const uint16_t* contexts, int64_t count, const uint16_t* frequencies, int64_t context_count,
+    int alphabet, int lanes, uint32_t* states, uint16_t* words, int64_t* word_count);
+int sgs_rans_decode(
+    const uint16_t* words, int64_t word_count, const uint32_t* states, int lanes, const uint16_t* contexts,
+    int64_t count, const uint16_t* frequencies, int64_t context_count, int alphabet, uint8_t* symbols);
+
 #ifdef __cplusplus
 }
 #endif

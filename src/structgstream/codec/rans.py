@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections of entropy-coded symbols: framing, bounds, and the choice between C++ and NumPy (docs/entropy.md)."""
+
+import ctypes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.codec.reference_rans import decode_lanes, encode_lanes
+from structgstream.codec.tables import FrequencyTables
+from structgstream.errors import StreamError
+from structgstream.kernels._load import native_library, native_reason
+
+MAX_SYMBOLS = 2**31 - 1
+FOUR_LANES_FROM = 1 << 13
+MANY_LANES_FROM = 1 << 17
+_NO_MEMORY = 1
+
+
+def lanes_of(count: int) -> int:
+    """How many lanes a section of ``count`` symbols has: 1, 4 from 2^13 on, 32 from 2^17 on, none without symbols."""
+    return 0 if count == 0 else 1 if count < FOUR_LANES_FROM else 4 if count < MANY_LANES_FROM else 32
+
+
+def has_native() -> bool:
+    """Whether the native library is there and has this coder."""
+    return native_reason() is None and hasattr(native_library(), "sgs_rans_decode")
+
+
+def encode(
+    symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables, *, native: bool | None = None
+) -> bytes:
+    """A section: number of symbols, number of words, states, words.
+
+    Args:
+        symbols: u8 ``[n]``, each below A and with a frequency of 1 or more in its context.
+        contexts: u16 ``[n]``, each below C.
+        tables: what both sides have.
+        native: C++ or NumPy, which give the same bytes; None takes C++ where it is.
+
+    Raises:
+        StreamError: symbols, contexts and tables do not fit each other.
+    """
+    contexts = _checked_contexts(contexts, tables)
+    symbols = np.ascontiguousarray(symbols, np.uint8)
+    if symbols.shape != contexts.shape:
+        raise StreamError(f"{symbols.shape} symbols cannot be coded with {contexts.shape} contexts; give one for each.")
+    if (symbols >= tables.alphabet).any() or not tables.rows[contexts, symbols].all():
+        raise StreamError("A symbol to encode has no frequency in its context; count it before making the tables.")
+    lanes = lanes_of(len(symbols))
+    if not lanes:
+        return _varint(0) + _varint(0)
+    code = _native_encode if _takes_native(native) else encode_lanes
+    states, words = code(symbols, contexts, tables, lanes=lanes)
+    return b"".join(
+        (_varint(len(symbols)), _varint(len(words)), states.astype("<u4").tobytes(), words.astype("<u2").tobytes())
+    )
+
+
+def decode(
+    data: bytes | memoryview,
+    contexts: NDArray[np.uint16],
+    tables: FrequencyTables,
+    *,
+    where: str = "A section of symbols",
+    native: bool | None = None,
+) -> NDArray[np.uint8]:
+    """The symbols u8 ``[n]`` of a section that fills ``data``.
+
+    Args:
+        data: what :func:`encode` gave.
+        contexts: u16 ``[n]``, as in encoding; their number is what the section must state.
+        tables: as in encoding.
+        where: subject of error messages.
+        native: as in :func:`encode`.
+
+    Raises:
+        StreamError: the section is damaged, or has not this number of symbols.
+    """
+    contexts = _checked_contexts(contexts, tables)
+    count, word_count, start = _counts(data, where=where)
+    if count != len(contexts):
+        raise StreamError(f"{where} states {count} symbols, {len(contexts)} are expected; it is damaged.")
+    lanes = lanes_of(count)
+    if start + 4 * lanes + 2 * word_count != len(data):
+        raise StreamError(f"{where} has {len(data)} bytes, but states {word_count} words; it is damaged.")
+    if not lanes:
+        return np.empty(0, np.uint8)
+    states = np.frombuffer(data, "<u4", lanes, start).astype(np.uint32)
+    words = np.frombuffer(data, "<u2", word_count, start + 4 * lanes).astype(np.uint16)
+    code = _native_decode if _takes_native(native) else decode_lanes
+    if (symbols := code(words, states, contexts, tables)) is None:
+        raise StreamError(f"{where} is damaged: its words and final states contradict each other.")
+    return symbols
+
+
+def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbols") -> int:
+    """How many bytes the section at the beginning of ``data`` takes; it may be followed by anything.
+
+    Raises:
+        StreamError: the section is longer than the data.
+    """
+    count, word_count, start = _counts(data, where=where)
+    end = start + 4 * lanes_of(count) + 2 * word_count
+    if end > len(data):
+        raise StreamError(f"{where} states {end} bytes, {len(data)} are left; it is damaged.")
+    return end
+
+
+def _counts(data: bytes | memoryview, *, where: str) -> tuple[int, int, int]:
+    """Numbers of symbols and of words, and where the states begin."""
+    count, start = _read_varint(data, 0, where=where)
+    word_count, start = _read_varint(data, start, where=where)
+    # A symbol takes one word at most.
+    if count > MAX_SYMBOLS or word_count > count:
+        raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
+    return count, word_count, start
+
+
+def _varint(value: int) -> bytes:
+    """Seven bits a byte, the lowest first; the high bit says that more follow."""
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _read_varint(data: bytes | memoryview, start: int, *, where: str) -> tuple[int, int]:
+    value = 0
+    for place, byte in enumerate(bytes(data[start : start + 5])):
+        value |= (byte & 0x7F) << 7 * place
+        if byte < 0x80:
+            return value, start + place + 1
+    raise StreamError(f"{where} is cut or damaged in its first bytes.")
+
+
+def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> NDArray[np.uint16]:
+    if contexts.ndim != 1 or len(contexts) > MAX_SYMBOLS or contexts.dtype != np.uint16:
+        raise StreamError(f"Contexts must be uint16 [n], got {contexts.dtype} {contexts.shape}.")
+    if len(contexts) and int(contexts.max()) >= tables.contexts:
+        raise StreamError(f"Context {int(contexts.max())} has no table; there are {tables.contexts}.")
+    return np.ascontiguousarray(contexts)
+
+
+def _takes_native(native: bool | None) -> bool:
+    if native and not has_native():
+        raise StreamError("The installed native library has no entropy coder; install structgstream again.")
+    return has_native() if native is None else native
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _native_encode(
+    symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables, *, lanes: int
+) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
+    states, words, word_count = np.empty(lanes, np.uint32), np.empty(len(symbols), np.uint16), ctypes.c_int64()
+    result = native_library().sgs_rans_encode(
+        _pointer(symbols),
+        _pointer(contexts),
+        ctypes.c_int64(len(symbols)),
+        *_table_arguments(tables),
+        ctypes.c_int(lanes),
+        _pointer(states),
+        _pointer(words),
+        ctypes.byref(word_count),
+    )
+    if result:
+        raise MemoryError if result == _NO_MEMORY else StreamError("Symbols to encode do not fit their tables.")
+    return states, words[: word_count.value]
+
+
+def _native_decode(
+    words: NDArray[np.uint16], states: NDArray[np.uint32], contexts: NDArray[np.uint16], tables: FrequencyTables
+) -> NDArray[np.uint8] | None:
+    symbols = np.empty(len(contexts), np.uint8)
+    result = native_library().sgs_rans_decode(
+        _pointer(words),
+        ctypes.c_int64(len(words)),
+        _pointer(states),
+        ctypes.c_int(len(states)),
+        _pointer(contexts),
+        ctypes.c_int64(len(contexts)),
+        *_table_arguments(tables),
+        _pointer(symbols),
+    )
+    if result == _NO_MEMORY:
+        raise MemoryError
+    return None if result else symbols
+
+
+def _table_arguments(tables: FrequencyTables) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c_int]:
+    return _pointer(tables.rows), ctypes.c_int64(tables.contexts), ctypes.c_int(tables.alphabet)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frequency tables of the entropy coder: integers throughout, so that every decoder has the same (docs/entropy.md)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.errors import StreamError
+
+FREQUENCY_BITS = 12
+TOTAL = 1 << FREQUENCY_BITS
+MAX_ALPHABET = 32
+MAX_CONTEXTS = 4096
+GEOMETRIC_ROWS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyTables:
+    """One row of frequencies for each context.
+
+    Args:
+        rows: u16 ``[C, A]``, each row summing to 4096; C at most 4096, A at most 32.
+
+    Raises:
+        StreamError: they are anything else.
+    """
+
+    rows: NDArray[np.uint16]
+
+    def __post_init__(self) -> None:
+        shape, dtype = self.rows.shape, self.rows.dtype
+        if (
+            dtype != np.uint16
+            or len(shape) != 2
+            or not (1 <= shape[0] <= MAX_CONTEXTS and 1 <= shape[1] <= MAX_ALPHABET)
+        ):
+            raise StreamError(
+                f"Frequency tables must be uint16 of at most {MAX_CONTEXTS} contexts and {MAX_ALPHABET} symbols, got "
+                f"{dtype} {shape}."
+            )
+        if (self.rows.sum(1, dtype=np.int64) != TOTAL).any():
+            raise StreamError(f"Every row of frequencies must sum to {TOTAL}; normalise counts with normalised().")
+        object.__setattr__(self, "rows", np.ascontiguousarray(self.rows))
+
+    @property
+    def contexts(self) -> int:
+        """C, the number of contexts."""
+        return self.rows.shape[0]
+
+    @property
+    def alphabet(self) -> int:
+        """A, the number of symbols."""
+        return self.rows.shape[1]
+
+    @cached_property
+    def starts(self) -> NDArray[np.uint16]:
+        """Sums of the frequencies before each symbol, u16 ``[C, A]``."""
+        return (np.cumsum(self.rows, axis=1, dtype=np.int64) - self.rows).astype(np.uint16)
+
+
+def normalised(counts: NDArray[np.integer]) -> FrequencyTables:
+    """Frequencies for counted symbols that make the code nearly as short as it can be; a row without any is even.
+
+    Symbols that occur get at least 1, others 0. From the floors of the quotas on, each further unit goes to the symbol
+    where ``count / (2 frequency + 1)`` is largest (Sainte-Lague's divisors: to second order the greatest gain in code
+    length), or comes from where ``count / (2 frequency - 1)`` is least; ties go to the lower symbol.
+
+    Args:
+        counts: ``[C, A]``, not negative, a row's sum below 2^40.
+
+    Raises:
+        StreamError: counts are negative or too large.
+    """
+    n = counts.astype(np.int64)
+    if n.size and (int(n.min()) < 0 or int(n.max()) >= 1 << 40):
+        raise StreamError("Counts of symbols must be from 0 to 2^40 - 1.")
+    n[n.sum(1) == 0] = 1
+    rows = np.where(n > 0, np.maximum(n * TOTAL // n.sum(1, keepdims=True), 1), 0)
+    while len(short := np.flatnonzero(rows.sum(1) < TOTAL)):
+        rows[short, _largest(n[short], 2 * rows[short] + 1)] += 1
+    while len(over := np.flatnonzero(rows.sum(1) > TOTAL)):
+        f = rows[over]
+        # The least of n / d is the largest of d / n; a frequency of 1 stays.
+        rows[over, _largest(np.where(f > 1, 2 * f - 1, 0), np.maximum(n[over], 1))] -= 1
+    return FrequencyTables(rows.astype(np.uint16))
+
+
+def _largest(numerators: NDArray[np.int64], denominators: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where in each row the fraction is largest, the first of equals; exact, by cross-multiplication."""
+    best = np.zeros(len(numerators), np.int64)
+    n, d = numerators[:, 0], denominators[:, 0]
+    for column in range(1, numerators.shape[1]):
+        wins = numerators[:, column] * d > n * denominators[:, column]
+        best[wins] = column
+        n, d = np.where(wins, numerators[:, column], n), np.where(wins, denominators[:, column], d)
+    return best
+
+
+def weighed(weights: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Frequencies ``[..., A]`` for integer weights: the floors of the quotas, at least 1 where the weight is positive.
+
+    What is missing from 4096, or too much, the first of the largest weights gets or gives. This is what a decoder does
+    with the weights in a table set; :func:`normalised` is for counts.
+    """
+    rows = np.where(weights > 0, np.maximum(weights * TOTAL // weights.sum(-1, keepdims=True), 1), 0)
+    peak = weights.argmax(-1)[..., None]
+    rest = TOTAL - rows.sum(-1, keepdims=True)
+    np.put_along_axis(rows, peak, np.take_along_axis(rows, peak, -1) + rest, -1)
+    return rows
+
+
+def geometric(numbers: NDArray[np.integer], *, alphabet: int) -> FrequencyTables:
+    """Two-sided geometric rows for symbols in the order 0, -1, 1, -2, 2 ...: the default tables.
+
+    Number ``g`` is ``8 z + q``: ``z`` (0 to 31) sets the odds of zero against everything else to
+    ``(2 + z % 2) 2^(z // 2) / 16``, ``q`` (0 to 7) the ratio from one magnitude to the next to ``(2 q + 1) / 16``.
+
+    Args:
+        numbers: ``[C]``, each 0 to 255.
+        alphabet: A, 2 to 32.
+    """
+    numbers = np.asarray(numbers, np.int64)
+    z, q = numbers >> 3, numbers & 7
+    weights = np.zeros((len(numbers), alphabet), np.int64)
+    side = np.full(len(numbers), 1 << 16, np.int64)
+    for symbol in range(1, alphabet):
+        if symbol > 1 and symbol % 2:
+            side = side * (2 * q + 1) >> 4
+        weights[:, symbol] = np.maximum(side, 1)
+    weights[:, 0] = ((2 + (z & 1)) << (z >> 1)) * weights.sum(1) >> 4
+    return FrequencyTables(weighed(weights).astype(np.uint16))
