@@ -7,19 +7,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.reference_rans import decode_lanes, encode_lanes
-from structgstream.codec.tables import FrequencyTables
+from structgstream.codec.tables import COST_BITS, TOTAL, FrequencyTables, code_costs
 from structgstream.errors import StreamError
 from structgstream.kernels._load import native_library, native_reason
 
 MAX_SYMBOLS = 2**31 - 1
-FOUR_LANES_FROM = 1 << 13
-MANY_LANES_FROM = 1 << 17
+LANES = (1, 4, 32)
+"""By the code in a section's head."""
+
 _NO_MEMORY = 1
+_LANE_BYTES = 3  # what a lane costs: half of its final state, and half of what is left of the other half
+_MOST_SHARE = 128  # a section spends up to a 128th on its lanes
 
 
-def lanes_of(count: int) -> int:
-    """How many lanes a section of ``count`` symbols has: 1, 4 from 2^13 on, 32 from 2^17 on, none without symbols."""
-    return 0 if count == 0 else 1 if count < FOUR_LANES_FROM else 4 if count < MANY_LANES_FROM else 32
+def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables) -> int:
+    """How many lanes the encoder takes: as many as cost less than a 128th of what the symbols will."""
+    used = np.bincount(tables.rows[contexts, symbols], minlength=TOTAL + 1)
+    size_bytes = int(used @ code_costs()) >> COST_BITS + 3
+    return max(lanes for lanes in LANES if (lanes - 1) * _LANE_BYTES * _MOST_SHARE <= size_bytes)
 
 
 def has_native() -> bool:
@@ -28,14 +33,20 @@ def has_native() -> bool:
 
 
 def encode(
-    symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables, *, native: bool | None = None
+    symbols: NDArray[np.uint8],
+    contexts: NDArray[np.uint16],
+    tables: FrequencyTables,
+    *,
+    lanes: int | None = None,
+    native: bool | None = None,
 ) -> bytes:
-    """A section: number of symbols, number of words, states, words.
+    """A section: numbers of symbols, words and lanes; states; words.
 
     Args:
         symbols: u8 ``[n]``, each below A and with a frequency of 1 or more in its context.
         contexts: u16 ``[n]``, each below C.
         tables: what both sides have.
+        lanes: 1, 4 or 32; None takes what :func:`lanes_for` says.
         native: C++ or NumPy, which give the same bytes; None takes C++ where it is.
 
     Raises:
@@ -47,14 +58,13 @@ def encode(
         raise StreamError(f"{symbols.shape} symbols cannot be coded with {contexts.shape} contexts; give one for each.")
     if (symbols >= tables.alphabet).any() or not tables.rows[contexts, symbols].all():
         raise StreamError("A symbol to encode has no frequency in its context; count it before making the tables.")
-    lanes = lanes_of(len(symbols))
-    if not lanes:
-        return _varint(0) + _varint(0)
+    if not len(symbols):
+        return _varint(0)
+    lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
     code = _native_encode if _takes_native(native) else encode_lanes
     states, words = code(symbols, contexts, tables, lanes=lanes)
-    return b"".join(
-        (_varint(len(symbols)), _varint(len(words)), states.astype("<u4").tobytes(), words.astype("<u2").tobytes())
-    )
+    head = _varint(len(symbols)) + _varint(len(words) << 2 | LANES.index(lanes))
+    return head + states.astype("<u4").tobytes() + words.astype("<u2").tobytes()
 
 
 def decode(
@@ -78,10 +88,9 @@ def decode(
         StreamError: the section is damaged, or has not this number of symbols.
     """
     contexts = _checked_contexts(contexts, tables)
-    count, word_count, start = _counts(data, where=where)
+    count, word_count, lanes, start = _head(data, where=where)
     if count != len(contexts):
         raise StreamError(f"{where} states {count} symbols, {len(contexts)} are expected; it is damaged.")
-    lanes = lanes_of(count)
     if start + 4 * lanes + 2 * word_count != len(data):
         raise StreamError(f"{where} has {len(data)} bytes, but states {word_count} words; it is damaged.")
     if not lanes:
@@ -100,21 +109,24 @@ def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbol
     Raises:
         StreamError: the section is longer than the data.
     """
-    count, word_count, start = _counts(data, where=where)
-    end = start + 4 * lanes_of(count) + 2 * word_count
+    _, word_count, lanes, start = _head(data, where=where)
+    end = start + 4 * lanes + 2 * word_count
     if end > len(data):
         raise StreamError(f"{where} states {end} bytes, {len(data)} are left; it is damaged.")
     return end
 
 
-def _counts(data: bytes | memoryview, *, where: str) -> tuple[int, int, int]:
-    """Numbers of symbols and of words, and where the states begin."""
+def _head(data: bytes | memoryview, *, where: str) -> tuple[int, int, int, int]:
+    """Numbers of symbols, words and lanes, and where the states begin."""
     count, start = _read_varint(data, 0, where=where)
-    word_count, start = _read_varint(data, start, where=where)
+    if count == 0:
+        return 0, 0, 0, start
+    value, start = _read_varint(data, start, where=where)
+    word_count, lane_code = value >> 2, value & 3
     # A symbol takes one word at most.
-    if count > MAX_SYMBOLS or word_count > count:
+    if count > MAX_SYMBOLS or word_count > count or lane_code >= len(LANES):
         raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
-    return count, word_count, start
+    return count, word_count, LANES[lane_code], start
 
 
 def _varint(value: int) -> bytes:

@@ -2,7 +2,7 @@
 """Frequency tables of the entropy coder: integers throughout, so that every decoder has the same (docs/entropy.md)."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ TOTAL = 1 << FREQUENCY_BITS
 MAX_ALPHABET = 32
 MAX_CONTEXTS = 4096
 GEOMETRIC_ROWS = 256
+COST_BITS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,3 +132,26 @@ def geometric(numbers: NDArray[np.integer], *, alphabet: int) -> FrequencyTables
         weights[:, symbol] = np.maximum(side, 1)
     weights[:, 0] = ((2 + (z & 1)) << (z >> 1)) * weights.sum(1) >> 4
     return FrequencyTables(weighed(weights).astype(np.uint16))
+
+
+@cache
+def logs() -> NDArray[np.int64]:
+    """log2 of 0 to 8191 in units of 2^-16, rounded down digit by digit; 0 for 0."""
+    n = np.maximum(np.arange(2 * TOTAL), 1)
+    whole = np.frexp(n.astype(np.float64))[1].astype(np.int64) - 1
+    x = (n.astype(np.uint64) << np.uint64(31)) >> whole.astype(np.uint64)  # 1 to 2, with 31 bits after the point
+    log = whole
+    for _ in range(COST_BITS):
+        x = x * x >> np.uint64(31)
+        digit = (x >> np.uint64(32)).astype(np.int64)
+        x >>= digit.astype(np.uint64)
+        log = 2 * log + digit
+    return log
+
+
+@cache
+def code_costs() -> NDArray[np.int64]:
+    """What a symbol of frequency 0 to 4096 costs, in units of 2^-16 bit; for encoders' choices."""
+    costs = (FREQUENCY_BITS << COST_BITS) - logs()[: TOTAL + 1]
+    costs[0] = 1 << 28  # not to be coded at all
+    return costs
