@@ -18,6 +18,7 @@ COMMANDS = {
     "reconstruct": "turn a capture into a stream, frame by frame",
     "evaluate": "score a stream against the cameras that training did not see",
     "render": "render a camera or a camera path to mp4 or PNG",
+    "export": "write frames as plain 3D Gaussians: .ply, .splat or .spz",
     "inspect": "show what a stream file holds",
     "ablate": "run the paper's ablations on a capture, ours beside the paper's figures",
     "compare": "run several methods on a capture and score their files alike",

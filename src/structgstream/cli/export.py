@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream export``."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, get_args
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from structgstream.cli.app import UsageError
+from structgstream.cli.options import Device, StreamFile, parsed
+from structgstream.cli.progress import human_bytes
+from structgstream.export.write import FORMATS, Format
+
+if TYPE_CHECKING:
+    from structgstream.codec.reader import StreamReader
+    from structgstream.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Export:
+    """Writes frames as plain 3D Gaussians for other programs: .ply, .splat or .spz.
+
+    What depends on the camera is averaged over the training cameras; colours are spherical harmonics fitted to what
+    they see. Units and axes are the capture's own (.spz: y up, z back). OUT.ply, OUT.splat or OUT.spz gives one frame,
+    any other name a folder of frame_000000.ply and so on. What is lost: docs/export.md.
+
+    Example: structgstream export ball.sgs --frame 5 -o ball.ply
+
+    Example: structgstream export ball.sgs --frames 0 19 --format spz -o ball-spz
+    """
+
+    stream: tyro.conf.Positional[StreamFile]
+    """The stream file."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
+    """Where to write. Default: a file (with --frame) or a folder beside the stream."""
+    format: Annotated[Format | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """Format of the files. Default: what the name of OUT says, else ply."""
+    frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """This frame only."""
+    frames: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="FIRST LAST", help_behavior_hint="")] = None
+    """From this frame to that, both included. Default: all."""
+    sh_degree: Annotated[int | None, tyro.conf.arg(metavar="0..2", help_behavior_hint="")] = None
+    """Degree of the spherical harmonics. Default: 1; .splat has none."""
+    device: Device = "auto"
+    """What evaluates the MLPs."""
+
+
+def main(arguments: list[str]) -> None:
+    """Exports and says where the result is."""
+    options = parsed(Export, "export", arguments=arguments)
+    if options.frame is not None and options.frames is not None:
+        raise UsageError("--frame names one frame, --frames the first and the last; give one of them.")
+    output, format = destination(options)
+    degree = checked_degree(options.sh_degree, format)
+    from structgstream.codec.reader import open_stream
+    from structgstream.export.bake import Baking, baked
+    from structgstream.export.write import write_gaussians
+    from structgstream.kernels.backend import select_backend
+    from structgstream.scene.state import on_device
+
+    reader = open_stream(options.stream, by_index=options.frame is not None)
+    numbers = chosen_frames(reader, options)
+    single = output.suffix.lower().lstrip(".") in FORMATS and not output.is_dir()
+    if single and len(numbers) > 1:
+        raise UsageError(f"{output.name} holds one frame: choose it with --frame, or name a folder and --format.")
+    backend = select_backend(options.device)
+    baking = Baking() if degree is None else replace(Baking(), degree=degree)
+    rig = reader.header.similarity.rig(reader.header.rig)
+    cameras = [rig[name] for name in rig.training]
+    written = gaussians = 0
+    bar = Progress(
+        TextColumn("exporting"),
+        BarColumn(bar_width=32),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task("frames", total=len(numbers))
+        for number, scene in scenes_of(reader, numbers):
+            plain = baked(on_device(scene, backend.device), cameras, backend, baking=baking)
+            path = output if single else output / f"frame_{number:06d}.{format}"
+            plain = plain.in_capture_units(reader.header.similarity)
+            written += write_gaussians(path, plain, format=format)
+            gaussians += len(plain)
+            bar.advance(task)
+    what = "1 frame" if len(numbers) == 1 else f"{len(numbers)} frames"
+    text = f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(written)}"
+    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def destination(options: Export) -> tuple[Path, Format]:
+    """Where to write and in which format.
+
+    Raises:
+        UsageError: the name asks for a format that there is not, or for another than --format.
+    """
+    format = options.format
+    if options.output is None:
+        format = format or "ply"
+        stem = options.stream.stem
+        name = f"{stem}-{format}" if options.frame is None else f"{stem}-{options.frame}.{format}"
+        return options.stream.with_name(name), format
+    ending = options.output.suffix.lower().lstrip(".")
+    if options.output.is_dir() or not ending:
+        return options.output, format or "ply"
+    for known in get_args(Format):
+        if ending == known:
+            if format not in (None, known):
+                raise UsageError(f"the name {options.output.name} asks for .{ending}, and --format for {format}.")
+            return options.output, known
+    if format is None:
+        raise UsageError(
+            f"there is no format .{ending}; there are {', '.join(FORMATS)}. For a folder of this name add --format."
+        )
+    return options.output, format
+
+
+def checked_degree(degree: int | None, format: Format) -> int | None:
+    """The degree that is baked, or None for the measured choice.
+
+    Raises:
+        UsageError: there is no such degree, or the format cannot hold it.
+    """
+    from structgstream.export.baked import MAX_DEGREE
+
+    if degree is not None and not 0 <= degree <= MAX_DEGREE:
+        raise UsageError(f"--sh-degree {degree} is not one of 0 to {MAX_DEGREE}.")
+    if format == "splat":
+        if degree:
+            raise UsageError(f"a .splat file holds one colour a Gaussian; --sh-degree {degree} needs ply or spz.")
+        return 0
+    return degree
+
+
+def chosen_frames(reader: "StreamReader", options: Export) -> range:
+    """Numbers of the frames to write.
+
+    Raises:
+        UsageError: there is no such frame.
+    """
+    have = len(reader.packets)
+    first, last = (options.frame, options.frame) if options.frame is not None else options.frames or (0, have - 1)
+    if not have:
+        raise UsageError("the stream has no whole frame.")
+    if not 0 <= first <= last < have:
+        asked = f"frame {first}" if first == last else f"range from {first} to {last}"
+        raise UsageError(f"the stream has frames 0 to {have - 1}; there is no {asked}.")
+    return range(first, last + 1)
+
+
+def scenes_of(reader: "StreamReader", numbers: range) -> "Iterator[tuple[int, Scene]]":
+    """The decoded scenes of these frames, with their numbers."""
+    if len(numbers) == 1:
+        yield numbers[0], reader.scene(numbers[0])
+        return
+    yield from zip(numbers, (scene for _, scene in reader.scenes(numbers.start)))

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``.ply`` of 3D Gaussian splatting's own code (Kerbl et al. 2023), which every viewer and editor reads.
+
+One element ``vertex`` in binary little endian, every property a float32: position, a normal that nobody uses, the
+constant colour coefficients ``f_dc``, the others ``f_rest`` (all of red, then green, then blue), the logit of the
+opacity, logarithms of the scales, and a quaternion wxyz.
+"""
+
+import numpy as np
+import torch
+
+from structgstream.export.baked import BakedGaussians
+
+LEAST_OPACITY = 1e-6  # A logit of 0 or 1 is not finite.
+
+
+def properties(degree: int) -> list[str]:
+    """Names of the properties, in order, of spherical harmonics of ``degree``."""
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    colors = [f"f_dc_{i}" for i in range(3)] + rest
+    shape = [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    return ["x", "y", "z", "nx", "ny", "nz", *colors, "opacity", *shape]
+
+
+def ply_bytes(gaussians: BakedGaussians) -> bytes:
+    """A whole ``.ply`` file, in the units and axes of ``gaussians``."""
+    names = properties(gaussians.degree)
+    lines = ["ply", "format binary_little_endian 1.0", "comment axes: x right, y down, z forward"]
+    lines += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names), "end_header"]
+    columns = [
+        gaussians.means,
+        torch.zeros_like(gaussians.means),
+        gaussians.sh[:, 0],
+        gaussians.sh[:, 1:].transpose(1, 2).flatten(1),
+        gaussians.opacities.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY).logit()[:, None],
+        gaussians.scales.log(),
+        gaussians.quats,
+    ]
+    table = torch.cat(columns, dim=1).cpu().numpy().astype(np.dtype("<f4"))
+    return "\n".join([*lines, ""]).encode("ascii") + table.tobytes()

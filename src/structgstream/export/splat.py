@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``.splat`` of web viewers: 32 bytes a Gaussian and nothing else, the most important first.
+
+float32 position and scales (not logarithms), 8-bit red, green, blue and opacity, and an 8-bit quaternion wxyz whose
+components are ``(byte - 128) / 128``. There is one colour for all directions.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from structgstream.errors import ConfigError
+from structgstream.export.baked import Y0, BakedGaussians
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def by_importance(gaussians: BakedGaussians) -> BakedGaussians:
+    """The same, largest volume times opacity first, so that a file that is still loading shows what matters."""
+    importance = gaussians.scales.log().sum(1) + gaussians.opacities.log()
+    return gaussians.select(importance.argsort(descending=True, stable=True))
+
+
+def splat_bytes(gaussians: BakedGaussians) -> bytes:
+    """A whole ``.splat`` file, in the units and axes of ``gaussians``.
+
+    Raises:
+        ConfigError: colours depend on direction. Their constant part alone is not what the cameras see on average.
+    """
+    if gaussians.degree:
+        raise ConfigError(
+            f"A .splat file holds one colour a Gaussian, got spherical harmonics of degree {gaussians.degree}; "
+            "bake with degree 0."
+        )
+    gaussians = by_importance(gaussians)
+    rows = np.empty(len(gaussians), ROW)
+    rows["mean"] = gaussians.means.cpu().numpy()
+    rows["scale"] = gaussians.scales.cpu().numpy()
+    rows["rgba"] = _bytes(255.0 * torch.cat([0.5 + Y0 * gaussians.sh[:, 0], gaussians.opacities[:, None]], dim=1))
+    rows["quat"] = _bytes(128.0 * torch.nn.functional.normalize(gaussians.quats, dim=1) + 128.0)
+    return rows.tobytes()
+
+
+def _bytes(values: Tensor) -> np.ndarray:
+    return values.round().clamp(0, 255).to(torch.uint8).cpu().numpy()

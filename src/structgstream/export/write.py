@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Baked Gaussians of a stream's frames as files that others open."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal, get_args
+
+from structgstream.errors import StorageError
+from structgstream.export.baked import BakedGaussians
+from structgstream.export.ply import ply_bytes
+from structgstream.export.splat import splat_bytes
+from structgstream.export.spz import spz_bytes
+
+Format = Literal["ply", "splat", "spz"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
+    "ply": ply_bytes,
+    "splat": splat_bytes,
+    "spz": spz_bytes,
+}
+
+
+def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) -> int:
+    """Writes a file of ``gaussians``, whole or not at all, and the folder when it is missing.
+
+    What stood at ``path`` stays until the new file is complete.
+
+    Args:
+        path: the file.
+        gaussians: in the units that the file shall have, OpenCV axes.
+        format: which of the formats; ``splat`` holds degree 0 only.
+
+    Returns:
+        Bytes of the file.
+
+    Raises:
+        ConfigError: the format cannot hold these Gaussians.
+        StorageError: the file cannot be written.
+    """
+    data = FORMAT_BYTES[format](gaussians)
+    partial = path.with_name(f"{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with partial.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
+    return len(data)
