@@ -58,6 +58,8 @@ def encode(
         raise StreamError(f"{symbols.shape} symbols cannot be coded with {contexts.shape} contexts; give one for each.")
     if (symbols >= tables.alphabet).any() or not tables.rows[contexts, symbols].all():
         raise StreamError("A symbol to encode has no frequency in its context; count it before making the tables.")
+    if lanes is not None and lanes not in LANES:
+        raise StreamError(f"Sections have 1, 4 or 32 lanes, not {lanes}.")
     if not len(symbols):
         return _varint(0)
     lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
