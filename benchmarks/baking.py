@@ -26,8 +26,8 @@ from structgstream.scene.state import on_device
 def choices(center: Baking) -> list[Baking]:
     """The values around ``center``, one choice changed at a time."""
     found = [replace(center, degree=degree) for degree in (0, 1, 2)]
-    found += [replace(center, ridge=ridge) for ridge in (1e-4, 1e-3, 1e-2, 1e-1) if ridge != center.ridge]
-    found += [replace(center, degree=2, ridge=ridge) for ridge in (1e-4, 1e-3, 1e-2, 1e-1) if ridge != center.ridge]
+    found += [replace(center, ridge=ridge) for ridge in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1) if ridge != center.ridge]
+    found += [replace(center, degree=2, ridge=ridge) for ridge in (1e-5, 1e-3, 1e-2, 1e-1) if ridge != center.ridge]
     found += [replace(center, opacity="drawn" if center.opacity == "seen" else "seen")]
     found += [replace(center, shape="covariance" if center.shape == "parts" else "parts")]
     return [*found, replace(center, weight="blend" if center.weight == "opacity" else "opacity")]

@@ -4,7 +4,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, StreamFile, parsed
 from structgstream.cli.progress import human_bytes
-from structgstream.export.write import FORMATS, Format
+from structgstream.export.formats import FORMATS, Format
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -109,7 +109,7 @@ def destination(options: Export) -> tuple[Path, Format]:
     ending = options.output.suffix.lower().lstrip(".")
     if options.output.is_dir() or not ending:
         return options.output, format or "ply"
-    for known in get_args(Format):
+    for known in FORMATS:
         if ending == known:
             if format not in (None, known):
                 raise UsageError(f"the name {options.output.name} asks for .{ending}, and --format for {format}.")

@@ -45,7 +45,7 @@ class Baking:
     """
 
     degree: int = 1
-    ridge: float = 0.01
+    ridge: float = 1e-4
     opacity: Literal["seen", "drawn"] = "seen"
     shape: Literal["parts", "covariance"] = "parts"
     weight: Literal["opacity", "blend"] = "opacity"

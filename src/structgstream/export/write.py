@@ -4,16 +4,14 @@
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal, get_args
 
 from structgstream.errors import StorageError
 from structgstream.export.baked import BakedGaussians
+from structgstream.export.formats import Format
 from structgstream.export.ply import ply_bytes
 from structgstream.export.splat import splat_bytes
 from structgstream.export.spz import spz_bytes
 
-Format = Literal["ply", "splat", "spz"]
-FORMATS: tuple[Format, ...] = get_args(Format)
 FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
     "ply": ply_bytes,
     "splat": splat_bytes,

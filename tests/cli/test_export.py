@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``export``: which files it writes, in which units, and what it says to wrong requests."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from rigs import random_scene
+from streams import header_for, write_stream
+from structgstream.cli import main
+from structgstream.codec.reader import open_stream
+from structgstream.codec.sinks import FileSink
+from structgstream.export.bake import Baking
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.scene import Scene
+
+FRAMES = 3
+
+
+def frames_of_a_scene(anchors: int = 30, free: int = 4) -> list[Scene]:
+    """A scene that drifts."""
+    scene = random_scene(anchors, free=free, seed=4)
+    shift = torch.tensor([0.1, 0.0, 0.0])
+    moved = [replace(scene.anchors, positions=scene.anchors.positions + t * shift) for t in range(FRAMES)]
+    return [replace(scene, anchors=anchors) for anchors in moved]
+
+
+@pytest.fixture(scope="module")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of a small scene."""
+    path = tmp_path_factory.mktemp("export") / "small.sgs"
+    write_stream(FileSink(path), frames_of_a_scene())
+    return path
+
+
+def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
+    """What a command that fails with ``status`` says: one line, no traceback."""
+    capsys.readouterr()
+    assert main(["export", *arguments, "--device", "reference"]) == status
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert len(error.strip().splitlines()) == 1
+    return error
+
+
+def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "one.ply"
+    assert main(["export", str(stream), "-o", str(out), "--frame", "1", "--device", "reference"]) == 0
+    vertices = PlyData.read(str(out))["vertex"].data
+    assert f"{len(vertices):,} Gaussians" in capsys.readouterr().out
+    assert [entry.name for entry in tmp_path.iterdir()] == ["one.ply"]
+    reader = open_stream(stream)
+    header, scene = reader.header, reader.scene(1)
+    camera = header.similarity.camera(header.rig[header.rig.training[0]])
+    drawn = scene.gaussians(camera, reference_backend())
+    wanted = header.similarity.inverse_points(drawn.means[drawn.opacities > 0.5])
+    found = torch.from_numpy(np.stack([vertices[axis] for axis in "xyz"], axis=1).copy())
+    assert len(wanted) > 20
+    assert float(torch.cdist(wanted.double(), found.double()).min(1).values.max()) < 1e-5
+    assert len([name for name in vertices.dtype.names if name.startswith("f_rest")]) == 3 * (
+        (Baking().degree + 1) ** 2 - 1
+    )
+
+
+def test_a_sequence_fills_a_folder(stream: Path, tmp_path: Path) -> None:
+    common = ["export", str(stream), "--device", "reference"]
+    assert main([*common, "-o", str(tmp_path / "all")]) == 0
+    assert main([*common, "-o", str(tmp_path / "two"), "--frames", "1", "2", "--format", "spz"]) == 0
+    assert main([*common, "-o", str(tmp_path / "one"), "--frame", "2", "--format", "splat"]) == 0
+    assert {str(entry.relative_to(tmp_path)) for entry in tmp_path.rglob("*.*")} == {
+        *(f"all/frame_00000{i}.ply" for i in range(3)),
+        *(f"two/frame_00000{i}.spz" for i in (1, 2)),
+        "one/frame_000002.splat",
+    }
+    first, last = (PlyData.read(str(tmp_path / "all" / f"frame_00000{i}.ply"))["vertex"]["x"].mean() for i in (0, 2))
+    assert last > first + 0.05
+    assert main([*common, "-o", str(tmp_path / "one.ply"), "--frame", "2"]) == 0
+    assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "all" / "frame_000002.ply").read_bytes()
+
+
+def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.sgs"
+    copy.write_bytes(stream.read_bytes())
+    common = ["export", str(copy), "--device", "reference", "--format", "splat"]
+    assert main([*common, "--frame", "0"]) == 0
+    assert main([*common, "--frames", "0", "0"]) == 0
+    made = {str(entry.relative_to(tmp_path)) for entry in tmp_path.rglob("*") if entry.is_file()}
+    assert made == {"copy.sgs", "copy-0.splat", "copy-splat/frame_000000.splat"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-o", "x.obj"], "there is no format .obj; there are ply, splat, spz"),
+        (["-o", "x.ply"], "holds one frame"),
+        (["-o", "x.ply", "--frame", "3"], "frames 0 to 2; there is no frame 3"),
+        (["-o", "x.ply", "--frame", "-1"], "no frame -1"),
+        (["-o", "x", "--frames", "1", "7"], "no range from 1 to 7"),
+        (["-o", "x", "--frames", "2", "1"], "no range from 2 to 1"),
+        (["-o", "x.ply", "--frame", "0", "--frames", "0", "1"], "give one of them"),
+        (["-o", "x.ply", "--frame", "0", "--format", "spz"], "asks for .ply, and --format for spz"),
+        (["-o", "x.splat", "--frame", "0", "--sh-degree", "1"], "one colour"),
+        (["-o", "x.ply", "--frame", "0", "--sh-degree", "3"], "not one of 0 to 2"),
+    ],
+)
+def test_wrong_requests(
+    stream: Path,
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert words in error_of([str(stream), *arguments], capsys, status=2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_problems_of_the_stream_and_of_the_disk(
+    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty.sgs"
+    scenes = frames_of_a_scene(anchors=0, free=0)
+    write_stream(FileSink(empty), scenes, header=header_for(scenes[0]))
+    assert "nothing to export" in error_of([str(empty), "--frame", "0"], capsys, status=1)
+    assert "no such" in error_of([str(tmp_path / "none.sgs")], capsys, status=1).lower()
+    (tmp_path / "file").write_text("")
+    inside = ["-o", str(tmp_path / "file" / "x.ply"), "--frame", "0"]
+    assert "cannot be written" in error_of([str(stream), *inside], capsys, status=1)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"empty.sgs", "file"}

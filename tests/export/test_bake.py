@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Baking: what does not depend on the camera stays, what does is averaged and fitted as stated."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rigs import arc_rig, random_scene
+from structgstream.errors import StreamError
+from structgstream.export.bake import Baking, baked, blend_weights, matrix_quaternions
+from structgstream.export.baked import MAX_DEGREE, BakedGaussians, sh_basis
+from structgstream.geometry import quaternion_matrices
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.render import Drawable, render
+from structgstream.scene.scene import Scene
+from structgstream.similarity import Similarity
+
+RIG = arc_rig(6, width=64, height=48)
+CAMERAS = [RIG[name] for name in RIG.training]
+BACKEND = reference_backend()
+
+
+def distance(one: Drawable, other: Drawable, names: tuple[str, ...] = RIG.training) -> float:
+    """PSNR, dB, of what both show to cameras of the rig."""
+    errors = [
+        (render(one, RIG[n], BACKEND).image - render(other, RIG[n], BACKEND).image).square().mean() for n in names
+    ]
+    return float(-10.0 * torch.stack(errors).mean().log10())
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return random_scene(60, free=5, cameras=5, seed=4)
+
+
+def test_the_basis_is_orthonormal_and_signed_as_viewers_have_it() -> None:
+    count = 20_000
+    z = 1.0 - (2.0 * torch.arange(count, dtype=torch.float64) + 1.0) / count
+    turn = torch.arange(count, dtype=torch.float64) * math.pi * (3.0 - math.sqrt(5.0))
+    ring = (1.0 - z * z).sqrt()
+    basis = sh_basis(torch.stack([ring * turn.cos(), ring * turn.sin(), z], dim=1), MAX_DEGREE)
+    gram = basis.T @ basis * (4.0 * math.pi / count)
+    torch.testing.assert_close(gram, torch.eye(9, dtype=torch.float64), atol=1e-4, rtol=0)
+    axes = sh_basis(torch.eye(3), 1)
+    torch.testing.assert_close(axes[:, 0], torch.full((3,), 0.2820948))
+    torch.testing.assert_close(axes[:, 1:], 0.4886025 * torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("shape", ["parts", "covariance"])
+def test_free_gaussians_stay_as_they_are(degree: int, shape: str) -> None:
+    scene = random_scene(0, free=7, cameras=5)
+    found = baked(scene, CAMERAS, BACKEND, baking=Baking(degree=degree, shape=shape))  # pyright: ignore[reportArgumentType]
+    wanted = scene.free_gaussians()
+    torch.testing.assert_close(found.means, wanted.means)
+    torch.testing.assert_close(found.opacities, wanted.opacities)
+    torch.testing.assert_close(found.colors(torch.tensor([0.3, 2.0, -1.0])), wanted.colors, atol=1e-4, rtol=1e-4)
+    axes, wanted_axes = (quaternion_matrices(g.quats) * g.scales[:, None] for g in (found, wanted))
+    torch.testing.assert_close(axes @ axes.mT, wanted_axes @ wanted_axes.mT, atol=1e-6, rtol=1e-4)
+
+
+def test_for_one_camera_nothing_is_lost(scene: Scene) -> None:
+    found = baked(scene, CAMERAS[:1], BACKEND, baking=Baking(degree=0))
+    assert distance(found, scene, RIG.training[:1]) > 55
+
+
+def test_pictures_are_close_and_a_degree_more_is_closer(scene: Scene) -> None:
+    flat, linear = (baked(scene, CAMERAS, BACKEND, baking=Baking(degree=degree)) for degree in (0, 1))
+    assert flat.degree == 0
+    assert linear.degree == 1
+    assert distance(flat, scene) > 25
+    assert distance(linear, scene) > distance(flat, scene) + 0.3
+    assert distance(linear, scene, RIG.testing) > 25
+
+
+def test_averages_are_what_the_cameras_draw(scene: Scene) -> None:
+    """Against a dictionary of ids, filled one Gaussian at a time."""
+    drawn: dict[int, list[tuple[float, torch.Tensor]]] = {}
+    seen: dict[int, int] = {}
+    for camera in CAMERAS:
+        generated, visible = scene.structured(camera, BACKEND)
+        for anchor in visible.tolist():
+            for offset in range(scene.anchors.offsets_per_anchor):
+                number = anchor * scene.anchors.offsets_per_anchor + offset
+                seen[number] = seen.get(number, 0) + 1
+        for i, number in enumerate(generated.ids.tolist()):
+            drawn.setdefault(number, []).append((float(generated.opacities[i]), generated.scales[i].log()))
+    structured = replace(scene, free=random_scene(0).free)
+    over_seen = {number: sum(o for o, _ in found) / seen[number] for number, found in drawn.items()}
+    over_drawn = {number: sum(o for o, _ in found) / len(found) for number, found in drawn.items()}
+    assert any(abs(over_seen[number] - over_drawn[number]) > 0.01 for number in drawn)
+    for opacity, wanted in (("seen", over_seen), ("drawn", over_drawn)):
+        found = baked(structured, CAMERAS, BACKEND, baking=Baking(opacity=opacity))  # pyright: ignore[reportArgumentType]
+        kept = sorted(number for number, value in wanted.items() if value >= 1 / 255)
+        torch.testing.assert_close(found.opacities, torch.tensor([wanted[number] for number in kept]))
+        logs = [sum(o * s for o, s in drawn[n]) / sum(o for o, _ in drawn[n]) for n in kept]
+        torch.testing.assert_close(found.scales, torch.stack([torch.as_tensor(entry) for entry in logs]).exp())
+
+
+def test_blend_weights_sum_to_the_coverage(scene: Scene) -> None:
+    gaussians = scene.gaussians(CAMERAS[0], BACKEND)
+    weights = blend_weights(gaussians, CAMERAS[0], BACKEND)
+    assert weights.min() >= 0
+    torch.testing.assert_close(weights.sum(), render(scene, CAMERAS[0], BACKEND).alpha.sum(), rtol=1e-4, atol=1e-3)
+    blend = baked(scene, CAMERAS, BACKEND, baking=Baking(weight="blend"))
+    assert distance(blend, scene) > 25
+
+
+def test_quaternions_of_rotations() -> None:
+    quats = torch.nn.functional.normalize(torch.randn(200, 4, dtype=torch.float64), dim=1)
+    half_turns = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    matrices = quaternion_matrices(torch.cat([quats, half_turns]))
+    torch.testing.assert_close(quaternion_matrices(matrix_quaternions(matrices)), matrices)
+
+
+def test_units_of_the_capture(scene: Scene) -> None:
+    """A camera of the capture sees the same in the capture's units as in the scene's."""
+    similarity = Similarity((0.4, -0.2, 0.3), 0.25)
+    rig = similarity.rig(RIG)
+    shrunk = baked(scene, CAMERAS, BACKEND)
+    x, y, z = similarity.center
+    inverse = Similarity((-0.25 * x, -0.25 * y, -0.25 * z), 1.0 / 0.25)
+    small = shrunk.in_capture_units(inverse)
+    name = RIG.training[1]
+    one = render(shrunk, RIG[name], BACKEND).image
+    torch.testing.assert_close(render(small, rig[name], BACKEND).image, one, atol=2e-3, rtol=0)
+    back = small.in_capture_units(similarity)
+    torch.testing.assert_close(back.means, shrunk.means, atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(back.scales, shrunk.scales)
+
+
+def test_a_scene_without_gaussians_is_refused() -> None:
+    with pytest.raises(StreamError, match="nothing to export"):
+        baked(random_scene(0, cameras=5), CAMERAS, BACKEND)
+
+
+def test_rows_are_selected_in_order(scene: Scene) -> None:
+    found: BakedGaussians = baked(scene, CAMERAS, BACKEND)
+    part = found.select(torch.tensor([3, 1]))
+    assert len(part) == 2
+    assert torch.equal(part.sh, found.sh[[3, 1]])
