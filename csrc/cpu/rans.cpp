@@ -125,7 +125,7 @@ extern "C" int sgs_rans_encode(const uint8_t* symbols, const uint16_t* contexts,
         states[i % lanes] = ((state / frequency) << kBits) + state % frequency + (entry & 0xffff);
     }
     *word_count = count - free_words;
-    std::memmove(words, words + free_words, sizeof(uint16_t) * static_cast<size_t>(*word_count));
+    if (*word_count > 0) std::memmove(words, words + free_words, sizeof(uint16_t) * static_cast<size_t>(*word_count));
     return kDone;
 }
 

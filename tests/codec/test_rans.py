@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+import importlib
 import struct
 from contextlib import suppress
+from typing import Any
 
-import constriction
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -76,6 +77,45 @@ def test_both_coders_write_the_same_bytes_and_read_each_other(count: int, lanes:
     assert (decode(data, context, tables, native=True) == decode(data, context, tables, native=False)).all()
 
 
+def plain_decode(data: bytes, context: np.ndarray, tables: FrequencyTables) -> list[int]:
+    """One symbol at a time, written from docs/entropy.md alone."""
+    place = 0
+
+    def varint() -> int:
+        nonlocal place
+        value = shift = 0
+        while True:
+            byte, place = data[place], place + 1
+            value, shift = value | (byte & 127) << shift, shift + 7
+            if byte < 128:
+                return value
+
+    count = varint()
+    word_count, code = divmod(varint(), 4)
+    lanes = {0: 1, 1: 4, 2: 32}[code]
+    states = list(struct.unpack_from(f"<{lanes}I", data, place))
+    words = iter(struct.unpack_from(f"<{word_count}H", data, place + 4 * lanes))
+    found = []
+    for i in range(count):
+        x, row = states[i % lanes], tables.rows[context[i]].tolist()
+        slot, symbol, start = x % 4096, 0, 0
+        while slot >= start + row[symbol]:
+            start, symbol = start + row[symbol], symbol + 1
+        x = row[symbol] * (x >> 12) + slot - start
+        states[i % lanes] = x if x >= 2**16 else x * 2**16 + next(words)
+        found.append(symbol)
+    assert set(states) == {2**16}
+    assert next(words, None) is None
+    return found
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_a_decoder_written_from_the_document_agrees(lanes: int) -> None:
+    for seed in range(5):
+        symbols, context, tables = drawn(seed, count=700, contexts=7, even=seed == 0)
+        assert plain_decode(encode(symbols, context, tables, lanes=lanes), context, tables) == symbols.tolist()
+
+
 @both
 def test_the_bytes_are_those_of_the_document(native) -> None:
     """The example of docs/entropy.md, worked by hand there."""
@@ -117,9 +157,10 @@ def test_peaked_symbols_are_within_a_hundredth_of_their_entropy_and_of_constrict
     size = len(encode(symbols, context, tables))
     bound = entropy_bytes(counted(symbols, context, contexts=50, alphabet=16))
     assert bound <= size <= 1.01 * bound
-    coder = constriction.stream.stack.AnsCoder()
+    stream: Any = importlib.import_module("constriction").stream  # its type stubs leave this out
+    coder = stream.stack.AnsCoder()
     probabilities = (tables.rows[context] / 4096).astype(np.float32)
-    coder.encode_reverse(symbols.astype(np.int32), constriction.stream.model.Categorical(perfect=False), probabilities)
+    coder.encode_reverse(symbols.astype(np.int32), stream.model.Categorical(perfect=False), probabilities)
     assert size <= 1.005 * coder.num_valid_bits() / 8
 
 
@@ -216,13 +257,14 @@ def test_states_that_do_not_come_home_are_refused(native) -> None:
 def test_an_encoder_is_told_what_does_not_fit() -> None:
     tables = FrequencyTables(np.array([[4095, 1, 0]], np.uint16))
     zero = np.zeros(2, np.uint16)
-    for symbols, context, problem in (
+    cases: list[tuple[list[int], np.ndarray, str]] = [
         ([0, 2], zero, "no frequency"),
         ([0, 3], zero, "no frequency"),
         ([0], zero, "one for each"),
         ([0, 0], zero + 1, "Context 1 has no table"),
         ([0, 0], zero.astype(np.int64), "must be uint16"),
-    ):
+    ]
+    for symbols, context, problem in cases:
         with pytest.raises(StreamError, match=problem):
             encode(np.array(symbols, np.uint8), context, tables)
     with pytest.raises(StreamError, match="Context 1 has no table"):

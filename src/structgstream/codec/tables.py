@@ -121,8 +121,16 @@ def geometric(numbers: NDArray[np.integer], *, alphabet: int) -> FrequencyTables
     Args:
         numbers: ``[C]``, each 0 to 255.
         alphabet: A, 2 to 32.
+
+    Raises:
+        StreamError: a number or the alphabet is not in its range.
     """
     numbers = np.asarray(numbers, np.int64)
+    if not 2 <= alphabet <= MAX_ALPHABET or (numbers < 0).any() or (numbers >= GEOMETRIC_ROWS).any():
+        raise StreamError(
+            f"There are geometric rows 0 to {GEOMETRIC_ROWS - 1} of 2 to {MAX_ALPHABET} symbols, asked was for {numbers} "
+            f"of {alphabet}."
+        )
     z, q = numbers >> 3, numbers & 7
     weights = np.zeros((len(numbers), alphabet), np.int64)
     side = np.full(len(numbers), 1 << 16, np.int64)
