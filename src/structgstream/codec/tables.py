@@ -128,8 +128,8 @@ def geometric(numbers: NDArray[np.integer], *, alphabet: int) -> FrequencyTables
     numbers = np.asarray(numbers, np.int64)
     if not 2 <= alphabet <= MAX_ALPHABET or (numbers < 0).any() or (numbers >= GEOMETRIC_ROWS).any():
         raise StreamError(
-            f"There are geometric rows 0 to {GEOMETRIC_ROWS - 1} of 2 to {MAX_ALPHABET} symbols, asked was for {numbers} "
-            f"of {alphabet}."
+            f"There are geometric rows 0 to {GEOMETRIC_ROWS - 1} of 2 to {MAX_ALPHABET} symbols, not "
+            f"{numbers} of {alphabet}."
         )
     z, q = numbers >> 3, numbers & 7
     weights = np.zeros((len(numbers), alphabet), np.int64)
