@@ -16,7 +16,7 @@ import torch
 from small_runs import CLIP, quick
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.errors import ConfigError
+from structgstream.errors import ExperimentError
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.experiments.results import Result, read_result
 from structgstream.experiments.tasks import FirstFrame, Variation
@@ -196,11 +196,29 @@ def test_a_stream_without_a_whole_frame_begins_anew_with_the_first_frame(runs: R
     assert run.stream.read_bytes() == runs.full.stream.read_bytes()
 
 
+@pytest.mark.parametrize("frames", [3, 4], ids=["finished", "to go on with"])
 @pytest.mark.parametrize("part", [{"start": 1}, {"scale": 0.5}, {"held_out": ("cam00", "cam01")}])
-def test_a_stream_of_other_pictures_is_refused_and_stays(runs: Runs, part: dict[str, Any]) -> None:
+def test_a_stream_of_other_pictures_is_refused_and_stays(runs: Runs, part: dict[str, Any], frames: int) -> None:
     before = runs.full.stream.read_bytes()
-    with pytest.raises(ConfigError, match="made from another capture or another part of it"):
-        replace(runs.full, capture=replace(CLIP, frames=4, **part), frames=4).run(runs.backend)
+    with pytest.raises(ExperimentError, match=r"another folder.*made from another capture or another part of it"):
+        replace(runs.full, capture=replace(CLIP, frames=frames, **part), frames=frames).run(runs.backend)
+    assert runs.full.stream.read_bytes() == before
+    assert runs.full.done()
+
+
+def test_a_finished_stream_of_another_configuration_is_not_scored_as_this_one(runs: Runs, tmp_path: Path) -> None:
+    shutil.copytree(runs.folder / "streams", tmp_path / "streams")
+    other = replace(quick(), online=replace(quick().online, iterations=1))
+    run = replace(runs.full, folder=tmp_path, config=other)
+    with pytest.raises(ExperimentError, match=r"another folder.*online\.iterations"):
+        run.run(runs.backend)
+    assert not run.result.exists()
+
+
+def test_a_stream_of_more_frames_than_asked_for_is_left_alone(runs: Runs) -> None:
+    before = runs.full.stream.read_bytes()
+    with pytest.raises(ExperimentError, match="has 3 frames already and 2 are asked for"):
+        replace(runs.full, capture=replace(CLIP, frames=2), frames=2).run(runs.backend)
     assert runs.full.stream.read_bytes() == before
     assert runs.full.done()
 
