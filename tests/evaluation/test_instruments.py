@@ -11,7 +11,7 @@ import torch
 from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.errors import ConfigError
-from structgstream.evaluation.flip import flip
+from structgstream.evaluation.flip import features_of, flip_of
 from structgstream.evaluation.instruments import TEMPORAL, Instruments, instruments, measured
 from structgstream.evaluation.lpips import ALEX, ENVIRONMENT, VGG, Lpips, published_heads
 
@@ -38,6 +38,10 @@ def seeded_alex() -> Lpips:
     return Lpips(ALEX, tuple(weights), published_heads(ALEX))
 
 
+def flip(one: np.ndarray, other: np.ndarray) -> float:
+    return flip_of(features_of(one), features_of(other))
+
+
 def noise(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (40, 48, 3)).astype(np.uint8)
 
@@ -54,7 +58,6 @@ def test_missing_weights_are_told_and_nothing_takes_their_place() -> None:
 
 
 def test_missing_packages_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     monkeypatch.setitem(sys.modules, "cv2", None)
     tools = instruments(cameras(640, 360), frames=5, device=CPU)
     for name in ("flip", "temporal_flip", "e_warp"):
@@ -79,7 +82,7 @@ def test_wrong_weights_are_an_error_not_a_gap(tmp_path: Path) -> None:
 
 def test_scores_over_time_are_differences_of_distances() -> None:
     alex = seeded_alex()
-    tools = Instruments(flip, {"alex": alex}, None)
+    tools = Instruments(features_of, {"alex": alex}, None)
     truths, pictures = (noise(0), noise(1)), (noise(2), noise(2) // 2)
     _, before = measured(tools, truth=truths[0], picture=pictures[0], before=None, camera="cam00", index=0)
     scores, _ = measured(tools, truth=truths[1], picture=pictures[1], before=before, camera="cam00", index=1)

@@ -116,4 +116,6 @@ def test_the_larger_of_two_spots_is_shown() -> None:
     mask[30:34, 70:74] = 1
     top, left, height, width = busiest(mask)
     assert mask[top : top + height, left : left + width].sum() == 16
+    mask[28:36, 10:16] = 1
+    assert (busiest(mask)[0], busiest(mask)[1]) == (26, 0)
     assert busiest(np.zeros((41, 83), np.int64)) == (0, 0, 10, 20)

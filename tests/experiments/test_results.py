@@ -118,6 +118,7 @@ def test_a_result_of_a_report_has_the_costs_of_the_frames_after_the_first() -> N
         "online_seconds": 2.0,
         "online_cpu_seconds": 3.0,
     }
+    assert result.mean["first_cpu_seconds"] == 60.0
     assert result.stream == {"total_bytes": 1400}
     assert [frame["psnr"] for frame in result.frames] == [30.0, 29.0, 28.0]
     assert [frame.get("cpu_seconds") for frame in result.frames] == [60.0, 3.0, None]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.errors import MissingExtraError
-from structgstream.evaluation.flip import flip, flip_evaluator
+from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of, opencv
 from structgstream.evaluation.flow import Flow, dis_flow
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
 from structgstream.evaluation.masks import changed_pixels
@@ -34,14 +34,14 @@ class Instruments:
     """What measures, and what could not be had.
 
     Args:
-        flip: mean FLIP of a picture and its truth, or None.
+        flip: what FLIP compares of a picture, or None.
         lpips: by name of the trunk, those whose weights were found.
         flow: where pixels were in the frame before, or None.
         weights: by name of the trunk, the file its weights came from.
         not_available: name of the score to the reason why there is none.
     """
 
-    flip: Callable[[Picture, Picture], float] | None
+    flip: Callable[[Picture], FlipFeatures] | None
     lpips: Mapping[str, Lpips]
     flow: Flow | None
     weights: Mapping[str, str] = field(default_factory=dict)
@@ -50,11 +50,15 @@ class Instruments:
 
 @dataclass(frozen=True)
 class Seen:
-    """One camera's frame, as the next one needs it: both pictures and their features for T-LPIPS."""
+    """One camera's frame, as the next one needs it: both pictures and what FLIP and LPIPS compare of them.
+
+    Each pair is of the truth and of the picture, or None where that is not measured.
+    """
 
     truth: Picture
     picture: Picture
-    features: tuple[Features, Features] | None  # of the truth and of the picture
+    flip: tuple[FlipFeatures, FlipFeatures] | None
+    lpips: tuple[Features, Features] | None
 
 
 def instruments(
@@ -80,8 +84,8 @@ def instruments(
     missing: dict[str, str] = {}
     measure = None
     try:
-        flip_evaluator()
-        measure = flip
+        opencv()
+        measure = features_of
     except MissingExtraError as error:
         missing |= dict.fromkeys(("flip", "temporal_flip"), str(error))
     if flow is None:
@@ -123,7 +127,8 @@ def measured(
     """
     alex, vgg = (_usable(tools, trunk.name, truth) for trunk in (ALEX, VGG))
     scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth)}
-    scores["flip"] = None if tools.flip is None else tools.flip(picture, truth)
+    seen = None if tools.flip is None else (tools.flip(truth), tools.flip(picture))
+    scores["flip"] = None if seen is None else flip_of(*seen)
     features = None if alex is None else (alex.features(truth), alex.features(picture))
     scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
     scores["lpips_vgg"] = None if vgg is None else vgg.distance(vgg.features(truth), vgg.features(picture))
@@ -134,14 +139,13 @@ def measured(
         if tools.flow is not None:
             field = tools.flow(before.truth, truth, camera, index)
             scores["e_warp"] = warping_error(picture, before.picture, field)
-        if tools.flip is not None:
-            scores["temporal_flip"] = difference_of_change(
-                tools.flip(picture, before.picture), tools.flip(truth, before.truth)
-            )
-        if alex is not None and features is not None and before.features is not None:
-            true, rendered = (alex.distance(*pair) for pair in zip(features, before.features, strict=True))
+        if seen is not None and before.flip is not None:
+            true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))
+            scores["temporal_flip"] = difference_of_change(rendered, true)
+        if alex is not None and features is not None and before.lpips is not None:
+            true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
             scores["t_lpips"] = difference_of_change(rendered, true)
-    return scores, Seen(truth, picture, features)
+    return scores, Seen(truth, picture, seen, features)
 
 
 def _usable(tools: Instruments, name: str, picture: Picture) -> Lpips | None:

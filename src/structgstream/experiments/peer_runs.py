@@ -82,7 +82,10 @@ class PeerRun:
 
         self.stream.parent.mkdir(parents=True, exist_ok=True)
         source = Prefetch(self.capture.open())
-        session = PeerSession(source, self.stream, METHODS[self.key], backend, seed=self.seed, resume=True)
+        part = {"start": self.capture.start, "scale": self.capture.scale, "every": self.capture.every}
+        session = PeerSession(
+            source, self.stream, METHODS[self.key], backend, seed=self.seed, resume=True, metadata=part
+        )
         machine = environment() | {"backend": backend.name}
         first = True
         with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator

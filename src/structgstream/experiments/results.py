@@ -92,6 +92,7 @@ def _online_means(frames: list[dict[str, Any]]) -> dict[str, float | None]:
         "online_free_bytes": mean([_free_bytes(frame["field_bytes"]) for frame in online]),
         "online_seconds": mean([frame.get("total_seconds") for frame in online]),
         "online_cpu_seconds": mean([frame.get("cpu_seconds") for frame in online]),
+        "first_cpu_seconds": next((frame.get("cpu_seconds") for frame in frames if frame["index"] == 0), None),
     }
 
 

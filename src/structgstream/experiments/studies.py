@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 READINGS_TABLE = "readings"
 COMPARED = (
     "psnr_first", "psnr", "ssim", "ms_ssim", "lpips_alex", "flip", "psnr_changed", "psnr_still", "drift_db_per_frame",
-    "online_bytes", "online_seconds", "online_cpu_seconds", "seconds_first", "e_warp", "t_lpips", "temporal_flip",
+    "online_bytes", "online_cpu_seconds", "first_cpu_seconds", "e_warp", "t_lpips", "temporal_flip",
     "flicker",
 )  # fmt: skip
 """Columns of the comparison, those without a value left out."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from structgstream.errors import ConfigError, ExperimentError
 from structgstream.experiments.captures import CapturePart, capture_facts
 from structgstream.experiments.results import Result, read_result, result_of, rounded, write_result
 from structgstream.presets import StreamConfig, to_json
@@ -194,11 +195,18 @@ def _reconstruct(
     stream.parent.mkdir(parents=True, exist_ok=True)
     sink, resumed = FileSink.resume(stream)
     done = 0 if resumed is None else len(resumed)
-    if done == len(source):
-        return
     fitted = first.fitted() if first is not None and done == 0 else None
     metadata = {"start": capture.start, "scale": capture.scale}
-    session = Session(Prefetch(source), sink, config, backend, resumed=resumed, metadata=metadata, first=fitted)
+    try:
+        session = Session(Prefetch(source), sink, config, backend, resumed=resumed, metadata=metadata, first=fitted)
+    except ConfigError as error:
+        raise ExperimentError(f"{stream} answers another question, so choose another folder. {error}") from None
+    if done > len(source):
+        raise ExperimentError(
+            f"{stream} has {done} frames already and {len(source)} are asked for; choose another folder for fewer."
+        )
+    if done == len(source):
+        return
     begin_log(stream, frames=done)
     machine = environment() | {"backend": backend.name}
     with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator

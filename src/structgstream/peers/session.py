@@ -41,6 +41,7 @@ class PeerSession(Generic[State, Memory]):
         backend: what computes.
         seed: of the stream.
         resume: go on after the last whole frame of the file, if there is one.
+        metadata: plain JSON values for the header; a file with others is not resumed.
         on_step: called after every optimisation step.
 
     Raises:
@@ -57,6 +58,7 @@ class PeerSession(Generic[State, Memory]):
         *,
         seed: int = 0,
         resume: bool = False,
+        metadata: Mapping[str, object] | None = None,
         on_step: StepListener | None = None,
     ) -> None:
         self._source, self._path, self._method, self._backend = source, Path(path), method, backend
@@ -72,7 +74,7 @@ class PeerSession(Generic[State, Memory]):
             static={},
             distance_input=False,
             config=to_json(method.config),
-            metadata={"capture": source.name, "seed": seed},
+            metadata={"capture": source.name, "seed": seed, **(metadata or {})},
         )
         self._resumed = self._existing(resume)
 
@@ -204,7 +206,7 @@ class PeerSession(Generic[State, Memory]):
         pairs = {
             "method": (header.codec, ours.codec),
             "configuration": (header.config, ours.config),
-            "capture or seed": (header.metadata, ours.metadata),
+            "capture, part of it or seed": (header.metadata, ours.metadata),
             "frame rate": (header.fps, ours.fps),
             "cameras": (_facts(header.rig), _facts(ours.rig)),
         }

@@ -41,6 +41,7 @@ from structgstream.training.patching import (
     surviving,
 )
 from structgstream.training.result import FitResult, Step, StepListener
+from structgstream.training.rounding import Rate, RoundingConfig
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import LastPass, gradients_of, view_loss
 from structgstream.training.stopwatch import Stopwatch
@@ -80,6 +81,7 @@ class OnlineConfig:
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    rounding: RoundingConfig = field(default_factory=RoundingConfig)
 
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
@@ -181,7 +183,10 @@ class _Fit:
         patch_at = math.ceil(patching.iteration * len(seen) / len(views))
         order = shuffled_views(seen, self.generator)
         dynamic = config.dynamic if partition is None else config.dynamic.difference(SHARED_FIELDS)
-        parameters = Parameters.of(scene, trained=parameters_of_fields(dynamic))
+        steps = config.rounding.steps
+        parameters = Parameters.of(scene, trained=parameters_of_fields(dynamic), steps=steps)
+        start = {name: parameters.values[name].detach().clone() for name in steps}
+        rate = Rate(config.rounding.rate_weight, start, steps) if config.rounding.rate_weight > 0.0 else None
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
@@ -199,6 +204,8 @@ class _Fit:
                 watch=watch,
                 focus=None if places is None else places[view.index],
             )
+            if rate is not None:
+                loss = replace(loss, total=loss.total + rate.of(parameters.values))
             gradients, screen_gradient = gradients_of(loss, parameters, watch)
             if iteration > iterations - len(seen):
                 last_pass.add(loss, view)

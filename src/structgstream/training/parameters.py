@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene taken apart into the tensors that an optimiser moves, and put together again."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -12,6 +12,7 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, flatten_head, scene_of, state_of, unflatten_head
+from structgstream.training.rounding import rounded
 
 ParameterName = Literal[
     "anchor_positions",
@@ -72,10 +73,13 @@ class Parameters:
     values: dict[ParameterName, Tensor]
     births: Tensor
     distance_input: bool
+    steps: Mapping[ParameterName, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, scene: Scene, *, trained: frozenset[ParameterName]) -> "Parameters":
-        """Copies of a scene's tensors; those in ``trained`` collect gradients."""
+    def of(
+        cls, scene: Scene, *, trained: frozenset[ParameterName], steps: Mapping[ParameterName, float] | None = None
+    ) -> "Parameters":
+        """Copies of a scene's tensors; those in ``trained`` collect gradients, those in ``steps`` are drawn rounded."""
         free = scene.free
         values: dict[ParameterName, Tensor] = {
             "anchor_positions": scene.anchors.positions,
@@ -97,7 +101,7 @@ class Parameters:
         copies: dict[ParameterName, Tensor] = {
             name: value.detach().clone().contiguous().requires_grad_(name in trained) for name, value in values.items()
         }
-        return cls(values=copies, births=free.births.clone(), distance_input=scene.distance_input)
+        return cls(copies, free.births.clone(), scene.distance_input, dict(steps or {}))
 
     @property
     def trained(self) -> list[ParameterName]:
@@ -113,7 +117,7 @@ class Parameters:
 
     def scene(self, template: Scene) -> Scene:
         """The scene these parameters stand for; differentiable. ``template`` gives the MLPs' widths."""
-        v = self.values
+        v = self.values | {name: rounded(self.values[name], step) for name, step in self.steps.items()}
 
         def head(name: Literal["opacity", "color", "covariance"], vector: Tensor):
             like = getattr(template.mlps, name)
