@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene's dynamic fields as bins: whole numbers times a step (docs/bitstream.md, section Bins).
+
+The value of a bin is the product of two float32 numbers, rounded as IEEE 754 rounds it: the same in every decoder.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from structgstream.codec.coder import Bins, Coder
+from structgstream.codec.free_rows import FreeBins, coded_free
+from structgstream.codec.rows import Change, coded_change
+from structgstream.errors import StreamError
+from structgstream.scene.state import FREE_COLUMNS, FieldName
+
+ANCHOR_ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales")
+"""Fields of three numbers an anchor, which change together."""
+WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
+FREE_STEPS = ("free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors")
+_FREE_WIDTHS = (3, 3, 4, 1, 3)
+LARGEST = 2**24  # whole numbers that float32 holds
+
+
+@dataclass(frozen=True)
+class SceneBins:
+    """The dynamic part of a scene, and what the last frame did to it.
+
+    Args:
+        anchors: ``[M, 3 x number of dynamic anchor fields]``.
+        change: of the anchors.
+        weights: by field, ``[P, 1]``.
+        weight_changes: by field.
+        free: the free Gaussians.
+    """
+
+    anchors: Bins
+    change: Change
+    weights: Mapping[FieldName, Bins]
+    weight_changes: Mapping[FieldName, Change]
+    free: FreeBins
+
+    def unmoved(self) -> "SceneBins":
+        """The same without a last change."""
+        return replace(
+            self,
+            change=Change.none(*self.anchors.shape),
+            weight_changes={name: Change.none(*bins.shape) for name, bins in self.weights.items()},
+            free=self.free.unmoved(),
+        )
+
+
+def anchor_fields(dynamic: frozenset[FieldName]) -> tuple[FieldName, ...]:
+    """The dynamic fields of anchors, in the order of their columns."""
+    return tuple(name for name in ANCHOR_ROWS if name in dynamic)
+
+
+def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> SceneBins:
+    """The nearest bins of a state's dynamic fields.
+
+    Raises:
+        StreamError: a value is too many steps from zero.
+    """
+    rows = [_bins(state[name], steps[name]) for name in anchor_fields(dynamic)]
+    count = len(state["anchor_positions"])
+    anchors = np.concatenate(rows, axis=1) if rows else np.zeros((count, 0), np.int32)
+    weights: dict[FieldName, Bins] = {
+        name: _bins(state[name], steps[name])[:, None] for name in WEIGHTS if name in dynamic
+    }
+    free = FreeBins.none()
+    if "free" in dynamic:
+        births = state["free_births"].cpu().numpy().astype(np.int64)
+        bins = _bins(state["free"], _free_steps(steps))
+        free = FreeBins(births, bins, Change.none(len(births), FREE_COLUMNS))
+    changes: dict[FieldName, Change] = {name: Change.none(*bins.shape) for name, bins in weights.items()}
+    return SceneBins(anchors, Change.none(*anchors.shape), weights, changes, free)
+
+
+def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> dict[FieldName, Tensor]:
+    """The dynamic fields that bins stand for."""
+    state: dict[FieldName, Tensor] = {}
+    for number, name in enumerate(anchor_fields(dynamic)):
+        state[name] = _values(bins.anchors[:, 3 * number : 3 * number + 3], steps[name])
+    for name, weights in bins.weights.items():
+        state[name] = _values(weights[:, 0], steps[name])
+    if "free" in dynamic:
+        state["free"] = _values(bins.free.bins, _free_steps(steps))
+        state["free_births"] = torch.from_numpy(bins.free.births.copy())
+    return state
+
+
+def coded_scene(
+    coder: Coder, after: SceneBins | None, before: SceneBins, *, fields: Sequence[FieldName], has_free: bool, where: str
+) -> SceneBins:
+    """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
+
+    Raises:
+        StreamError: what is decoded contradicts itself.
+    """
+    groups = [(name, 3 * number, 3 * number + 3) for number, name in enumerate(fields)]
+    given = None if after is None else Change.of(after.anchors - before.anchors)
+    change = coded_change(coder, given, before.change, groups=groups)
+    anchors = before.anchors + change.residuals
+    weights: dict[FieldName, Bins] = {}
+    changes: dict[FieldName, Change] = {}
+    for name, bins in before.weights.items():
+        given = None if after is None else Change.of(after.weights[name] - bins)
+        changes[name] = coded_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
+        weights[name] = bins + changes[name].residuals
+    free = before.free
+    if has_free:
+        free = coded_free(coder, None if after is None else after.free, before.free, where=where)
+    for found in (anchors, *weights.values(), free.bins):
+        if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
+            raise StreamError(f"{where} has a bin beyond 24 bits, which no value stands for; it is damaged.")
+    return SceneBins(anchors, change, weights, changes, free)
+
+
+def _free_steps(steps: Mapping[str, float]) -> NDArray[np.float32]:
+    return np.repeat(np.array([steps[name] for name in FREE_STEPS], np.float32), _FREE_WIDTHS)
+
+
+def _bins(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
+    found = np.rint(value.detach().cpu().numpy().astype(np.float64) / np.asarray(step, np.float32))
+    if found.size and not np.abs(found).max() <= LARGEST:
+        raise StreamError(f"A value is {np.abs(found).max():g} steps from zero, at most {LARGEST} can be coded.")
+    return found.astype(np.int32)
+
+
+def _values(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(bins.astype(np.float32) * np.asarray(step, np.float32))
