@@ -2,7 +2,7 @@
 """Configurations as values. Paper mode is a preset, not a fork; the paper's ablations are edits of one."""
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 from structgstream.data.points import PointsConfig
 from structgstream.training.growth import GrowthConfig
@@ -26,6 +26,8 @@ class StreamConfig:
     """Largest distance of a training camera to their mean after normalisation; rates and voxel sizes refer to it."""
     key_interval_seconds: float = 1.0
     """A key packet, from which a viewer can start, comes this often in media time."""
+    codec: Literal["raw", "compact"] = "raw"
+    """How frames are coded: as float32, or rounded (``online.rounding``) and entropy coded."""
     seed: int = 0
 
 
@@ -74,6 +76,13 @@ MOTION = replace(
 )
 """As RIG, but only what moves is fitted. F_Sigma stays as it is: what stands still depends on it."""
 
+COMPACT = replace(
+    MOTION,
+    codec="compact",
+    online=replace(MOTION.online, dynamic=MOTION.online.dynamic.difference(["covariance_mlp"])),
+)
+"""As MOTION, in small packets: what moves is sent rounded, against the frame before."""
+
 FAST = replace(
     RIG,
     initial=replace(
@@ -114,6 +123,7 @@ PRESETS: dict[str, StreamConfig] = {
     "paper-immersive": PAPER,
     "rig": RIG,
     "motion": MOTION,
+    "compact": COMPACT,
     "fast": FAST,
     "tiny": TINY,
 }

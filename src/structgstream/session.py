@@ -6,9 +6,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
 from structgstream.cameras import CameraRig
+from structgstream.codec.bins import FREE_STEPS
+from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader
@@ -19,12 +22,14 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakKind, PeakMeter
 from structgstream.presets import StreamConfig, to_json
+from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, on_device, state_of
 from structgstream.similarity import Similarity, normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame
 from structgstream.training.result import FitResult, StepListener
+from structgstream.training.rounding import pixel_size
 
 
 @dataclass(frozen=True)
@@ -131,12 +136,14 @@ class Session:
     def _frames(self) -> Iterator[FrameReport]:
         encoder: SceneEncoder | None = None
         scene: Scene | None = None
+        steps: Mapping[str, float] = {}
         start = 0
         if self._resumed is not None:
-            encoder = SceneEncoder(self._resumed.header)
+            encoder, steps = SceneEncoder(self._resumed.header), self._resumed.header.steps
             self._sink.open(self._resumed.header)
             start = len(self._resumed)
-            scene = self._resumed.scene(start - 1) if start else None
+            for packet in self._resumed.group(start - 1) if start else ():
+                scene = encoder.follow(packet)
         if start >= len(self._source):
             return
         # What moves shows against the frame before, so a resumed stream reads that one once more.
@@ -151,16 +158,19 @@ class Session:
                 return
             peaks.end("read")
             read = time.perf_counter()
-            fit = self._fit(scene, frame, before)
+            fit = self._fit(scene, frame, before, steps)
             before = frame if self._config.online.motion.enabled else None
             peaks.end("fit")
             fitted = time.perf_counter()
+            fitted_scene = fit.scene
             if encoder is None:
-                header = self._header(fit.scene)
-                encoder = SceneEncoder(header)
+                if self._config.codec == "compact":
+                    fitted_scene = in_space_order(fitted_scene)
+                header = self._header(fitted_scene)
+                encoder, steps = SceneEncoder(header), header.steps
                 self._sink.open(header)
             kind = PacketKind.KEY if frame.index % self._key_interval == 0 else PacketKind.DELTA
-            encoded = encoder.encode(fit.scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
+            encoded = encoder.encode(fitted_scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
             scene = encoded.reconstruction
             coded = time.perf_counter()
             size = self._sink.write(encoded.packet)
@@ -196,7 +206,9 @@ class Session:
     def _key_interval(self) -> int:
         return max(1, round(self._source.fps * self._config.key_interval_seconds))
 
-    def _fit(self, scene: Scene | None, frame: MultiViewFrame, before: MultiViewFrame | None) -> FitResult:
+    def _fit(
+        self, scene: Scene | None, frame: MultiViewFrame, before: MultiViewFrame | None, steps: Mapping[str, float]
+    ) -> FitResult:
         seed = frame_seed(self._config.seed, frame.index)
         if scene is None:
             if self._first is not None:
@@ -225,22 +237,33 @@ class Session:
             backend=self._backend,
             seed=seed,
             before=before,
+            steps=steps,
             on_step=self._on_step,
         )
 
     def _header(self, scene: Scene) -> StreamHeader:
-        dynamic = self._config.online.dynamic
+        dynamic, codec = self._config.online.dynamic, self._config.codec
         state = state_of(scene)
+        steps: dict[str, float] = {}
+        reference: dict[FieldName, torch.Tensor] = {}
+        if codec == "compact":
+            pixel = pixel_size(scene.anchors.positions, self._rig)
+            known = self._config.online.rounding.steps(pixel)
+            used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
+            steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
+            reference = quantised(state, steps, dynamic.difference(["free", "free_births"]))
         return StreamHeader(
             rig=self._source.rig,
             similarity=self._similarity,
             fps=self._source.fps,
-            codec="raw",
+            codec=codec,
             dynamic=dynamic,
             static={name: value.cpu() for name, value in state.items() if name not in dynamic},
             distance_input=scene.distance_input,
             config=to_json(self._config),
             metadata=self._metadata,
+            steps=steps,
+            reference=reference,
         )
 
     def _check_resumable(self, header: StreamHeader) -> None:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Field blocks: one tensor of the scene as bytes (docs/bitstream.md, section Field blocks).
 
-Coding 0 (``raw``) stores the little-endian numbers as they are: float32, or int64 for identities.
+Coding 0 (``raw``) stores the little-endian numbers as they are: float32, or int64 for identities. Coding 1 (``coded``)
+stores bytes that only the codec of the stream understands.
 """
 
 import math
@@ -18,10 +19,12 @@ from structgstream.errors import StreamError
 from structgstream.scene.state import STATE_TABLE, FieldName
 
 BLOCK = struct.Struct("<BBBB")  # field code, coding, dtype, number of dimensions
-RAW = 0
+RAW, CODED = 0, 1
 MAX_DIMENSIONS = 4
 MAX_ELEMENTS = 2**31 - 1
 _DTYPES = {0: np.dtype("<f4"), 1: np.dtype("<i8")}
+_BYTES = np.dtype("u1")
+_OF_CODING = {RAW: _DTYPES, CODED: {2: _BYTES}}
 _NAMES: dict[int, FieldName] = {field.code: field.name for field in STATE_TABLE}
 _CODES: dict[FieldName, int] = {field.name: field.code for field in STATE_TABLE}
 
@@ -34,6 +37,7 @@ class Block:
     """
 
     name: FieldName
+    coding: int
     dtype: np.dtype
     shape: tuple[int, ...]
     start: int
@@ -50,6 +54,11 @@ def packed_block(name: FieldName, value: Tensor) -> bytes:
     return head + struct.pack(f"<{array.ndim}I", *array.shape) + array.tobytes()
 
 
+def coded_block(name: FieldName, data: bytes) -> bytes:
+    """One field, coded."""
+    return BLOCK.pack(_CODES[name], CODED, 2, 1) + struct.pack("<I", len(data)) + data
+
+
 def blocks_in(payload: Stored, start: int, *, where: str) -> Iterator[Block]:
     """Every block from byte ``start`` to the end.
 
@@ -61,7 +70,8 @@ def blocks_in(payload: Stored, start: int, *, where: str) -> Iterator[Block]:
         if start + BLOCK.size > len(payload):
             raise StreamError(f"{where} ends within the head of a field block.")
         code, coding, dtype, dimensions = BLOCK.unpack(payload[start : start + BLOCK.size])
-        if code not in _NAMES or coding != RAW or dtype not in _DTYPES or dimensions > MAX_DIMENSIONS:
+        known = code in _NAMES and dtype in _OF_CODING.get(coding, {}) and dimensions <= MAX_DIMENSIONS
+        if not known or (coding == CODED and dimensions != 1):
             raise StreamError(
                 f"{where} holds a field block (field {code}, coding {coding}, type {dtype}, {dimensions} dimensions) "
                 "that this version does not know; install a newer structgstream."
@@ -73,11 +83,12 @@ def blocks_in(payload: Stored, start: int, *, where: str) -> Iterator[Block]:
         if data > len(payload):
             raise StreamError(f"{where} ends within the shape of field {_NAMES[code]}.")
         shape = struct.unpack(f"<{dimensions}I", payload[start + BLOCK.size : data])
-        end = data + math.prod(shape) * _DTYPES[dtype].itemsize
+        found = _OF_CODING[coding][dtype]
+        end = data + math.prod(shape) * found.itemsize
         # An empty tensor has no bytes to be checked against, so its other sizes get a bound of their own.
         if end > len(payload) or math.prod(max(size, 1) for size in shape) > MAX_ELEMENTS:
             raise StreamError(f"{where} states {shape} numbers for field {_NAMES[code]}, more than it holds.")
-        yield Block(_NAMES[code], _DTYPES[dtype], shape, start, data, end)
+        yield Block(_NAMES[code], coding, found, shape, start, data, end)
         start = end
 
 
@@ -89,6 +100,22 @@ def unpacked_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName
     """
     values: dict[FieldName, Tensor] = {}
     for block in blocks_in(payload, start, where=where):
+        if block.coding != RAW:
+            raise StreamError(f"{where} holds field {block.name} coded, where its numbers as they are belong.")
         array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
         values[block.name] = torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))
     return values
+
+
+def coded_fields(payload: bytes, start: int, *, where: str) -> dict[FieldName, memoryview]:
+    """The bytes of all blocks from byte ``start`` to the end, every one coded.
+
+    Raises:
+        StreamError: as :func:`blocks_in`, or a block is not coded.
+    """
+    found: dict[FieldName, memoryview] = {}
+    for block in blocks_in(payload, start, where=where):
+        if block.coding != CODED:
+            raise StreamError(f"{where} holds field {block.name} as it is, where it should be coded.")
+        found[block.name] = memoryview(payload)[block.data : block.end]
+    return found

@@ -21,6 +21,7 @@ from structgstream.codec.table_choice import chosen_tables
 from structgstream.codec.table_sets import decoded_tables
 from structgstream.codec.tables import FrequencyTables, geometric
 from structgstream.errors import StreamError
+from structgstream.scene.state import FieldName
 
 Bins = NDArray[np.int32]
 Naturals = NDArray[np.int64]
@@ -129,9 +130,9 @@ class Encoder:
 class Decoder:
     """Reads what :class:`Encoder` wrote into the fields."""
 
-    def __init__(self, tables: Tables, fields: Mapping[str, bytes | memoryview], *, where: str) -> None:
+    def __init__(self, tables: Tables, fields: Mapping[FieldName, bytes | memoryview], *, where: str) -> None:
         self._tables = tables
-        self._left = {name: memoryview(data) for name, data in fields.items()}
+        self._left: dict[str, memoryview] = {name: memoryview(data) for name, data in fields.items()}
         self._where = where
 
     def flags(self, name: str, values: Flags | None, contexts: Contexts, *, count: int) -> Flags:

@@ -3,10 +3,12 @@
 
 import math
 import struct
+from collections.abc import Set
 
 from torch import Tensor
 
-from structgstream.codec.blocks import blocks_in, unpacked_blocks
+from structgstream.codec.blocks import blocks_in, coded_fields, unpacked_blocks
+from structgstream.codec.compact import CompactDecoder, CompactState
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.shapes import check_shapes
 from structgstream.errors import StreamError
@@ -32,34 +34,48 @@ def packet_of(payload: bytes, kind: PacketKind) -> Packet:
 
 
 class SceneDecoder:
-    """Decodes the packets of one stream. With the ``raw`` codec every packet stands alone.
+    """Decodes the packets of one stream, in order: a delta packet follows the packet before it.
+
+    With the ``raw`` codec every packet stands alone, and so does every key packet.
 
     Raises:
-        StreamError: the stream has a codec that this version does not know.
+        StreamError: the stream has a codec that this version does not know, or its header does not fit it.
     """
 
     def __init__(self, header: StreamHeader) -> None:
-        if header.codec != "raw":
-            raise StreamError(
-                f"The stream is coded with {header.codec!r}; this version knows 'raw'. Install a newer structgstream."
-            )
         self._header = header
+        self._compact = None if header.codec == "raw" else CompactDecoder(header)
+
+    @property
+    def state(self) -> CompactState | None:
+        """What the ``compact`` codec goes on from."""
+        return None if self._compact is None else self._compact.state
 
     def decode(self, packet: Packet) -> Scene:
         """The scene of one frame, on the CPU, in normalised units.
 
         Raises:
-            StreamError: the packet's fields are not the header's dynamic ones, or their shapes contradict each other.
+            StreamError: the packet's fields are not the header's dynamic ones, their shapes contradict each other, or
+                it needs a packet that has not been decoded.
         """
         header, where = self._header, f"Packet {packet.index}"
-        dynamic = unpacked_blocks(packet.payload, FRAME.size, where=where)
-        if dynamic.keys() != header.dynamic:
-            raise StreamError(
-                f"{where} holds {', '.join(sorted(dynamic)) or 'no field'}; "
-                f"the header announces {', '.join(sorted(header.dynamic)) or 'none'}."
-            )
+        if self._compact is None:
+            dynamic = unpacked_blocks(packet.payload, FRAME.size, where=where)
+        else:
+            coded = coded_fields(packet.payload, FRAME.size, where=where)
+            _check_fields(coded.keys(), header, where)
+            dynamic = self._compact.decode(coded, kind=packet.kind, index=packet.index)
+        _check_fields(dynamic.keys(), header, where)
         fields: dict[FieldName, Tensor] = {**header.static, **dynamic}
         check_shapes(
             fields, distance_input=header.distance_input, training_cameras=len(header.rig.training), where=where
         )
         return scene_of(fields, distance_input=header.distance_input)
+
+
+def _check_fields(names: Set[FieldName], header: StreamHeader, where: str) -> None:
+    if names != header.dynamic:
+        raise StreamError(
+            f"{where} holds {', '.join(sorted(names)) or 'no field'}; "
+            f"the header announces {', '.join(sorted(header.dynamic)) or 'none'}."
+        )

@@ -10,7 +10,8 @@ decodes the bytes it has just made and returns that. Without it trainer and view
 import math
 from dataclasses import dataclass
 
-from structgstream.codec.blocks import packed_block
+from structgstream.codec.blocks import coded_block, packed_block
+from structgstream.codec.compact import CompactEncoder
 from structgstream.codec.decoder import FRAME, SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StreamError
@@ -32,7 +33,20 @@ class SceneEncoder:
     def __init__(self, header: StreamHeader) -> None:
         self._header = header
         self._decoder = SceneDecoder(header)
+        self._compact = None if header.codec == "raw" else CompactEncoder(header)
         self._last_pts_seconds = -math.inf
+
+    def follow(self, packet: Packet) -> Scene:
+        """Go on after ``packet``, which another encoder made, with what it says; needed after every packet of a group.
+
+        Raises:
+            StreamError: it does not follow the packet before it, or is damaged.
+        """
+        scene = self._decoder.decode(packet)
+        if self._compact is not None:
+            self._compact.follow(self._decoder.state)
+        self._last_pts_seconds = packet.pts_seconds
+        return scene
 
     def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded:
         """The packet of one frame.
@@ -49,10 +63,14 @@ class SceneEncoder:
         state = state_of(scene)
         lengths: dict[FieldName, int] = {}
         parts = [FRAME.pack(index, pts_seconds)]
+        coded = None if self._compact is None else self._compact.encode(state, kind=kind, index=index)
         for row in STATE_TABLE:
             if row.name in self._header.dynamic:
-                parts.append(packed_block(row.name, state[row.name]))
-                lengths[row.name] = len(parts[-1])
+                block = (
+                    packed_block(row.name, state[row.name]) if coded is None else coded_block(row.name, coded[row.name])
+                )
+                parts.append(block)
+                lengths[row.name] = len(block)
         packet = Packet(kind, index, pts_seconds, b"".join(parts), lengths)
         encoded = Encoded(packet, self._decoder.decode(packet))
         self._last_pts_seconds = pts_seconds

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
@@ -48,11 +49,13 @@ def packed_header(header: StreamHeader) -> bytes:
         "distance_input": header.distance_input,
         "config": header.config,
         "metadata": header.metadata,
+        **({"steps": dict(header.steps)} if header.steps else {}),
     }
     text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
     packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
     static = [packed_block(f.name, header.static[f.name]) for f in STATE_TABLE if f.name not in header.dynamic]
-    return LENGTH.pack(len(packed)) + packed + b"".join(static)
+    reference = [packed_block(f.name, header.reference[f.name]) for f in STATE_TABLE if f.name in header.reference]
+    return LENGTH.pack(len(packed)) + packed + b"".join(static + reference)
 
 
 def unpacked_header(payload: bytes) -> StreamHeader:
@@ -71,10 +74,10 @@ def unpacked_header(payload: bytes) -> StreamHeader:
         header = _header(_description(payload[LENGTH.size : LENGTH.size + length]), static)
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, ZstdError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
-    if header.dynamic | header.static.keys() != _FIELDS or header.dynamic & header.static.keys():
+    if header.dynamic | header.static.keys() != _FIELDS or (header.reference and header.codec == "raw"):
         raise StreamError("The init record does not hold every field that packets leave out, and only those.")
     check_shapes(
-        header.static,
+        {**header.static, **header.reference},
         distance_input=header.distance_input,
         training_cameras=len(header.rig.training),
         where="The init record",
@@ -94,6 +97,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
     cameras = {entry["name"]: _camera(entry) for entry in description["cameras"]}
     if len(cameras) != len(description["cameras"]) or not all(isinstance(name, str) for name in cameras):
         raise ValueError("camera names must be texts, each used once")
+    dynamic: frozenset[FieldName] = frozenset(description["dynamic"])
     x, y, z = (_number(value) for value in description["similarity"]["center"])
     plain = [description["config"], description["metadata"]]
     if not all(isinstance(value, dict) for value in plain) or not isinstance(description["distance_input"], bool):
@@ -103,12 +107,21 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),
         fps=_positive(description["fps"]),
         codec=str(description["codec"]),
-        dynamic=frozenset(description["dynamic"]),
-        static=static,
+        dynamic=dynamic,
+        static={name: value for name, value in static.items() if name not in dynamic},
         distance_input=description["distance_input"],
         config=description["config"],
         metadata=description["metadata"],
+        steps={str(name): _step(value) for name, value in description.get("steps", {}).items()},
+        reference={name: value for name, value in static.items() if name in dynamic},
     )
+
+
+def _step(value: object) -> float:
+    step = _positive(value)
+    if float(np.float32(step)) != step:
+        raise ValueError(f"the step {value!r}, which is no float32 number")
+    return step
 
 
 def _camera(entry: dict[str, Any]) -> Camera:

@@ -2,7 +2,7 @@
 """The nouns of a stream: its header, its packets, and where packets go."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Protocol
 
@@ -21,12 +21,14 @@ class StreamHeader:
         rig: every camera of the capture, in the capture's own units, with the held-out set of the training run.
         similarity: from the capture's units to the scene's.
         fps: frames per second of the media.
-        codec: how fields are coded; version 1 of the format knows ``raw``.
+        codec: how fields are coded: ``raw`` or ``compact``.
         dynamic: the fields that packets carry; all others are in ``static``.
         static: the fields that hold for the whole stream, exactly as the decoder uses them.
         distance_input: whether the MLPs see the distance.
         config: the resolved configuration of the run, as plain JSON values.
         metadata: capture name, creator, start frame and the like, as plain JSON values.
+        steps: of the ``compact`` codec, by name (``bins.py``); each is a float32 number.
+        reference: of the ``compact`` codec, the dynamic fields that key packets change: those of anchors and MLPs.
     """
 
     rig: CameraRig
@@ -38,6 +40,8 @@ class StreamHeader:
     distance_input: bool
     config: Mapping[str, Any]
     metadata: Mapping[str, Any]
+    steps: Mapping[str, float] = field(default_factory=dict)
+    reference: Mapping[FieldName, Tensor] = field(default_factory=dict)
 
 
 class PacketKind(IntEnum):

@@ -19,7 +19,7 @@ from structgstream.codec.blocks import blocks_in
 from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
 from structgstream.codec.header import unpacked_header
 from structgstream.codec.index import indexed_offsets
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.records import (
     CHECKSUM,
     PREFIX,
@@ -39,6 +39,9 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName
 
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
+
+
+NOTHING = -2  # no frame follows it
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,7 @@ class StreamReader:
             end = self._scan(end)
         self.cut_reason = None if self.complete else why_stopped(data, end)
         self._decoder = SceneDecoder(self.header)
+        self._decoded = NOTHING
 
     def _scan(self, end: int) -> int:
         """Verify every record from byte ``end`` on; returns where the last whole one ends."""
@@ -194,13 +198,35 @@ class StreamReader:
         if not 0 <= index < len(self):
             have = f"frames 0 to {len(self) - 1}" if self.packets else "no whole frame"
             raise StreamError(f"{self._name} has {have}; there is no frame {index}.")
+        follows = index == self._decoded + 1
+        self._decoded = NOTHING  # Until a packet has been decoded.
+        scene: Scene | None = None
+        for packet in [self._packet(index)] if follows else self.group(index):
+            scene = self._decoder.decode(packet)
+        assert scene is not None, "a group holds the frame that was asked for"
+        self._decoded = index
+        return scene
+
+    def group(self, index: int) -> Iterator[Packet]:
+        """The packets that frame ``index`` needs, from a key packet to its own; with ``raw`` its own alone.
+
+        Raises:
+            StreamError: one has been damaged.
+        """
+        first = index
+        while self.header.codec != "raw" and self.packets[first].kind is not PacketKind.KEY:
+            first -= 1
+        for number in range(first, index + 1):
+            yield self._packet(number)
+
+    def _packet(self, index: int) -> Packet:
         record = record_at(self._data, self.packets.offsets[index])
         if record is None or record.type not in _KINDS:
             raise self.packets.damaged(index)
         packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
         if packet.index != index:
             raise self.packets.damaged(index)
-        return self._decoder.decode(packet)
+        return packet
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
         """Every frame from ``start`` on, one at a time."""

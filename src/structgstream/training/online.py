@@ -9,6 +9,7 @@
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -116,6 +117,7 @@ def fit_next_frame(
     backend: Backend,
     seed: int,
     before: MultiViewFrame | None = None,
+    steps: Mapping[str, float] | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult:
     """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
@@ -127,6 +129,7 @@ def fit_next_frame(
         config: what may change, and how.
         backend: what computes.
         seed: all randomness comes from it, so a frame can be repeated alone.
+        steps: of what is sent rounded (Note [Bins]); what it names is drawn rounded and comes back so.
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
@@ -138,7 +141,7 @@ def fit_next_frame(
 
     def fitted(stepping: Backend) -> FitResult:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
-        fit = _Fit(config, backend, stepping, frame.index, generator, watch, on_step)
+        fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
         if earlier is None:
             return fit.run(scene, views)
         with watch.stage("find motion"):
@@ -171,6 +174,7 @@ class _Fit:
     frame_index: int
     generator: torch.Generator
     watch: Stopwatch
+    steps: Mapping[str, float]
     on_step: StepListener | None
 
     def run(self, scene: Scene, views: list[View], *, partition: Partition | None = None) -> FitResult:
@@ -183,10 +187,10 @@ class _Fit:
         patch_at = math.ceil(patching.iteration * len(seen) / len(views))
         order = shuffled_views(seen, self.generator)
         dynamic = config.dynamic if partition is None else config.dynamic.difference(SHARED_FIELDS)
-        steps = config.rounding.steps
-        parameters = Parameters.of(scene, trained=parameters_of_fields(dynamic), steps=steps)
-        start = {name: parameters.values[name].detach().clone() for name in steps}
-        rate = Rate(config.rounding.rate_weight, start, steps) if config.rounding.rate_weight > 0.0 else None
+        trained = parameters_of_fields(dynamic)
+        steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
+        parameters = Parameters.of(scene, trained=trained, steps=steps)
+        rate = Rate.of(parameters, steps, weight=config.rounding.rate_weight)
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
@@ -205,7 +209,7 @@ class _Fit:
                 focus=None if places is None else places[view.index],
             )
             if rate is not None:
-                loss = replace(loss, total=loss.total + rate.of(parameters.values))
+                loss = replace(loss, total=loss.total + rate.price(parameters.values))
             gradients, screen_gradient = gradients_of(loss, parameters, watch)
             if iteration > iterations - len(seen):
                 last_pass.add(loss, view)

@@ -15,8 +15,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from structgstream.cameras import CameraRig
+
 if TYPE_CHECKING:
-    from structgstream.training.parameters import ParameterName
+    from structgstream.training.parameters import ParameterName, Parameters
+
+ANCHOR_FIELDS: "tuple[ParameterName, ...]" = ("anchor_positions", "offset_scales", "base_scales")
 
 
 class _Rounded(torch.autograd.Function):
@@ -36,19 +40,54 @@ def rounded(value: Tensor, step: float) -> Tensor:
 
 @dataclass(frozen=True)
 class RoundingConfig:
-    """Steps of what is sent, in units of the normalised scene; 0: as it is."""
+    """How fine what is sent is, for a stream with the codec ``compact``."""
 
-    position_step: float = 0.0
-    scale_step: float = 0.0
-    """Of logarithms."""
-    rate_weight: float = 0.0
-    """Weight of an anchor's bits in the loss."""
+    position_pixels: float = 0.25
+    """Step of positions, as seen by a typical camera at a typical distance: less cannot be seen."""
+    log_scale_step: float = 0.02
+    weight_step: float = 0.002
+    """Of the weights of MLPs."""
+    free_log_scale_step: float = 0.05
+    free_quat_step: float = 1 / 64
+    free_logit_opacity_step: float = 0.125
+    free_color_step: float = 1 / 128
+    rate_weight: float = 1e-4
+    """Weight in the loss of the bits of a moving anchor."""
 
-    @property
-    def steps(self) -> "dict[ParameterName, float]":
-        """Steps by name of what is rounded."""
-        steps: dict[ParameterName, float] = {"anchor_positions": self.position_step, "offset_scales": self.scale_step}
-        return {name: step for name, step in steps.items() if step > 0.0}
+    def steps(self, pixel: float) -> dict[str, float]:
+        """The step of everything that can change, by name; ``pixel`` is what one covers, in units of the scene."""
+        return {
+            "anchor_positions": self.position_pixels * pixel,
+            "offset_scales": self.log_scale_step,
+            "base_scales": self.log_scale_step,
+            "opacity_mlp": self.weight_step,
+            "color_mlp": self.weight_step,
+            "covariance_mlp": self.weight_step,
+            "free_means": self.position_pixels * pixel,
+            "free_log_scales": self.free_log_scale_step,
+            "free_quats": self.free_quat_step,
+            "free_logit_opacities": self.free_logit_opacity_step,
+            "free_colors": self.free_color_step,
+        }
+
+
+def pixel_size(positions: Tensor, rig: CameraRig) -> float:
+    """What a pixel covers at the median distance of what the median training camera sees, in units of the scene.
+
+    Args:
+        positions: ``[M, 3]`` of anchors.
+        rig: in units of the scene.
+    """
+    sizes = []
+    for name in rig.training:
+        viewmat, K, _ = rig[name].beside(positions)
+        points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = (points @ K.T)[:, :2] / points[:, 2:]
+        size = pixels.new_tensor([rig[name].width, rig[name].height])
+        seen = (points[:, 2] > rig[name].near) & ((pixels >= 0) & (pixels < size)).all(1)
+        if seen.any():
+            sizes.append(float(points[seen, 2].median() / K[0, 0]))
+    return float(torch.tensor(sizes).median())
 
 
 @dataclass(frozen=True)
@@ -65,8 +104,16 @@ class Rate:
     before: "Mapping[ParameterName, Tensor]"
     steps: "Mapping[ParameterName, float]"
 
-    def of(self, values: "Mapping[ParameterName, Tensor]") -> Tensor:
-        """The weighted price of leaving the bins of the last frame: log2(1 + distance in bins), a mean over anchors."""
+    @classmethod
+    def of(cls, parameters: "Parameters", steps: "Mapping[ParameterName, float]", *, weight: float) -> "Rate | None":
+        """The price of leaving what ``parameters`` are now; None for nothing."""
+        paid: dict[ParameterName, float] = {name: steps[name] for name in ANCHOR_FIELDS if name in steps}
+        if not paid or weight <= 0.0:
+            return None
+        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid)
+
+    def price(self, values: "Mapping[ParameterName, Tensor]") -> Tensor:
+        """log2(1 + distance in bins), summed over an anchor, a mean over anchors, weighted."""
         bits = [
             torch.log2(1.0 + (values[name] - self.before[name]).abs() / step).sum() / max(len(self.before[name]), 1)
             for name, step in self.steps.items()
