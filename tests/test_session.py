@@ -62,7 +62,7 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         seeds.append(seed)
         return FitResult(small_scene(seed=seed % 1000), 1, 20.0)
 
-    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None):
+    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None, steps=None):
         seeds.append(seed)
         return FitResult(moved(scene, seed % 7), 1, 21.0, spawned=2, pruned=1, seconds={"render": 0.5})
 
@@ -102,7 +102,7 @@ def test_every_frame_is_reported_and_readable(quick_fits: list[int]) -> None:
 def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     started_from = []
 
-    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None):
+    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None, steps=None):
         """A trainer that touches a static field, which no packet carries."""
         started_from.append(scene)
         fitted = moved(scene, frame.index)
@@ -259,6 +259,7 @@ def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[in
         "points",
         "normalised_radius",
         "key_interval_seconds",
+        "codec",
         "seed",
     }
 

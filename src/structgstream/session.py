@@ -163,9 +163,9 @@ class Session:
             peaks.end("fit")
             fitted = time.perf_counter()
             fitted_scene = fit.scene
+            if scene is None and self._config.codec == "compact":
+                fitted_scene = in_space_order(fitted_scene)
             if encoder is None:
-                if self._config.codec == "compact":
-                    fitted_scene = in_space_order(fitted_scene)
                 header = self._header(fitted_scene)
                 encoder, steps = SceneEncoder(header), header.steps
                 self._sink.open(header)

@@ -27,8 +27,8 @@ def test_a_packet_states_its_frame() -> None:
 
 
 def test_another_codec_is_refused() -> None:
-    with pytest.raises(StreamError, match="coded with 'compact'; this version knows 'raw'. Install a newer"):
-        SceneDecoder(replace(HEADER, codec="compact"))
+    with pytest.raises(StreamError, match="coded with 'tiny'; this version knows 'raw' and 'compact'. Install a newer"):
+        SceneDecoder(replace(HEADER, codec="tiny"))
 
 
 def test_fields_that_the_header_does_not_announce() -> None:

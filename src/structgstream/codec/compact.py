@@ -106,6 +106,9 @@ class CompactEncoder(_Compact):
         after = binned(state, self._header.dynamic, self._header.steps)
         if after.anchors.shape != before.anchors.shape:
             raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
+        for name, bins in after.weights.items():
+            if bins.shape != before.weights[name].shape:
+                raise StreamError(f"Frame {index} has {name} of another size than the header.")
         encoder = Encoder(tables)
         self._keep(kind, index, self._coded(encoder, after, before, index), tables)
         return {name: encoder.fields.get(name, b"") for name in self._header.dynamic}

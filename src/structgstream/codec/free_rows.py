@@ -18,6 +18,8 @@ GROUPS = (
     ("free.logit_opacities", 10, 11),
     ("free.colors", 11, 14),
 )
+MOST_FREE = 2**18
+"""Free Gaussians that a scene may have: a symbol can take less than a bit, so bytes do not bound their number."""
 _FRAME_BITS = 32  # a birth is frame * 2^32 + number
 
 
@@ -49,7 +51,7 @@ def coded_free(coder: Coder, after: FreeBins | None, before: FreeBins, *, where:
     """Codes what becomes of ``before``; of ``after``, births and bins are looked at.
 
     Raises:
-        StreamError: births do not ascend.
+        StreamError: births do not ascend or are out of range, or there are too many.
     """
     alive = None if after is None else np.isin(before.births, after.births)
     contexts = before.change.active.astype(np.uint16)
@@ -66,7 +68,7 @@ def coded_free(coder: Coder, after: FreeBins | None, before: FreeBins, *, where:
         change = Change.of(after.bins[kept] - old.bins)
         new = FreeBins(after.births[~kept], after.bins[~kept], Change.none(0, FREE_COLUMNS))
     change = coded_change(coder, change, old.change, groups=GROUPS)
-    born = _coded_births(coder, new, where=where)
+    born = _coded_births(coder, new, most=MOST_FREE - len(old.births), where=where)
     births = np.concatenate([old.births, born.births])
     if not (np.diff(births) > 0).all():
         raise StreamError(f"{where} has births that do not ascend; it is damaged.")
@@ -80,13 +82,17 @@ def coded_free(coder: Coder, after: FreeBins | None, before: FreeBins, *, where:
     )
 
 
-def _coded_births(coder: Coder, new: FreeBins | None, *, where: str) -> FreeBins:
+def _coded_births(coder: Coder, new: FreeBins | None, *, most: int, where: str) -> FreeBins:
     count = coder.number("free_births.count", None if new is None else len(new.births))
+    if count > most:
+        raise StreamError(f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}.")
     if not count:
         return FreeBins.none()
     nothing = np.zeros(count, np.uint16)
     frames = numbers = fresh = None
     if new is not None:
+        if int(new.births.min()) < 0:
+            raise StreamError(f"{where} has births below 0.")
         frames = np.diff(new.births >> _FRAME_BITS, prepend=0)
         numbers = np.diff(new.births & (1 << _FRAME_BITS) - 1, prepend=0)
         fresh = frames != 0
@@ -94,7 +100,10 @@ def _coded_births(coder: Coder, new: FreeBins | None, *, where: str) -> FreeBins
     frames = coder.naturals("free_births.frame", frames, nothing, count=1)
     fresh = frames != 0
     numbers = coder.naturals("free_births.number", numbers, fresh.astype(np.uint16), count=2)
-    births = (np.cumsum(frames) << _FRAME_BITS) + _restarted_sums(numbers, fresh)
+    frame, number = np.cumsum(frames), _restarted_sums(numbers, fresh)
+    if int(frame[-1]) >= 1 << 31 or int(number.max()) >= 1 << _FRAME_BITS:
+        raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
+    births = (frame << _FRAME_BITS) + number
     columns = np.tile(np.arange(FREE_COLUMNS, dtype=np.uint16), (count, 1))
     steps = None if new is None else _zigzag(np.diff(new.bins.astype(np.int64), axis=0, prepend=0)).ravel()
     contexts: Contexts = columns.ravel()

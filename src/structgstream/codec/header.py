@@ -24,6 +24,7 @@ MAX_JSON_BYTES = 16 * 2**20
 MAX_IMAGE_SIDE = 65_535
 LENGTH = struct.Struct("<I")
 _ZSTD_LEVEL = 19
+_LEAST_STEP = 2.0**-64
 _FIELDS = frozenset(field.name for field in STATE_TABLE)
 
 
@@ -99,9 +100,10 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         raise ValueError("camera names must be texts, each used once")
     dynamic: frozenset[FieldName] = frozenset(description["dynamic"])
     x, y, z = (_number(value) for value in description["similarity"]["center"])
-    plain = [description["config"], description["metadata"]]
+    steps = description.get("steps", {})
+    plain = [description["config"], description["metadata"], steps]
     if not all(isinstance(value, dict) for value in plain) or not isinstance(description["distance_input"], bool):
-        raise TypeError("config and metadata must be objects, distance_input true or false")
+        raise TypeError("config, metadata and steps must be objects, distance_input true or false")
     return StreamHeader(
         rig=CameraRig(cameras, frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])),
         similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),
@@ -112,15 +114,15 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         distance_input=description["distance_input"],
         config=description["config"],
         metadata=description["metadata"],
-        steps={str(name): _step(value) for name, value in description.get("steps", {}).items()},
+        steps={name: _step(value) for name, value in steps.items()},
         reference={name: value for name, value in static.items() if name in dynamic},
     )
 
 
 def _step(value: object) -> float:
-    step = _positive(value)
-    if float(np.float32(step)) != step:
-        raise ValueError(f"the step {value!r}, which is no float32 number")
+    # Within these bounds the product of a step and a bin is neither infinite nor denormal.
+    if not _LEAST_STEP <= (step := _positive(value)) <= 1 / _LEAST_STEP or float(np.float32(step)) != step:
+        raise ValueError(f"the step {value!r}; it must be a float32 number from 2^-64 to 2^64")
     return step
 
 
