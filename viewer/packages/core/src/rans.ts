@@ -1,0 +1,119 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Sections of entropy-coded symbols: interleaved rANS (docs/entropy.md, section Symbols). */
+
+import { StreamError } from "./errors.js";
+import { viewOf } from "./records.js";
+import { type FrequencyTables, TOTAL } from "./tables.js";
+
+const LANES = [1, 4, 32];
+const MAX_SYMBOLS = 2 ** 31 - 1;
+
+/** What a section states: `start` is where its states begin, `bytes` how long it is. */
+export interface SectionHead {
+  readonly symbols: number;
+  readonly words: number;
+  readonly lanes: number;
+  readonly start: number;
+  readonly bytes: number;
+}
+
+/**
+ * The head of the section that begins at `data`, which anything may follow.
+ *
+ * @throws StreamError it is damaged, or the section longer than the data
+ */
+export function sectionHead(data: Uint8Array, where: string): SectionHead {
+  const [symbols, next] = varintAt(data, 0, where);
+  if (symbols === 0) return { symbols, words: 0, lanes: 0, start: next, bytes: next };
+  const [value, start] = varintAt(data, next, where);
+  const words = Math.floor(value / 4);
+  const lanes = LANES[value % 4];
+  // A symbol takes one word at most.
+  if (symbols > MAX_SYMBOLS || words > symbols || lanes === undefined) {
+    throw new StreamError(`${where} states ${symbols} symbols in ${words} words; it is damaged.`);
+  }
+  const bytes = start + 4 * lanes + 2 * words;
+  if (bytes > data.length) {
+    throw new StreamError(`${where} states ${bytes} bytes, ${data.length} are left; it is damaged.`);
+  }
+  return { symbols, words, lanes, start, bytes };
+}
+
+function varintAt(data: Uint8Array, start: number, where: string): [value: number, next: number] {
+  let value = 0;
+  for (let place = 0; place < 5 && start + place < data.length; place++) {
+    const byte = data[start + place]!;
+    value += (byte & 127) * 2 ** (7 * place);
+    if (byte < 128) return [value, start + place + 1];
+  }
+  throw new StreamError(`${where} is cut or damaged in its first bytes.`);
+}
+
+/**
+ * The symbols u8 `[n]` of the section that `data` begins with.
+ *
+ * @param contexts `[n]`, each below `tables.contexts`; their number is what the section must state
+ * @throws StreamError the section is damaged, or has not this number of symbols
+ */
+export function decodedSymbols(
+  data: Uint8Array,
+  head: SectionHead,
+  contexts: Uint8Array,
+  tables: FrequencyTables,
+  where: string,
+): Uint8Array {
+  const count = contexts.length;
+  if (head.symbols !== count) {
+    throw new StreamError(`${where} states ${head.symbols} symbols, ${count} are expected; it is damaged.`);
+  }
+  const symbols = new Uint8Array(count);
+  if (count === 0) return symbols;
+  const { lanes, start } = head;
+  const view = viewOf(data);
+  // States are below 2^32 and kept as int32: every operation below gives the same bits as on unsigned numbers.
+  const states = new Int32Array(lanes);
+  let sound = true;
+  for (let lane = 0; lane < lanes; lane++) {
+    states[lane] = view.getInt32(start + 4 * lane, true);
+    sound &&= states[lane]! >>> 16 !== 0;
+  }
+  const starts = startsOf(tables);
+  const width = tables.alphabet + 1;
+  let word = start + 4 * lanes;
+  const end = word + 2 * head.words;
+  for (let i = 0, lane = 0; i < count && sound; i++) {
+    const x = states[lane]!;
+    const slot = x & (TOTAL - 1);
+    const row = contexts[i]! * width;
+    let place = row;
+    while (starts[place + 1]! <= slot) place++;
+    const first = starts[place]!;
+    let next = (Math.imul(starts[place + 1]! - first, x >>> 12) + slot - first) | 0;
+    if (next >>> 16 === 0) {
+      sound = word < end;
+      next = (next << 16) | data[word]! | (data[word + 1]! << 8);
+      word += 2;
+    }
+    states[lane] = next;
+    symbols[i] = place - row;
+    lane = lane + 1 === lanes ? 0 : lane + 1;
+  }
+  if (!sound || word !== end || states.some((state) => state !== TOTAL << 4)) {
+    throw new StreamError(`${where} is damaged: its words and final states contradict each other.`);
+  }
+  return symbols;
+}
+
+/** Sums of the frequencies before each symbol and of all, `[contexts, alphabet + 1]`. */
+function startsOf(tables: FrequencyTables): Uint16Array {
+  const { contexts, alphabet, rows } = tables;
+  const starts = new Uint16Array(contexts * (alphabet + 1));
+  for (let context = 0; context < contexts; context++) {
+    let sum = 0;
+    for (let symbol = 0; symbol < alphabet; symbol++) {
+      sum += rows[context * alphabet + symbol]!;
+      starts[context * (alphabet + 1) + symbol + 1] = sum;
+    }
+  }
+  return starts;
+}

@@ -1,0 +1,86 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Records: the frame of everything in a stream file (docs/bitstream.md, sections Prefix and Records). */
+
+import { StreamError } from "./errors.js";
+
+export const RecordType = { init: 1, key: 2, delta: 3, index: 4 } as const;
+export const MAJOR = 1;
+export const PREFIX_BYTES = 12;
+export const HEAD_BYTES = 8;
+export const CHECKSUM_BYTES = 4;
+const MAGIC = [0x89, 0x53, 0x47, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
+
+/** One record; `offset` is where its first byte is in the stream. */
+export interface StreamRecord {
+  readonly type: number;
+  readonly payload: Uint8Array;
+  readonly offset: number;
+}
+
+let crcTable: Uint32Array | undefined;
+
+function madeCrcTable(): Uint32Array {
+  const table = new Uint32Array(256);
+  for (let byte = 0; byte < 256; byte++) {
+    let rest = byte;
+    for (let bit = 0; bit < 8; bit++) rest = rest & 1 ? (rest >>> 1) ^ 0xedb88320 : rest >>> 1;
+    table[byte] = rest;
+  }
+  return table;
+}
+
+/** CRC-32 as in zlib and PNG. */
+export function crc32(bytes: Uint8Array): number {
+  crcTable ??= madeCrcTable();
+  const table = crcTable;
+  let crc = -1;
+  for (let i = 0; i < bytes.length; i++) crc = (crc >>> 8) ^ table[(crc ^ bytes[i]!) & 255]!;
+  return ~crc >>> 0;
+}
+
+export function viewOf(bytes: Uint8Array): DataView {
+  return new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+}
+
+/** Whether `bytes` may be the beginning of a stream: as much of the signature as is there is right. */
+export function isSignature(bytes: Uint8Array): boolean {
+  return MAGIC.every((byte, i) => i >= bytes.length || bytes[i] === byte);
+}
+
+/**
+ * Refuses what is not a stream of this major version.
+ *
+ * @param bytes the first 12 bytes, or fewer where the stream is cut
+ * @throws StreamError with what was found and what to do
+ */
+export function checkPrefix(bytes: Uint8Array, name: string): void {
+  if (!isSignature(bytes)) {
+    throw new StreamError(`${name} is not a structgstream file: its first bytes are not the format's signature.`);
+  }
+  if (bytes.length < PREFIX_BYTES) {
+    throw new StreamError(`${name} is cut at byte ${bytes.length}, before anything that can be shown.`);
+  }
+  const view = viewOf(bytes);
+  const major = view.getUint16(8, true);
+  if (major !== MAJOR) {
+    const version = `${major}.${view.getUint16(10, true)}`;
+    throw new StreamError(`${name} has format version ${version}; this program reads ${MAJOR}.x. Use a newer one.`);
+  }
+}
+
+/** Bytes of the whole record that `head` (8 bytes) begins: nothing is allocated for it. */
+export function recordBytes(head: Uint8Array): number {
+  return HEAD_BYTES + viewOf(head).getUint32(4, true) + CHECKSUM_BYTES;
+}
+
+/**
+ * The record that fills `bytes`, or undefined when it is cut or damaged. The payload is not copied.
+ *
+ * @param offset where the bytes are in the stream
+ */
+export function recordIn(bytes: Uint8Array, offset: number): StreamRecord | undefined {
+  if (bytes.length < HEAD_BYTES + CHECKSUM_BYTES || recordBytes(bytes) !== bytes.length) return undefined;
+  const end = bytes.length - CHECKSUM_BYTES;
+  if (viewOf(bytes).getUint32(end, true) !== crc32(bytes.subarray(0, end))) return undefined;
+  return { type: bytes[0]!, payload: bytes.subarray(HEAD_BYTES, end), offset };
+}
