@@ -1,0 +1,100 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Field blocks: one field of the scene as bytes (docs/bitstream.md, section Field blocks). */
+
+import { StreamError } from "./errors.js";
+import { type FieldName, fieldOf, type Tensor } from "./fields.js";
+import { viewOf } from "./records.js";
+
+const HEAD_BYTES = 4;
+const RAW = 0;
+const CODED = 1;
+const MAX_DIMENSIONS = 4;
+const MAX_ELEMENTS = 2 ** 31 - 1;
+
+/** Where one field is in a payload; nothing is copied, and everything stated has been checked against the payload. */
+export interface Block {
+  readonly name: FieldName;
+  readonly coded: boolean;
+  readonly itemBytes: number;
+  readonly shape: readonly number[];
+  readonly start: number;
+  readonly data: number;
+  readonly end: number;
+}
+
+function itemBytesOf(coding: number, type: number, dimensions: number): number | undefined {
+  if (dimensions > MAX_DIMENSIONS) return undefined;
+  if (coding === RAW) return type === 0 ? 4 : type === 1 ? 8 : undefined;
+  return coding === CODED && type === 2 && dimensions === 1 ? 1 : undefined;
+}
+
+/**
+ * Every block from byte `start` to the end.
+ *
+ * @throws StreamError an unknown field or coding, a field that comes twice, or a size that does not fit the payload
+ */
+export function blocksIn(payload: Uint8Array, start: number, where: string): Block[] {
+  const view = viewOf(payload);
+  const blocks: Block[] = [];
+  for (let at = start; at < payload.length; ) {
+    if (at + HEAD_BYTES > payload.length) throw new StreamError(`${where} ends within the head of a field block.`);
+    const [code, coding, type, dimensions] = payload.subarray(at, at + HEAD_BYTES) as unknown as [number, ...number[]];
+    const name = fieldOf(code);
+    const itemBytes = itemBytesOf(coding!, type!, dimensions!);
+    if (name === undefined || itemBytes === undefined) {
+      throw new StreamError(
+        `${where} holds a field block (field ${code}, coding ${coding}, type ${type}, ${dimensions} dimensions) that ` +
+          "this version does not know; use a newer one.",
+      );
+    }
+    if (blocks.some((block) => block.name === name)) throw new StreamError(`${where} holds field ${name} twice.`);
+    const data = at + HEAD_BYTES + 4 * dimensions!;
+    if (data > payload.length) throw new StreamError(`${where} ends within the shape of field ${name}.`);
+    const shape = Array.from({ length: dimensions! }, (_, i) => view.getUint32(at + HEAD_BYTES + 4 * i, true));
+    // Products are exact where they are within the bounds, and beyond them also when rounded. An empty tensor has no
+    // bytes to be checked against, so its other sizes get a bound of their own.
+    const bounded = shape.reduce((product, size) => product * Math.max(size, 1), 1) <= MAX_ELEMENTS;
+    const end = data + shape.reduce((product, size) => product * size, itemBytes);
+    if (!bounded || end > payload.length) {
+      throw new StreamError(`${where} states (${shape.join(", ")}) numbers for field ${name}, more than it holds.`);
+    }
+    blocks.push({ name, coded: coding === CODED, itemBytes, shape, start: at, data, end });
+    at = end;
+  }
+  return blocks;
+}
+
+/**
+ * The tensors of all blocks from byte `start` to the end, copied byte by byte (NaNs keep their bits), which takes a
+ * little-endian machine; WebGPU and WebAssembly run on no other.
+ *
+ * @throws StreamError as {@link blocksIn}, or a block is coded
+ */
+export function unpackedBlocks(payload: Uint8Array, start: number, where: string): Map<FieldName, Tensor> {
+  const fields = new Map<FieldName, Tensor>();
+  for (const block of blocksIn(payload, start, where)) {
+    if (block.coded) {
+      throw new StreamError(`${where} holds field ${block.name} coded, where its numbers as they are belong.`);
+    }
+    const { buffer } = payload.slice(block.data, block.end);
+    const data = block.itemBytes === 8 ? new BigInt64Array(buffer) : new Float32Array(buffer);
+    fields.set(block.name, { shape: block.shape, data });
+  }
+  return fields;
+}
+
+/**
+ * The bytes of all blocks from byte `start` to the end, every one coded; they are not copied.
+ *
+ * @throws StreamError as {@link blocksIn}, or a block is not coded
+ */
+export function codedFields(payload: Uint8Array, start: number, where: string): Map<FieldName, Uint8Array> {
+  const fields = new Map<FieldName, Uint8Array>();
+  for (const block of blocksIn(payload, start, where)) {
+    if (!block.coded) {
+      throw new StreamError(`${where} holds field ${block.name} as it is, where it should be coded.`);
+    }
+    fields.set(block.name, payload.subarray(block.data, block.end));
+  }
+  return fields;
+}

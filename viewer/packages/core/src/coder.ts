@@ -1,0 +1,117 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Arrays of whole numbers from the sections of a packet's fields (docs/bitstream.md, codec `compact`). */
+
+import { BitReader } from "./bits.js";
+import { StreamError } from "./errors.js";
+import type { FieldName } from "./fields.js";
+import { decodedSymbols, sectionHead } from "./rans.js";
+import { RESIDUAL_ALPHABET, residualsOf } from "./residualSymbols.js";
+import { decodedTables, type FrequencyTables, geometric } from "./tables.js";
+
+const CLASSES = 32; // bit lengths of natural numbers below 2^31
+const FLAT = 128; // of the geometric rows: what is expected of a context that has not been seen
+
+/** The frequency tables that both sides hold, by name; what was not used yet is a geometric guess. */
+export class Tables {
+  private readonly sets: Map<string, FrequencyTables>;
+
+  constructor(other?: Tables) {
+    this.sets = new Map(other?.sets);
+  }
+
+  get(name: string, contexts: number, alphabet: number): FrequencyTables {
+    return this.sets.get(name) ?? geometric(FLAT, contexts, alphabet);
+  }
+
+  put(name: string, tables: FrequencyTables): void {
+    this.sets.set(name, tables);
+  }
+}
+
+/** Decodes one section after another; what a name says before its dot is the field whose bytes it reads. */
+export class Decoder {
+  private readonly left: Map<string, Uint8Array>;
+
+  /** @param where subject of error messages */
+  constructor(
+    private readonly tables: Tables,
+    fields: ReadonlyMap<FieldName, Uint8Array>,
+    private readonly where: string,
+  ) {
+    this.left = new Map(fields);
+  }
+
+  /** Yes (1) or no (0), `[n]`, with contexts `[n]` below `count`. */
+  flags(name: string, contexts: Uint8Array, count: number): Uint8Array {
+    return this.section(name, contexts, count, 2);
+  }
+
+  /** Signed numbers `[n]` of 32 bits. */
+  residuals(name: string, contexts: Uint8Array, count: number): Int32Array {
+    const symbols = this.section(name, contexts, count, RESIDUAL_ALPHABET);
+    return residualsOf(symbols, this.taken(name, this.number(name)), `${this.where}, ${name},`);
+  }
+
+  /** Numbers `[n]` from 0 to below 2^31. */
+  naturals(name: string, contexts: Uint8Array, count: number): Int32Array {
+    const sizes = this.section(name, contexts, count, CLASSES);
+    let bits = 0;
+    for (const size of sizes) bits += Math.max(size - 1, 0);
+    const reader = new BitReader(this.taken(name, Math.ceil(bits / 8)), `${this.where}, ${name},`);
+    const found = new Int32Array(sizes.length);
+    for (let i = 0; i < found.length; i++) {
+      const size = sizes[i]!;
+      if (size) found[i] = (1 << (size - 1)) + reader.fixed(size - 1);
+    }
+    reader.end();
+    return found;
+  }
+
+  /** One number from 0 to below 2^32. */
+  number(name: string): number {
+    let value = 0;
+    for (let place = 0; place < 5; place++) {
+      const byte = this.taken(name, 1)[0]!;
+      value += (byte & 127) * 2 ** (7 * place);
+      if (byte < 128 && value < 2 ** 32) return value;
+      if (byte < 128) break;
+    }
+    throw new StreamError(`${this.where}, ${name}, holds a number beyond 32 bits; it is damaged.`);
+  }
+
+  /** Nothing may be left. */
+  end(): void {
+    for (const [name, data] of this.left) {
+      if (data.length) {
+        throw new StreamError(`${this.where} has more bytes of ${name} than it should; it is damaged.`);
+      }
+    }
+  }
+
+  private section(name: string, contexts: Uint8Array, count: number, alphabet: number): Uint8Array {
+    const where = `${this.where}, ${name},`;
+    const before = this.tables.get(name, count, alphabet);
+    const tables = decodedTables(this.taken(name, this.number(name)), before, where);
+    this.tables.put(name, tables);
+    const head = sectionHead(this.leftOf(name), where);
+    return decodedSymbols(this.taken(name, head.bytes), head, contexts, tables, where);
+  }
+
+  private leftOf(name: string): Uint8Array {
+    return this.left.get(fieldIn(name)) ?? new Uint8Array(0);
+  }
+
+  private taken(name: string, size: number): Uint8Array {
+    const data = this.leftOf(name);
+    if (size > data.length) {
+      const missing = size - data.length;
+      throw new StreamError(`${this.where} ends ${missing} bytes too early in ${fieldIn(name)}; it is damaged.`);
+    }
+    this.left.set(fieldIn(name), data.subarray(size));
+    return data.subarray(0, size);
+  }
+}
+
+function fieldIn(name: string): string {
+  return name.slice(0, name.indexOf("."));
+}

@@ -1,0 +1,83 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact). */
+
+import { binned, CODABLE, decodedScene, FREE_STEPS, type SceneBins, unmoved, valued } from "./bins.js";
+import { Decoder, Tables } from "./coder.js";
+import { StreamError } from "./errors.js";
+import { type FieldName, mergedFields, type Tensor } from "./fields.js";
+import type { StreamHeader } from "./header.js";
+
+/** What is known after a packet. */
+interface CompactState {
+  readonly index: number;
+  readonly bins: SceneBins;
+  readonly tables: Tables;
+}
+
+/**
+ * Refuses a header whose packets cannot be decoded.
+ *
+ * @throws StreamError another codec, dynamic fields that cannot be coded, or no step or reference for one
+ */
+export function checkCodec(header: StreamHeader): void {
+  const { codec, dynamic, steps, reference } = header;
+  if (codec === "raw") {
+    if (reference.size)
+      throw new StreamError("The init record holds dynamic fields, which codec 'raw' has no use for.");
+    return;
+  }
+  if (codec !== "compact") {
+    throw new StreamError(
+      `The stream is coded with '${codec}'; this version knows 'raw' and 'compact'. Use a newer one.`,
+    );
+  }
+  const beyond = [...dynamic].filter((name) => !CODABLE.has(name));
+  if (beyond.length) throw new StreamError(`The compact codec has no coding for ${beyond.join(", ")}.`);
+  if (dynamic.has("free") !== dynamic.has("free_births")) {
+    throw new StreamError("The header announces free Gaussians without their births, or births without them.");
+  }
+  const rows = referenceNames(dynamic);
+  const needed: readonly string[] = dynamic.has("free") ? [...rows, ...FREE_STEPS] : rows;
+  const missing = needed.filter((name) => !steps.has(name));
+  if (missing.length) throw new StreamError(`The header states no step for ${missing.join(", ")}.`);
+  if (reference.size !== rows.length || !rows.every((name) => reference.has(name))) {
+    throw new StreamError("The header's reference state does not hold the dynamic fields of anchors and MLPs.");
+  }
+}
+
+function referenceNames(dynamic: ReadonlySet<FieldName>): FieldName[] {
+  return [...dynamic].filter((name) => name !== "free" && name !== "free_births");
+}
+
+/** Decodes the frames of one stream, in order, beginning at any key packet. A packet that throws changes nothing. */
+export class CompactDecoder {
+  private readonly reference: SceneBins;
+  private state: CompactState | undefined;
+
+  /** @throws StreamError the reference has a value that no bin stands for */
+  constructor(private readonly header: StreamHeader) {
+    const known = mergedFields(header.static, header.reference);
+    this.reference = binned(known, new Set(referenceNames(header.dynamic)), header.steps);
+  }
+
+  /**
+   * The dynamic fields of a frame.
+   *
+   * @throws StreamError the packet is damaged, or does not follow the one before it
+   */
+  decode(fields: ReadonlyMap<FieldName, Uint8Array>, isKey: boolean, index: number): Map<FieldName, Tensor> {
+    const { dynamic, steps } = this.header;
+    const where = `Packet ${index}`;
+    const start = isKey ? { bins: this.reference, tables: undefined } : this.state;
+    if (start === undefined || (!isKey && this.state?.index !== index - 1)) {
+      throw new StreamError(`${where} needs packet ${index - 1}, which was not decoded before it.`);
+    }
+    const tables = new Tables(start.tables);
+    const decoder = new Decoder(tables, fields, where);
+    const bins = decodedScene(decoder, start.bins, dynamic, where);
+    decoder.end();
+    // What a key packet changes is everything since the reference, and tells nothing of what comes next.
+    this.state = { index, bins: isKey ? unmoved(bins) : bins, tables };
+    return valued(bins, dynamic, steps);
+  }
+}

@@ -1,0 +1,80 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A packet to a scene: everything a receiver needs besides a renderer. */
+
+import { blocksIn, codedFields, unpackedBlocks } from "./blocks.js";
+import { CompactDecoder } from "./compact.js";
+import { StreamError } from "./errors.js";
+import { checkShapes, type FieldName, type Fields, mergedFields } from "./fields.js";
+import { type StreamHeader, trainingCameras } from "./header.js";
+import { viewOf } from "./records.js";
+
+export const FRAME_BYTES = 12;
+
+/** One packet: a key packet stands alone beside the header, a delta packet needs the packet before it. */
+export interface Packet {
+  readonly isKey: boolean;
+  readonly index: number;
+  readonly ptsSeconds: number;
+  readonly payload: Uint8Array;
+}
+
+/** One frame: every field of the scene, in scene units. Fields that do not change are the header's own. */
+export interface Frame {
+  readonly index: number;
+  readonly ptsSeconds: number;
+  readonly fields: Fields;
+}
+
+/**
+ * The packet in a key or delta record.
+ *
+ * @throws StreamError the payload contradicts the format
+ */
+export function packetOf(payload: Uint8Array, isKey: boolean): Packet {
+  if (payload.length < FRAME_BYTES) throw new StreamError("A packet is too short to hold its index and time.");
+  const view = viewOf(payload);
+  const index = view.getUint32(0, true);
+  const ptsSeconds = view.getFloat64(4, true);
+  if (!Number.isFinite(ptsSeconds)) {
+    throw new StreamError(`Packet ${index} has the presentation time ${ptsSeconds}, which is no time.`);
+  }
+  blocksIn(payload, FRAME_BYTES, `Packet ${index}`);
+  return { isKey, index, ptsSeconds, payload };
+}
+
+/** Decodes the packets of one stream: in order from any key packet on; with codec `raw` in any order. */
+export class SceneDecoder {
+  private readonly compact: CompactDecoder | undefined;
+
+  /** @throws StreamError the header does not fit its codec */
+  constructor(private readonly header: StreamHeader) {
+    this.compact = header.codec === "raw" ? undefined : new CompactDecoder(header);
+  }
+
+  /**
+   * The scene of one frame.
+   *
+   * @throws StreamError the packet is damaged, contradicts the header, or needs one that has not been decoded
+   */
+  decode(packet: Packet): Frame {
+    const { header, compact } = this;
+    const { payload, isKey, index, ptsSeconds } = packet;
+    const where = `Packet ${index}`;
+    const decoded = compact ? codedFields(payload, FRAME_BYTES, where) : unpackedBlocks(payload, FRAME_BYTES, where);
+    checkNames([...decoded.keys()], header, where);
+    const dynamic = compact ? compact.decode(decoded as Map<FieldName, Uint8Array>, isKey, index) : (decoded as Fields);
+    const fields = mergedFields(header.static, dynamic);
+    const facts = { distanceInput: header.distanceInput, trainingCameras: trainingCameras(header) };
+    checkShapes(fields, facts, where);
+    return { index, ptsSeconds, fields };
+  }
+}
+
+function checkNames(names: FieldName[], header: StreamHeader, where: string): void {
+  if (names.length !== header.dynamic.size || !names.every((name) => header.dynamic.has(name))) {
+    throw new StreamError(
+      `${where} holds ${names.sort().join(", ") || "no field"}; ` +
+        `the header announces ${[...header.dynamic].sort().join(", ") || "none"}.`,
+    );
+  }
+}

@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The description in the init record: JSON in one zstd frame of stated size. */
+
+import { decompress } from "fzstd";
+import { StreamError } from "./errors.js";
+import { viewOf } from "./records.js";
+
+const MAX_JSON_BYTES = 16 * 2 ** 20;
+const ZSTD_MAGIC = 0xfd2fb528;
+
+/**
+ * The value that the frame holds; its stated size is looked at before anything is unpacked.
+ *
+ * @throws StreamError it is no zstd frame, states no size or too large a one, or holds no JSON
+ */
+export function unpackedJson(frame: Uint8Array): unknown {
+  const size = contentSize(frame);
+  if (size === undefined || size > MAX_JSON_BYTES) {
+    throw new StreamError(
+      `The init record's description states ${size ?? "no"} bytes unpacked; expected at most ${MAX_JSON_BYTES}.`,
+    );
+  }
+  try {
+    // With a buffer given, the decoder allocates neither the window nor the size that the frame states.
+    const bytes = decompress(frame, new Uint8Array(size));
+    return JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes));
+  } catch (error) {
+    const reason = error instanceof Error ? error.message : String(error);
+    throw new StreamError(`The init record's description cannot be read (${reason}).`, { cause: error });
+  }
+}
+
+/** What a zstd frame (RFC 8878, section 3.1.1.1) states as its content size, if it does. */
+function contentSize(frame: Uint8Array): number | undefined {
+  if (frame.length < 5) return undefined;
+  const view = viewOf(frame);
+  if (view.getUint32(0, true) !== ZSTD_MAGIC) return undefined;
+  const descriptor = frame[4]!;
+  const singleSegment = (descriptor >> 5) & 1;
+  const code = descriptor >> 6;
+  const width = code === 0 ? singleSegment : 1 << code;
+  const at = 5 + (1 - singleSegment) + [0, 1, 2, 4][descriptor & 3]!;
+  if (width === 0 || at + width > frame.length) return undefined;
+  if (width === 1) return frame[at]!;
+  if (width === 2) return view.getUint16(at, true) + 256;
+  if (width === 4) return view.getUint32(at, true);
+  return view.getUint32(at, true) + view.getUint32(at + 4, true) * 2 ** 32;
+}
