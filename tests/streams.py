@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small streams that several tests look at."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
 
 from rigs import arc_rig, random_scene
+from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS
+from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.sinks import MemorySink
@@ -28,6 +30,19 @@ def header_for(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -
         config={"seed": 0},
         metadata={"capture": "test"},
     )
+
+
+STEPS = dict.fromkeys((*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS), 2.0 ** (-6))
+
+
+def compact_header(
+    scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC, steps: Mapping[str, float] = STEPS
+) -> StreamHeader:
+    """As :func:`header_for`, with codec ``compact``; ``scene`` is the reference."""
+    rows = dynamic.difference(["free", "free_births"])
+    used = {name: step for name, step in steps.items() if name in rows or (name in FREE_STEPS and "free" in dynamic)}
+    reference = quantised(state_of(scene), used, rows)
+    return replace(header_for(scene, dynamic=dynamic), codec="compact", steps=used, reference=reference)
 
 
 def small_scene(anchors: int = 3, *, free: int = 0, seed: int = 0) -> Scene:

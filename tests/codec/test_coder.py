@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from structgstream.codec.bits import fixed, numbers_of, packed_bits
 from structgstream.codec.coder import Decoder, Encoder, Tables, bit_lengths, varint
 from structgstream.errors import StreamError
 
@@ -90,3 +91,21 @@ def test_tables_persist_and_a_copy_goes_on_apart() -> None:
     repeated = Encoder(tables)
     repeated.residuals("one.step", values, nothing, count=1)
     assert repeated.fields == again.fields
+
+
+@given(st.lists(st.tuples(st.integers(0, 56), st.integers(0, 2**56 - 1)), max_size=40))
+def test_numbers_are_found_at_any_bit(pairs: list[tuple[int, int]]) -> None:
+    values = [value % (1 << width) for width, value in pairs]
+    widths = np.array([width for width, _ in pairs], np.int64)
+    data = packed_bits(fixed(value, width) for value, (width, _) in zip(values, pairs) if width)
+    assert numbers_of(data, widths, where="").tolist() == values
+    with pytest.raises(StreamError, match="It has .* bytes for .* bits of numbers"):
+        numbers_of(data + b"\0", widths, where="It")
+
+
+def test_what_stands_behind_the_last_number_must_be_zero() -> None:
+    """Every file that says the same is the same."""
+    assert numbers_of(b"\xa0", np.array([3]), where="").tolist() == [5]
+    for data in (b"\xa1", b"\xb0", b""):
+        with pytest.raises(StreamError, match="damaged"):
+            numbers_of(data, np.array([3]), where="It")

@@ -23,7 +23,8 @@ ANCHOR_ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base
 WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
 FREE_STEPS = ("free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors")
 _FREE_WIDTHS = (3, 3, 4, 1, 3)
-LARGEST = 2**24  # whole numbers that float32 holds
+LARGEST = 2**22
+"""Of bins: with their products rounded to float32, the nearest bin of a value is still the one it was made of."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ def coded_scene(
         free = coded_free(coder, None if after is None else after.free, before.free, where=where)
     for found in (anchors, *weights.values(), free.bins):
         if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
-            raise StreamError(f"{where} has a bin beyond 24 bits, which no value stands for; it is damaged.")
+            raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
     return SceneBins(anchors, change, weights, changes, free)
 
 

@@ -3,6 +3,9 @@
 
 from collections.abc import Iterable
 
+import numpy as np
+from numpy.typing import NDArray
+
 from structgstream.errors import StreamError
 
 
@@ -32,6 +35,24 @@ def signed_golomb(value: int, *, order: int) -> str:
 def zigzag(value: int) -> int:
     """The place of ``value`` in 0, -1, 1, -2, 2 ..."""
     return 2 * value if value >= 0 else -2 * value - 1
+
+
+def numbers_of(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
+    """Numbers int64 ``[n]`` of the widths 0 to 56 ``[n]`` that fill ``data``, but for zeros in the last byte.
+
+    Raises:
+        StreamError: there are fewer bytes or more, or something else behind the last number.
+    """
+    ends = np.cumsum(widths)
+    bits = int(ends[-1]) if len(ends) else 0
+    if len(data) != -(-bits // 8) or (bits % 8 and data[-1] & 0xFF >> bits % 8):
+        raise StreamError(f"{where} has {len(data)} bytes for {bits} bits of numbers; it is damaged.")
+    starts = ends - widths
+    # The eight bytes from the one where a number begins hold all of it.
+    stored = np.frombuffer(bytes(data) + bytes(8), np.uint8)
+    words = np.lib.stride_tricks.sliding_window_view(stored, 8)[starts >> 3]
+    found = np.ascontiguousarray(words).view(">u8")[:, 0].astype(np.uint64) << (starts & 7).astype(np.uint64)
+    return np.where(widths > 0, found >> (64 - np.maximum(widths, 1)).astype(np.uint64), 0).astype(np.int64)
 
 
 class BitReader:

@@ -14,12 +14,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.bits import BitReader, fixed, packed_bits
+from structgstream.codec.bits import fixed, numbers_of, packed_bits
 from structgstream.codec.rans import decode, encode, section_bytes
 from structgstream.codec.residual_symbols import ALPHABET, residuals_of, symbols_of
 from structgstream.codec.table_choice import chosen_tables
 from structgstream.codec.table_sets import decoded_tables
-from structgstream.codec.tables import FrequencyTables, geometric
+from structgstream.codec.tables import FrequencyTables, geometric_family
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
@@ -65,7 +65,9 @@ class Tables:
     def get(self, name: str, *, contexts: int, alphabet: int) -> FrequencyTables:
         """The set of this name."""
         found = self._sets.get(name)
-        return geometric(np.full(contexts, _FLAT), alphabet=alphabet) if found is None else found
+        if found is None:
+            return FrequencyTables(geometric_family(alphabet)[np.full(contexts, _FLAT)])
+        return found
 
     def put(self, name: str, tables: FrequencyTables) -> None:
         """What the set is from now on."""
@@ -144,10 +146,9 @@ class Decoder:
 
     def naturals(self, name: str, values: Naturals | None, contexts: Contexts, *, count: int) -> Naturals:
         sizes = self._section(name, contexts, count=count, alphabet=CLASSES).astype(np.int64)
-        bits = int(np.maximum(sizes - 1, 0).sum())
-        reader = BitReader(self._taken(name, -(-bits // 8)), where=f"{self._where}, {name},")
-        found = [(1 << size - 1) + reader.fixed(size - 1) if size else 0 for size in sizes.tolist()]
-        return np.array(found, np.int64)
+        widths = np.maximum(sizes - 1, 0)
+        rest = numbers_of(self._taken(name, -(-int(widths.sum()) // 8)), widths, where=f"{self._where}, {name},")
+        return np.where(sizes > 0, (1 << widths) + rest, 0)
 
     def number(self, name: str, value: int | None) -> int:
         found = shift = 0

@@ -22,10 +22,9 @@ from structgstream.codec.table_sets import (
 )
 from structgstream.codec.tables import (
     COST_BITS,
-    GEOMETRIC_ROWS,
     FrequencyTables,
     code_costs,
-    geometric,
+    geometric_family,
     logs,
     normalised,
     weighed,
@@ -87,7 +86,7 @@ def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
             f"Counts {counts.shape} must be of the tables' shape {previous.rows.shape}, 2^31 - 1 at most."
         )
     kept = previous.rows.astype(np.int64)
-    family = geometric(np.arange(GEOMETRIC_ROWS), alphabet=previous.alphabet).rows.astype(np.int64)
+    family = geometric_family(previous.alphabet).astype(np.int64)
     of_family = (counts @ code_costs()[family].T) + (2 + NUMBER_BITS << COST_BITS)
     number = of_family.argmin(1)
     keep, parametric = _data_cost(counts, kept) + (1 << COST_BITS), of_family.min(1)

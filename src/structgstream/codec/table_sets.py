@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.bits import BitReader
-from structgstream.codec.tables import FREQUENCY_BITS, GEOMETRIC_ROWS, FrequencyTables, geometric, weighed
+from structgstream.codec.tables import FREQUENCY_BITS, FrequencyTables, geometric_family, weighed
 from structgstream.errors import StreamError
 
 NUMBER_BITS = 8
@@ -49,7 +49,7 @@ def decoded_tables(
     if len(data) > _MOST_ROW_BYTES * previous.contexts:
         raise StreamError(f"{where} has {len(data)} bytes for {previous.contexts} contexts; it is damaged.")
     reader = BitReader(data, where=where)
-    family = geometric(np.arange(GEOMETRIC_ROWS), alphabet=previous.alphabet).rows
+    family = geometric_family(previous.alphabet)
     rows = previous.rows.copy()
     for row in rows:
         if not reader.fixed(1):

@@ -143,6 +143,14 @@ def geometric(numbers: NDArray[np.integer], *, alphabet: int) -> FrequencyTables
 
 
 @cache
+def geometric_family(alphabet: int) -> NDArray[np.uint16]:
+    """All 256 geometric rows ``[256, A]``, not to be written to."""
+    rows = geometric(np.arange(GEOMETRIC_ROWS), alphabet=alphabet).rows
+    rows.setflags(write=False)
+    return rows
+
+
+@cache
 def logs() -> NDArray[np.int64]:
     """log2 of 0 to 8191 in units of 2^-16, rounded down digit by digit; 0 for 0."""
     n = np.maximum(np.arange(2 * TOTAL), 1)
