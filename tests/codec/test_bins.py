@@ -14,7 +14,7 @@ from structgstream.codec.compact import CODABLE, quantised
 from structgstream.errors import StreamError
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, state_of
 
-AWKWARD = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STEPS)}
+AWKWARD: dict[str, float] = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STEPS)}
 
 
 @pytest.mark.parametrize("dynamic", [CODABLE, PAPER_DYNAMIC, frozenset({"free", "free_births"}), frozenset()])
@@ -24,10 +24,12 @@ def test_bins_of_the_values_of_bins_are_the_same_bins(dynamic: frozenset[FieldNa
     values = valued(bins, dynamic, AWKWARD)
     assert values.keys() == dynamic
     again = binned({**state, **values}, dynamic, AWKWARD)
-    assert (again.anchors == bins.anchors).all() and (again.free.bins == bins.free.bins).all()
+    assert (again.anchors == bins.anchors).all()
+    assert (again.free.bins == bins.free.bins).all()
     assert all((again.weights[name] == found).all() for name, found in bins.weights.items())
     for name, value in values.items():
-        assert value.dtype == state[name].dtype and value.shape == state[name].shape
+        assert value.dtype == state[name].dtype
+        assert value.shape == state[name].shape
     for name in dynamic & AWKWARD.keys():
         assert ((values[name] - state[name]).abs() <= 0.5001 * AWKWARD[name]).all(), name
 
@@ -60,6 +62,7 @@ def test_columns_stand_in_the_order_of_the_state_table() -> None:
     assert found.anchors[:, 3:6].tolist() == [[1, 2, 3], [4, 5, 6]]
     assert found.free.bins.tolist() == [[*range(14)]]
     widths = {"free_means": 3, "free_log_scales": 3, "free_quats": 4, "free_logit_opacities": 1, "free_colors": 3}
-    coarse = binned(state, CODABLE, {**STEPS, **{name: 2.0**-7 * (i + 1) for i, name in enumerate(widths)}})
+    steps = STEPS | {name: 2.0**-7 * (i + 1) for i, name in enumerate(widths)}
+    coarse = binned(state, CODABLE, steps)
     expected = [round(2 * column / (i + 1)) for i, column in zip(np.repeat(range(5), [*widths.values()]), range(14))]
     assert coarse.free.bins.tolist() == [expected]

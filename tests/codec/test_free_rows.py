@@ -27,7 +27,8 @@ def exchange(after: FreeBins, before: FreeBins, tables: tuple[Tables, Tables] | 
     back = coded_free(reader, None, before, where="Packet 0")
     reader.end()
     for one, other in ((known, back), (after, back)):
-        assert (one.births == other.births).all() and (one.bins == other.bins).all()
+        assert (one.births == other.births).all()
+        assert (one.bins == other.bins).all()
     assert (known.change.active == back.change.active).all()
     assert (known.change.residuals == back.change.residuals).all()
     return back

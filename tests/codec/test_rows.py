@@ -41,7 +41,8 @@ def test_a_change_comes_back(pair: tuple[Change, Change]) -> None:
     reader = Decoder(Tables(), fields, where="Packet 0")  # type: ignore[arg-type]
     back = coded_change(reader, None, before, groups=GROUPS)
     reader.end()
-    assert (back.active == change.active).all() and (back.residuals == change.residuals).all()
+    assert (back.active == change.active).all()
+    assert (back.residuals == change.residuals).all()
     assert back.residuals.dtype == np.int32
 
 
@@ -57,12 +58,15 @@ class Seen:
         self.contexts: dict[str, list[int]] = {}
 
     def flags(self, name: str, values: Flags | None, contexts: Contexts, *, count: int) -> Flags:
-        assert values is not None and count == ACTIVITY_CONTEXTS and (contexts < count).all()
+        assert values is not None
+        assert count == ACTIVITY_CONTEXTS
+        assert (contexts < count).all()
         self.contexts[name] = contexts.tolist()
         return values
 
     def residuals(self, name: str, values, contexts: Contexts, *, count: int):
-        assert count == RESIDUAL_CONTEXTS and (contexts < count).all()
+        assert count == RESIDUAL_CONTEXTS
+        assert (contexts < count).all()
         self.contexts[name] = contexts.tolist()
         return values
 
