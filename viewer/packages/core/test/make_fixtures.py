@@ -25,7 +25,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_
 from structgstream.similarity import Similarity
 
 FOLDER = Path(__file__).parent / "fixtures"
-FRAMES, GROUP = 7, 4
+GROUP = 4
 ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales")
 WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
 STEPS = dict.fromkeys((*ROWS, *WEIGHTS, *FREE_STEPS), 2.0 ** (-9)) | {"offset_scales": float(torch.tensor(0.01))}
@@ -97,7 +97,14 @@ def header_for(state: dict[FieldName, Tensor], dynamic: frozenset[FieldName], *,
 
 
 def stream(
-    anchors: int, dynamic: frozenset[FieldName], *, share: float, born: int, wide: bool, distance_input: bool
+    anchors: int,
+    dynamic: frozenset[FieldName],
+    *,
+    share: float,
+    born: int,
+    distance_input: bool = True,
+    frames: int = 7,
+    wide: bool = False,
 ) -> tuple[bytes, list[Scene]]:
     """A whole stream and the scenes that a decoder finds in it; ``wide`` has the network sizes of real scenes."""
     g = torch.Generator().manual_seed(anchors)
@@ -107,7 +114,7 @@ def stream(
     encoder, sink = SceneEncoder(header), MemorySink()
     sink.open(header)
     scenes = []
-    for index in range(FRAMES):
+    for index in range(frames):
         next_state(state, index, g, share=share, born=0 if index == 2 else born)
         whole: dict[FieldName, Tensor] = {**state, **header.static}
         kind = PacketKind.DELTA if index % GROUP else PacketKind.KEY
@@ -146,12 +153,13 @@ def main() -> None:
     bench = parser.parse_args().bench
     if bench:
         anchors, path = int(bench[0]), Path(bench[1])
-        data, _ = stream(anchors, PAPER_DYNAMIC, share=0.05, born=200, wide=True, distance_input=True)
+        data, _ = stream(anchors, PAPER_DYNAMIC, share=0.05, born=200, wide=True)
         path.write_bytes(data)
         return
     FOLDER.mkdir(exist_ok=True)
-    write_fixture("paper", *stream(41, PAPER_DYNAMIC, share=0.2, born=3, wide=False, distance_input=True))
-    write_fixture("every", *stream(24, CODABLE, share=0.5, born=2, wide=False, distance_input=False))
+    write_fixture("paper", *stream(41, PAPER_DYNAMIC, share=0.2, born=3))
+    write_fixture("every", *stream(24, CODABLE, share=0.5, born=2, distance_input=False))
+    write_fixture("tiny", *stream(4, PAPER_DYNAMIC, share=0.5, born=1, frames=3))
 
 
 if __name__ == "__main__":

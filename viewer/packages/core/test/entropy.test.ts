@@ -1,0 +1,83 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The examples of docs/entropy.md, and what it calls damage. */
+
+import { expect, test } from "vitest";
+import { BitReader } from "../src/bits.ts";
+import { StreamError } from "../src/errors.ts";
+import { decodedSymbols, sectionHead } from "../src/rans.ts";
+import { residualsOf } from "../src/residualSymbols.ts";
+import { decodedTables, geometricRow } from "../src/tables.ts";
+
+const SECTION = Uint8Array.of(0x04, 0x04, 0x00, 0xb8, 0x97, 0x00, 0x01, 0x50);
+const TABLES = { contexts: 2, alphabet: 2, rows: Uint16Array.of(3072, 1024, 3, 4093) };
+const CONTEXTS = Uint8Array.of(0, 0, 1, 1);
+
+function symbols(section: Uint8Array, contexts = CONTEXTS): Uint8Array {
+  return decodedSymbols(section, sectionHead(section, "It"), contexts, TABLES, "It");
+}
+
+test("symbols", () => {
+  expect([...symbols(SECTION)]).toEqual([0, 1, 0, 0]);
+});
+
+test("a section of another number of symbols, with a lane code 3, or with one bit changed in its states", () => {
+  expect(() => symbols(SECTION, CONTEXTS.subarray(1))).toThrow("It states 4 symbols, 3 are expected; it is damaged.");
+  const lanes = SECTION.slice();
+  lanes[1] = 7;
+  expect(() => symbols(lanes)).toThrow("It states 4 symbols in 1 words; it is damaged.");
+  for (let bit = 0; bit < 32; bit++) {
+    const states = SECTION.slice();
+    states[2 + (bit >> 3)]! ^= 1 << (bit & 7);
+    expect(() => symbols(states)).toThrow("It is damaged: its words and final states contradict each other.");
+  }
+  for (let end = 0; end < SECTION.length; end++) expect(() => symbols(SECTION.subarray(0, end))).toThrow(StreamError);
+});
+
+test("an explicit row against the previous one", () => {
+  const previous = { contexts: 1, alphabet: 4, rows: Uint16Array.of(3072, 512, 512, 0) };
+  const set = Uint8Array.of(0xc8, 0x2b, 0x20);
+  expect([...decodedTables(set, previous, "It").rows]).toEqual([3072, 768, 256, 0]);
+  expect([...previous.rows]).toEqual([3072, 512, 512, 0]);
+  set[2]! |= 1;
+  expect(() => decodedTables(set, previous, "It")).toThrow("It goes on after its last number; it is damaged.");
+  expect(() => decodedTables(new Uint8Array(73), previous, "It")).toThrow("It has 73 bytes for 1 contexts");
+});
+
+test("the geometric family", () => {
+  const row = new Uint16Array(5);
+  geometricRow(100, row);
+  expect([...row]).toEqual([3644, 145, 145, 81, 81]);
+  for (let number = 0; number < 256; number++) {
+    const longest = new Uint16Array(32);
+    geometricRow(number, longest);
+    expect(longest.reduce((sum, frequency) => sum + frequency)).toBe(4096);
+  }
+});
+
+test("escapes", () => {
+  const found = residualsOf(Uint8Array.of(15, 0, 15, 13, 14, 15), Uint8Array.of(0x89, 0x48), "It");
+  expect([...found]).toEqual([8, 0, -8, -7, 7, 13]);
+  expect(() => residualsOf(Uint8Array.of(15), new Uint8Array(0), "It")).toThrow("It has 0 bytes for 1 values");
+  expect(() => residualsOf(Uint8Array.of(0), Uint8Array.of(0), "It")).toThrow("It has 1 bytes for 0 values");
+});
+
+test("the ends of 32 bits", () => {
+  const least = `${"0".repeat(28)}${(2 ** 31 - 8 + 4).toString(2)}1`;
+  const most = `${"0".repeat(28)}${(2 ** 31 - 9 + 4).toString(2)}0`;
+  const beyond = `${least.slice(0, -1)}0`;
+  const escapes = (text: string) => {
+    const padded = text.padEnd(8 * Math.ceil(text.length / 8), "0");
+    return Uint8Array.from(padded.match(/.{8}/g)!, (byte) => Number.parseInt(byte, 2));
+  };
+  expect([...residualsOf(Uint8Array.of(15), escapes(least), "It")]).toEqual([-(2 ** 31)]);
+  expect([...residualsOf(Uint8Array.of(15), escapes(most), "It")]).toEqual([2 ** 31 - 1]);
+  expect(() => residualsOf(Uint8Array.of(15), escapes(beyond), "It")).toThrow("holds a value beyond 32 bits");
+});
+
+test("more zeros than an Exp-Golomb code may have, and a cut one", () => {
+  expect(new BitReader(Uint8Array.of(0b00010110), "It").signedGolomb(0, 3)).toBe(5);
+  expect(new BitReader(Uint8Array.of(0b00010100), "It").signedGolomb(0, 3)).toBe(-5);
+  expect(() => new BitReader(Uint8Array.of(0b00010110), "It").golomb(0, 2)).toThrow("cut or out of bounds");
+  expect(() => new BitReader(Uint8Array.of(0b00000001), "It").golomb(0, 8)).toThrow("ends within a number");
+  expect(() => new BitReader(Uint8Array.of(0), "It").golomb(0, 8)).toThrow("cut or out of bounds");
+});

@@ -1,0 +1,130 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Damaged streams give scenes or a StreamError: no other exception, and no large allocation. */
+
+import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
+import { Decoder, Tables } from "../src/coder.ts";
+import { StreamError } from "../src/errors.ts";
+import { decodedFree, MOST_FREE, noFree } from "../src/freeRows.ts";
+import { readStream } from "../src/reader.ts";
+import { bytesOf, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.ts";
+
+const MOST_BYTES = 2 ** 20;
+const STREAMS: [string, Uint8Array][] = [
+  ["raw", bytesOf(VECTORS, "version-1.sgs")],
+  ["compact", bytesOf(FIXTURES, "tiny.sgs")],
+];
+const ARRAYS = { Uint8Array, Uint16Array, Int32Array, Float32Array, Float64Array, BigInt64Array };
+let largest = 0;
+
+beforeEach(() => {
+  largest = 0;
+  for (const [name, Base] of Object.entries(ARRAYS)) {
+    const counting = new Proxy(Base, {
+      construct(target, given: unknown[], newTarget) {
+        if (typeof given[0] === "number") largest = Math.max(largest, given[0] * Base.BYTES_PER_ELEMENT);
+        return Reflect.construct(target, given, newTarget);
+      },
+    });
+    vi.stubGlobal(name, counting);
+  }
+});
+
+afterEach(() => {
+  vi.unstubAllGlobals();
+});
+
+/** Frames that could be decoded, or undefined where the stream was refused; anything but a StreamError is thrown. */
+function framesOf(stream: Uint8Array): number | undefined {
+  try {
+    const reader = readStream(stream);
+    for (const { index } of reader.packets) reader.frame(index);
+    return reader.packets.length;
+  } catch (error) {
+    if (error instanceof StreamError) return undefined;
+    throw error;
+  }
+}
+
+describe.each(STREAMS)("the %s stream", (_, stream) => {
+  const records = readStream(stream).packets.length;
+
+  test("cut at every byte", () => {
+    let before = 0;
+    for (let end = 0; end <= stream.length; end++) {
+      const frames = framesOf(stream.subarray(0, end)) ?? 0;
+      expect(frames).toBeGreaterThanOrEqual(before);
+      before = frames;
+    }
+    expect(before).toBe(records);
+    expect(largest).toBeLessThan(MOST_BYTES);
+  });
+
+  test("with every byte changed", () => {
+    for (let at = 0; at < stream.length; at++) {
+      const damaged = stream.slice();
+      damaged[at]! ^= 1 << (at & 7);
+      const frames = framesOf(damaged);
+      expect(frames === undefined || frames <= records).toBe(true);
+    }
+    expect(largest).toBeLessThan(MOST_BYTES);
+  });
+
+  test("with every byte changed and a checksum that says it is right", { timeout: 60_000 }, () => {
+    const pieces = piecesOf(stream);
+    let decoded = 0;
+    let refused = 0;
+    for (const [place, piece] of pieces.entries()) {
+      if (place === 0) continue;
+      for (let at = 8; at < piece.length - 4; at++) {
+        for (const change of [1 << (at & 7), 0xff]) {
+          const payload = piece.slice(8, -4);
+          payload[at - 8]! ^= change;
+          const damaged = joined(...pieces.slice(0, place), record(piece[0]!, payload), ...pieces.slice(place + 1));
+          if (framesOf(damaged) === undefined) refused++;
+          else decoded++;
+        }
+      }
+    }
+    expect(refused).toBeGreaterThan(300);
+    expect(decoded).toBeGreaterThan(300);
+    expect(largest).toBeLessThan(2 ** 24);
+  });
+
+  test("with every payload cut anywhere and a checksum that says it is right", () => {
+    const pieces = piecesOf(stream);
+    for (const [place, piece] of pieces.entries()) {
+      if (place === 0 || place === pieces.length - 1) continue;
+      for (let end = 0; end < piece.length - 12; end++) {
+        const cut = record(piece[0]!, piece.slice(8, 8 + end));
+        expect(framesOf(joined(...pieces.slice(0, place), cut, ...pieces.slice(place + 1)))).toBeUndefined();
+      }
+    }
+    expect(largest).toBeLessThan(MOST_BYTES);
+  });
+});
+
+/** What {@link decodedFree} reads of a packet in which nothing is there and `count`, a varint, is born. */
+function bornOf(...count: number[]): Decoder {
+  const kept = (bytes: number) => [bytes, ...Array<number>(bytes).fill(0)]; // a table set that changes nothing
+  const changes = Array.from({ length: 10 }, () => [...kept(5), 0, 0]).flat();
+  const free = Uint8Array.of(...kept(3), 0, ...kept(3), 0, ...changes);
+  const births = Uint8Array.of(...kept(1), 0, ...count);
+  return new Decoder(
+    new Tables(),
+    new Map([
+      ["free", free],
+      ["free_births", births],
+    ]),
+    "It",
+  );
+}
+
+test("more births than a scene may have are refused before anything is allocated for them", () => {
+  expect(decodedFree(bornOf(0), noFree(), "It").births.length).toBe(0);
+  expect(() => decodedFree(bornOf(0x80, 0x80, 0x10), noFree(), "It")).toThrow("ends 1 bytes too early in free_births");
+  largest = 0;
+  expect(() => decodedFree(bornOf(0x81, 0x80, 0x10), noFree(), "It")).toThrow(`adds ${MOST_FREE + 1} free Gaussians`);
+  expect(() => decodedFree(bornOf(255, 255, 255, 255, 15), noFree(), "It")).toThrow("adds 4294967295 free Gaussians");
+  expect(() => decodedFree(bornOf(255, 255, 255, 255, 16), noFree(), "It")).toThrow("a number beyond 32 bits");
+  expect(largest).toBeLessThan(2 ** 16);
+});

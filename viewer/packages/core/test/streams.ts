@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Stream files that tests look at, and how to make others of them. */
+
+import { readFileSync } from "node:fs";
+import { expect } from "vitest";
+import type { Tensor } from "../src/fields.ts";
+import { CHECKSUM_BYTES, crc32, HEAD_BYTES, PREFIX_BYTES, RecordType, viewOf } from "../src/records.ts";
+
+export const VECTORS = new URL("../../../../tests/vectors/", import.meta.url);
+export const FIXTURES = new URL("./fixtures/", import.meta.url);
+
+export function bytesOf(folder: URL, name: string): Uint8Array {
+  return new Uint8Array(readFileSync(new URL(name, folder)));
+}
+
+export function joined(...parts: Uint8Array[]): Uint8Array {
+  const whole = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0));
+  let at = 0;
+  for (const part of parts) {
+    whole.set(part, at);
+    at += part.length;
+  }
+  return whole;
+}
+
+/** A whole record. */
+export function record(type: number, payload: Uint8Array): Uint8Array {
+  const bytes = joined(new Uint8Array([type, 0, 0, 0, 0, 0, 0, 0]), payload, new Uint8Array(CHECKSUM_BYTES));
+  viewOf(bytes).setUint32(4, payload.length, true);
+  viewOf(bytes).setUint32(HEAD_BYTES + payload.length, crc32(bytes.subarray(0, -CHECKSUM_BYTES)), true);
+  return bytes;
+}
+
+/** Prefix and records of a stream, the index last. */
+export function piecesOf(stream: Uint8Array): Uint8Array[] {
+  const pieces = [stream.subarray(0, PREFIX_BYTES)];
+  for (let at = PREFIX_BYTES; at + HEAD_BYTES + CHECKSUM_BYTES <= stream.length; ) {
+    const end = at + HEAD_BYTES + viewOf(stream).getUint32(at + 4, true) + CHECKSUM_BYTES;
+    pieces.push(stream.subarray(at, end));
+    if (stream[at] === RecordType.index) break;
+    at = end;
+  }
+  return pieces;
+}
+
+/** Compares bits, so that NaNs and the sign of zero count. */
+export function expectSame(found: Tensor | undefined, expected: Tensor): void {
+  expect(found?.shape).toEqual(expected.shape);
+  expect(found?.data.constructor).toBe(expected.data.constructor);
+  expect(Buffer.compare(bits(found!.data), bits(expected.data))).toBe(0);
+}
+
+function bits(data: Float32Array | BigInt64Array): Uint8Array {
+  return new Uint8Array(data.buffer, data.byteOffset, data.byteLength);
+}
