@@ -14,7 +14,7 @@ from structgstream.codec.compact import CODABLE, quantised
 from structgstream.errors import StreamError
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, state_of
 
-AWKWARD: dict[str, float] = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STEPS)}
+AWKWARD = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STEPS)}
 
 
 @pytest.mark.parametrize("dynamic", [CODABLE, PAPER_DYNAMIC, frozenset({"free", "free_births"}), frozenset()])

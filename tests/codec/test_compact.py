@@ -287,7 +287,8 @@ def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index
             continue
         check_shapes({**header.static, **found}, distance_input=True, training_cameras=2, where="")
         different += any(not torch.equal(value, state_of(seen[index])[name]) for name, value in found.items())
-    assert failed > 50 and different > 20, "some damage is found, and the checksum is there for the rest"
+    assert failed > 50
+    assert different > 20, "the checksum is there for what decodes to something else"
 
 
 def test_every_byte_of_an_init_record_changed_gives_a_decoder_or_one_kind_of_error() -> None:

@@ -1,16 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The golden stream of format version 1: what was written once must be readable, and written the same, for ever."""
+"""The golden streams of format version 1: what was written once must be readable for ever, and raw written the same.
+
+What a ``compact`` encoder chooses may become better; what a decoder makes of it may not change.
+"""
 
 import hashlib
+import itertools
 import json
 import struct
+from pathlib import Path
+from typing import Any
 
+import pytest
+import torch
 import zstandard
 
-from structgstream.codec.reader import open_stream
+from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.records import scanned
 from structgstream.scene.state import state_of
-from vectors.generate import EXPECTED, STREAM, SUMS, golden_header, golden_stream
+from vectors.generate import (
+    COMPACT_EXPECTED,
+    COMPACT_STEPS,
+    COMPACT_STREAM,
+    EXPECTED,
+    STREAM,
+    SUMS,
+    compact_header,
+    compact_stream,
+    golden_header,
+    golden_stream,
+)
 
 
 def canonical(data: bytes) -> tuple[bytes, bytes, list[tuple[int, bytes]], bytes]:
@@ -33,7 +52,10 @@ def relative_index(data: bytes) -> list[tuple[int, int, int]]:
 
 def test_the_files_are_those_that_were_published() -> None:
     assert STREAM.stat().st_size < 20_000
-    for line in SUMS.read_text().splitlines():
+    assert COMPACT_STREAM.stat().st_size < 20_000
+    lines = SUMS.read_text().splitlines()
+    assert len(lines) == 4
+    for line in lines:
         digest, name = line.split()
         assert hashlib.sha256((STREAM.parent / name).read_bytes()).hexdigest() == digest, name
 
@@ -44,18 +66,50 @@ def test_today_s_encoder_writes_the_golden_stream() -> None:
     assert relative_index(today) == relative_index(golden)
 
 
-def test_today_s_decoder_reads_the_golden_stream() -> None:
-    reader = open_stream(STREAM)
+@pytest.mark.parametrize(("stream", "wanted", "count"), [(STREAM, EXPECTED, 3), (COMPACT_STREAM, COMPACT_EXPECTED, 6)])
+def test_today_s_decoder_reads_a_golden_stream(stream: Path, wanted: Path, count: int) -> None:
+    reader = open_stream(stream)
     assert reader.complete
-    frames = json.loads(EXPECTED.read_text())["frames"]
-    assert len(frames) == len(reader) == 3
-    for frame, (info, scene) in zip(frames, reader.scenes(), strict=True):
-        assert (info.index, info.pts_seconds, info.kind.name) == (frame["index"], frame["pts_seconds"], frame["kind"])
-        found = {
-            name: {"shape": list(value.shape), "values": value.flatten().tolist()}
-            for name, value in state_of(scene).items()
-        }
-        assert found == frame["fields"]
+    check(reader, json.loads(wanted.read_text())["frames"], count)
+
+
+def check(reader: StreamReader, frames: list[dict[str, Any]], count: int) -> None:
+    """Forwards, and then every frame alone."""
+    assert len(frames) == len(reader) == count
+    backwards = [(reader.packets[i], reader.scene(i)) for i in reversed(range(count))]
+    for found in (list(reader.scenes()), backwards[::-1]):
+        for frame, (info, scene) in zip(frames, found, strict=True):
+            got = (info.index, info.pts_seconds, info.kind.name)
+            assert got == (frame["index"], frame["pts_seconds"], frame["kind"])
+            fields = {
+                name: {"shape": list(value.shape), "values": value.flatten().tolist()}
+                for name, value in state_of(scene).items()
+            }
+            assert fields == frame["fields"]
+
+
+def test_today_s_compact_encoder_says_the_same_in_not_more_bytes() -> None:
+    today = compact_stream()
+    check(StreamReader(today), json.loads(COMPACT_EXPECTED.read_text())["frames"], 6)
+    assert len(today) <= COMPACT_STREAM.stat().st_size + 50, "zstd differs a little"
+
+
+def test_the_golden_compact_stream_is_worth_decoding() -> None:
+    """It has two groups, births, deaths, updates, an MLP that moves, escapes, and steps that are no powers of two."""
+    reader = open_stream(COMPACT_STREAM)
+    assert [info.kind.name for info in reader.packets] == ["KEY", "DELTA", "DELTA", "KEY", "DELTA", "DELTA"]
+    assert [len(scene.free) for _, scene in reader.scenes()] == [3, 5, 2, 5, 0, 1]
+    assert reader.header.steps == COMPACT_STEPS
+    wanted = compact_header()
+    for name, value in reader.header.reference.items():
+        assert torch.equal(value, wanted.reference[name])
+    states = [state_of(scene) for _, scene in reader.scenes()]
+    moved = [not torch.equal(a["covariance_mlp"], b["covariance_mlp"]) for a, b in itertools.pairwise(states)]
+    assert moved == [True, False, False, True, False]
+    jump = (states[4]["anchor_positions"] - states[3]["anchor_positions"])[14] / COMPACT_STEPS["anchor_positions"]
+    assert jump.round().tolist() == [900, -900, 9]
+    kept = torch.isin(states[1]["free_births"], states[2]["free_births"])
+    assert not torch.equal(states[1]["free"][kept], states[2]["free"]), "some are updated"
 
 
 def test_today_s_reader_understands_the_golden_header() -> None:

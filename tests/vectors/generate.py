@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the golden stream of format version 1 and what a decoder must find in it.
+"""Makes the golden streams of format version 1, one of each codec, and what a decoder must find in them.
 
-Every number is a small multiple of a power of two: exact in float32, in JSON, and on any machine. Run from the
-repository's root, only when a new version of the format gets vectors of its own: ``python tests/vectors/generate.py``.
+With ``raw`` every number is a small multiple of a power of two; with ``compact`` it is the product of a whole number
+and a float32, which need not be one: exact in JSON and on any machine. Run from the repository's root, only when a new
+version or codec gets vectors of its own; files that are there stay: ``python tests/vectors/generate.py``.
 """
 
 import hashlib
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,8 +27,30 @@ from structgstream.similarity import Similarity
 
 FOLDER = Path(__file__).parent
 STREAM, EXPECTED, SUMS = (FOLDER / name for name in ("version-1.sgs", "version-1.json", "SHA256SUMS"))
+COMPACT_STREAM, COMPACT_EXPECTED = (FOLDER / f"version-1-compact.{suffix}" for suffix in ("sgs", "json"))
 ANCHORS, K, FEATURES, HIDDEN = 3, 2, 2, 3
 KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.KEY)
+COMPACT_KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA)
+COMPACT_ANCHORS = 21
+COMPACT_BIRTHS = (
+    (0, 1, 5),
+    (0, 1, 5, 2**32, 2**32 + 1),
+    (1, 2**32 + 1),
+    (1, 2**32 + 1, 3 * 2**32, 3 * 2**32 + 2, 3 * 2**32 + 2**31 - 1),
+    (),
+    (5 * 2**32 + 7,),
+)
+COMPACT_STEPS = {
+    "anchor_positions": 1 / 256,
+    "offset_scales": float(np.float32(0.02)),
+    "covariance_mlp": float(np.float32(0.003)),
+    "free_means": 1 / 128,
+    "free_log_scales": float(np.float32(0.05)),
+    "free_quats": 1 / 64,
+    "free_logit_opacities": 1 / 8,
+    "free_colors": float(np.float32(0.007)),
+}
+COLUMNS = {"free_means": 3, "free_log_scales": 3, "free_quats": 4, "free_logit_opacities": 1, "free_colors": 3}
 
 
 def numbers(*shape: int, salt: int) -> Tensor:
@@ -33,22 +59,23 @@ def numbers(*shape: int, salt: int) -> Tensor:
     return ((torch.arange(count) * 37 + salt * 53) % 129 - 64).float().reshape(shape) / 16
 
 
+def mlp_size(outputs: int) -> int:
+    """Weights of an MLP with ``outputs`` numbers for each Gaussian."""
+    return HIDDEN * (FEATURES + 5) + outputs * K * (HIDDEN + 1)
+
+
 def golden_scene(frame: int) -> Scene:
     """Frame 0 has no free Gaussians, frame 1 two, frame 2 one of them and a new one."""
-    inputs = FEATURES + 4
     births = torch.tensor([[], [5, 2**40], [5, 2**40 + 1]][frame], dtype=torch.int64)
-    sizes = {
-        name: HIDDEN * (inputs + 1) + n * K * (HIDDEN + 1) for name, n in (("opacity", 1), ("color", 3), ("cov", 7))
-    }
     state: dict[FieldName, Tensor] = {
         "anchor_positions": numbers(ANCHORS, 3, salt=1 + 100 * frame),
         "offset_scales": numbers(ANCHORS, 3, salt=2 + 100 * frame),
         "base_scales": numbers(ANCHORS, 3, salt=3),
         "anchor_offsets": numbers(ANCHORS, K, 3, salt=4),
         "anchor_features": numbers(ANCHORS, FEATURES, salt=5),
-        "opacity_mlp": numbers(sizes["opacity"], salt=6),
-        "color_mlp": numbers(sizes["color"], salt=7),
-        "covariance_mlp": numbers(sizes["cov"], salt=8 + 100 * frame),
+        "opacity_mlp": numbers(mlp_size(1), salt=6),
+        "color_mlp": numbers(mlp_size(3), salt=7),
+        "covariance_mlp": numbers(mlp_size(7), salt=8 + 100 * frame),
         "free": numbers(len(births), 14, salt=9 + 100 * frame),
         "free_births": births,
         "camera_color": numbers(2, 6, salt=11),
@@ -77,30 +104,110 @@ def golden_header() -> StreamHeader:
     )
 
 
-def golden_stream() -> bytes:
+def compact_scene(frame: int) -> Scene:
+    """Anchors 3 to 8 wander, 14 jumps far in frame 4, weights of F_Sigma change in frames 1 and 4; free ones come and go.
+
+    Every number is exactly that of a bin, so this is also what a decoder must find.
+    """
+    moves = torch.zeros(COMPACT_ANCHORS, 6, dtype=torch.int64)
+    for past in range(1, frame + 1):
+        moves[3 + past % 2 : 9] += whole(6 - past % 2, 6, salt=past, most=3)
+    if frame >= 4:
+        moves[14] += torch.tensor([900, -900, 9, -8, 0, 70_000])
+    weights = whole(mlp_size(7), salt=8, most=400)
+    weights[::5] += (frame >= 1) + 12 * (frame >= 4)
+    births = torch.tensor(COMPACT_BIRTHS[frame], dtype=torch.int64)
+    # Of each birth, in each frame: the first two columns of its mean move in odd frames.
+    free = torch.cat([whole(0, 14, salt=0, most=1), *(whole(1, 14, salt=int(b % 1000), most=90) for b in births)])
+    free[:, :2] += frame // 2 * whole(len(births), 2, salt=3, most=4)
+    steps = COMPACT_STEPS
+    rows = whole(COMPACT_ANCHORS, 6, salt=1, most=300) + moves
+    columns = free.split([*COLUMNS.values()], dim=1)
+    state: dict[FieldName, Tensor] = {
+        "anchor_positions": valued(rows[:, :3], steps["anchor_positions"]),
+        "offset_scales": valued(rows[:, 3:], steps["offset_scales"]),
+        "base_scales": numbers(COMPACT_ANCHORS, 3, salt=3),
+        "anchor_offsets": numbers(COMPACT_ANCHORS, K, 3, salt=4),
+        "anchor_features": numbers(COMPACT_ANCHORS, FEATURES, salt=5),
+        "opacity_mlp": numbers(mlp_size(1), salt=6),
+        "color_mlp": numbers(mlp_size(3), salt=7),
+        "covariance_mlp": valued(weights, steps["covariance_mlp"]),
+        "free": torch.cat([valued(part, steps[name]) for part, name in zip(columns, COLUMNS, strict=True)], dim=1),
+        "free_births": births,
+        "camera_color": numbers(2, 6, salt=11),
+    }
+    return scene_of(state, distance_input=True)
+
+
+def whole(*shape: int, salt: int, most: int) -> Tensor:
+    """Whole numbers from ``-most`` to ``most`` that look arbitrary."""
+    count = int(torch.tensor(shape).prod())
+    return ((torch.arange(count) * 7919 + salt * 104_729) % (2 * most + 1) - most).reshape(shape)
+
+
+def valued(bins: Tensor, step: float) -> Tensor:
+    """What bins stand for: the product of two float32."""
+    return torch.from_numpy(bins.numpy().astype(np.float32) * np.float32(step))
+
+
+def compact_header() -> StreamHeader:
+    """As :func:`golden_header`, with frame 0 as the reference."""
+    state = state_of(compact_scene(0))
+    return replace(
+        golden_header(),
+        codec="compact",
+        static={name: value for name, value in state.items() if name not in PAPER_DYNAMIC},
+        steps=COMPACT_STEPS,
+        reference={name: state[name] for name in ("anchor_positions", "offset_scales", "covariance_mlp")},
+    )
+
+
+def streamed(header: StreamHeader, scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> bytes:
     """The whole stream as today's encoder writes it."""
-    header = golden_header()
     encoder, sink = SceneEncoder(header), MemorySink()
     sink.open(header)
-    for index, kind in enumerate(KINDS):
-        sink.write(encoder.encode(golden_scene(index), index=index, pts_seconds=index / 4, kind=kind).packet)
+    for index, (scene, kind) in enumerate(zip(scenes, kinds, strict=True)):
+        sink.write(encoder.encode(scene, index=index, pts_seconds=index / 4, kind=kind).packet)
     sink.close()
     return sink.data
 
 
-def expected() -> dict[str, Any]:
-    """What is in it, as plain values: tensors as shape and flat list, in the order of the state table."""
+def told(scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> dict[str, Any]:
+    """What is in a stream, as plain values: tensors as shape and flat list, in the order of the state table."""
     frames = []
-    for index, kind in enumerate(KINDS):
+    for index, (scene, kind) in enumerate(zip(scenes, kinds, strict=True)):
         fields = {
             name: {"shape": list(value.shape), "values": value.flatten().tolist()}
-            for name, value in state_of(golden_scene(index)).items()
+            for name, value in state_of(scene).items()
         }
         frames.append({"index": index, "pts_seconds": index / 4, "kind": kind.name, "fields": fields})
     return {"frames": frames}
 
 
+def golden_stream() -> bytes:
+    """That of codec ``raw``."""
+    return streamed(golden_header(), [golden_scene(i) for i in range(len(KINDS))], KINDS)
+
+
+def compact_stream() -> bytes:
+    """That of codec ``compact``."""
+    return streamed(compact_header(), [compact_scene(i) for i in range(len(COMPACT_KINDS))], COMPACT_KINDS)
+
+
+def main() -> None:
+    """Write what is missing, and the sums of all."""
+    raw, compact = [golden_scene(i) for i in range(3)], [compact_scene(i) for i in range(6)]
+    files = {
+        STREAM: golden_stream(),
+        EXPECTED: (json.dumps(told(raw, KINDS)) + "\n").encode(),
+        COMPACT_STREAM: compact_stream(),
+        COMPACT_EXPECTED: (json.dumps(told(compact, COMPACT_KINDS)) + "\n").encode(),
+    }
+    for path, data in files.items():
+        if not path.exists():
+            path.write_bytes(data)
+    SUMS.write_text("".join(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in files))
+
+
 if __name__ == "__main__":
-    STREAM.write_bytes(golden_stream())
-    EXPECTED.write_text(json.dumps(expected(), indent=None) + "\n")
-    SUMS.write_text("".join(f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.name}\n" for f in (STREAM, EXPECTED)))
+    main()
