@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check clean
+.PHONY: demo test check viewer-test clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
@@ -15,6 +15,10 @@ test: $(VENV)/.test-ready
 
 check: $(VENV)/.test-ready
 	scripts/check $(BIN)
+
+# Needs Node 20 or newer.
+viewer-test:
+	cd viewer && npm ci --no-audit --no-fund && npm test
 
 # A plain (not editable) install: what is tested is what a user gets. Sources are listed so that a change reinstalls.
 SOURCES := pyproject.toml CMakeLists.txt $(shell find csrc src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')

@@ -2,6 +2,7 @@
 /** Streams that the Python encoder made, bit for bit. */
 
 import { createHash } from "node:crypto";
+import { readdirSync } from "node:fs";
 import { describe, expect, test } from "vitest";
 import type { FieldName, Tensor } from "../src/fields.ts";
 import { readStream } from "../src/reader.ts";
@@ -31,18 +32,22 @@ function sha256(bytes: Uint8Array): string {
   return createHash("sha256").update(bytes).digest("hex");
 }
 
-test("the golden stream of version 1", () => {
-  const reader = readStream(bytesOf(VECTORS, "version-1.sgs"));
-  const { frames } = jsonOf(VECTORS, "version-1.json") as { frames: GoldenFrame[] };
+const GOLDEN = readdirSync(VECTORS)
+  .filter((file) => file.endsWith(".sgs"))
+  .map((file) => file.slice(0, -4));
+
+test.each(GOLDEN)("the golden stream %s", (name) => {
+  const reader = readStream(bytesOf(VECTORS, `${name}.sgs`));
+  const { frames } = jsonOf(VECTORS, `${name}.json`) as { frames: GoldenFrame[] };
   expect(reader.state).toBe("complete");
   expect(reader.packets.length).toBe(frames.length);
   for (const { index, pts_seconds, kind, fields } of frames) {
     const frame = reader.frame(index);
     expect([frame.index, frame.ptsSeconds, reader.packets[index]!.isKey]).toEqual([index, pts_seconds, kind === "KEY"]);
     expect([...frame.fields.keys()]).toEqual(Object.keys(fields));
-    for (const [name, { shape, values }] of Object.entries(fields)) {
-      const data = name === "free_births" ? BigInt64Array.from(values, BigInt) : Float32Array.from(values);
-      expectSame(frame.fields.get(name as FieldName), { shape, data });
+    for (const [field, { shape, values }] of Object.entries(fields)) {
+      const data = field === "free_births" ? BigInt64Array.from(values, BigInt) : Float32Array.from(values);
+      expectSame(frame.fields.get(field as FieldName), { shape, data });
     }
   }
 });
