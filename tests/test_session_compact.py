@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stream with codec ``compact`` of a world in which everything is known."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from streams import same
+from structgstream import session
+from structgstream.cameras import CameraRig
+from structgstream.codec.bins import FREE_STEPS
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.records import scanned
+from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.errors import ConfigError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import reference_backend
+from structgstream.presets import COMPACT, PRESETS, TINY, StreamConfig
+from structgstream.scene.order import space_order
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import PAPER_DYNAMIC, state_of
+from structgstream.session import FrameReport, Session
+from structgstream.training.motion import MotionConfig
+from structgstream.training.rounding import RoundingConfig, pixel_size
+from worlds import moving_world
+
+FRAMES = 4
+WORLD = moving_world(FRAMES, speed=0.06, movers=20, emerges_at=1)
+CONFIG = replace(
+    TINY,
+    codec="compact",
+    key_interval_seconds=2 / 30,
+    initial=replace(TINY.initial, iterations=20, schedule_iterations=20, coarse_iterations=10),
+    online=replace(
+        TINY.online,
+        iterations=8,
+        patching=replace(TINY.online.patching, iteration=4),
+        motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
+        # Eight iterations in pictures of 48 pixels do not carry an anchor further than half a common step.
+        rounding=RoundingConfig(position_pixels=0.02),
+    ),
+)
+
+
+@dataclass
+class Capture:
+    """The world's pictures."""
+
+    length: int = FRAMES
+    fps: float = 30.0
+    name: str = "world"
+
+    @property
+    def rig(self) -> CameraRig:
+        return WORLD.rig
+
+    @property
+    def points(self) -> np.ndarray:
+        return WORLD.scene.anchors.positions.numpy()
+
+    def __len__(self) -> int:
+        return self.length
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        yield from WORLD.frames[start : self.length]
+
+
+def run(sink, *, config: StreamConfig = CONFIG, resumed=None, frames: int = FRAMES) -> list[FrameReport]:
+    return list(Session(Capture(frames), sink, config, reference_backend(), resumed=resumed).run())
+
+
+@cache
+def whole() -> tuple[bytes, list[FrameReport], list[Scene], list[Scene]]:
+    """The stream, the reports, where each later frame's fit started, and what it came to."""
+    started, fitted, fit = [], [], session.fit_next_frame
+
+    def following(scene, *arguments, **options):
+        started.append(scene)
+        found = fit(scene, *arguments, **options)
+        fitted.append(found.scene)
+        return found
+
+    session.fit_next_frame = following  # type: ignore[assignment]
+    try:
+        reports = run(sink := MemorySink())
+    finally:
+        session.fit_next_frame = fit
+    return sink.data, reports, started, fitted
+
+
+def test_each_frame_starts_from_what_a_reader_sees_and_ends_there() -> None:
+    data, reports, started, fitted = whole()
+    reader = StreamReader(data)
+    scenes = [scene for _, scene in reader.scenes()]
+    assert [info.kind.name for info in reader.packets] == ["KEY", "DELTA", "KEY", "DELTA"]
+    assert all(same(a, b) for a, b in zip(started, scenes[:-1], strict=True))
+    # What was drawn at the end of a fit is already what is sent: the codec loses nothing any more.
+    for trained, seen in zip(fitted, scenes[1:], strict=True):
+        state = state_of(trained)
+        for name in reader.header.dynamic:
+            assert torch.equal(state[name].cpu(), state_of(seen)[name]), name
+    assert [r.free for r in reports] == [len(scene.free) for scene in scenes]
+    assert max(r.free for r in reports) > 0, "the ball that emerges is patched"
+
+
+def test_it_moves_and_static_fields_stay() -> None:
+    reader = StreamReader(whole()[0])
+    states = [state_of(scene) for _, scene in reader.scenes()]
+    assert not torch.equal(states[0]["anchor_positions"], states[3]["anchor_positions"])
+    for name in states[0].keys() - reader.header.dynamic:
+        assert torch.equal(states[0][name], states[3][name]), name
+
+
+def test_steps_are_float32_and_come_from_a_pixel() -> None:
+    header = StreamReader(whole()[0]).header
+    dynamic = CONFIG.online.dynamic
+    assert header.steps.keys() == {*dynamic.difference(["free", "free_births"]), *FREE_STEPS}
+    assert all(float(np.float32(step)) == step for step in header.steps.values())
+    pixel = pixel_size(header.reference["anchor_positions"], header.similarity.rig(header.rig))
+    assert header.steps["anchor_positions"] == pytest.approx(0.02 * pixel, rel=1e-2)
+    assert header.reference.keys() == dynamic.difference(["free", "free_births"])
+
+
+def test_anchors_stand_in_space_order() -> None:
+    header = StreamReader(whole()[0]).header
+    steps = space_order(header.reference["anchor_positions"]).diff()
+    assert (steps == 1).float().mean() > 0.8, "but for those that rounding has moved to another cell"
+
+
+def test_what_stands_still_keeps_its_bins() -> None:
+    reader, reports = StreamReader(whole()[0]), whole()[1]
+    states = [state_of(scene) for _, scene in reader.scenes()]
+    for before, after, report in zip(states, states[1:], reports[1:]):
+        changed = (before["anchor_positions"] != after["anchor_positions"]).any(1)
+        assert int(changed.sum()) <= report.moving < report.anchors
+
+
+def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Path) -> None:
+    data, path = whole()[0], tmp_path / "a.sgs"
+    init, *packets = [*scanned(data)][:-1]
+    for cut in (init.end, *(record.end for record in packets), packets[2].end - 1):
+        path.write_bytes(data[:cut])
+        sink, resumed = FileSink.resume(path)
+        done = 0 if resumed is None else len(resumed)
+        assert len(run(sink, resumed=resumed)) == FRAMES - done
+        assert path.read_bytes() == data, cut
+
+
+def test_another_codec_does_not_continue_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.sgs"
+    path.write_bytes(whole()[0])
+    sink, resumed = FileSink.resume(path)
+    with pytest.raises(ConfigError, match="another configuration: codec differ"):
+        run(sink, resumed=resumed, config=replace(CONFIG, codec="raw"))
+    sink.close()
+
+
+def delta_bytes(rate_weight: float) -> int:
+    online = replace(CONFIG.online, rounding=replace(CONFIG.online.rounding, rate_weight=rate_weight))
+    reports = run(MemorySink(), config=replace(CONFIG, online=online, key_interval_seconds=1.0))
+    return sum(report.field_bytes[name] for report in reports[1:] for name in ("anchor_positions", "offset_scales"))
+
+
+def test_a_higher_price_makes_fewer_bytes() -> None:
+    sizes = [delta_bytes(weight) for weight in (0.0, 1e-2, 1.0)]
+    assert sizes[2] < sizes[1] < sizes[0]
+
+
+def test_it_is_smaller_than_raw() -> None:
+    raw = run(MemorySink(), config=replace(CONFIG, codec="raw"))
+    compact = whole()[1]
+    assert sum(r.bytes for r in compact) * 5 < sum(r.bytes for r in raw)
+
+
+def test_the_preset() -> None:
+    assert PRESETS["compact"] is COMPACT
+    assert COMPACT.codec == "compact"
+    assert COMPACT.online.motion.enabled
+    assert COMPACT.online.dynamic == PAPER_DYNAMIC - {"covariance_mlp"}
+    assert all(config.codec == "raw" for name, config in PRESETS.items() if name != "compact")

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rigs import arc_rig, random_scene
+from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, LARGEST, WEIGHTS, binned, valued
+from structgstream.codec.compact import CODABLE
+from structgstream.scene.state import state_of
+from structgstream.training.parameters import Parameters, parameters_of_fields
+from structgstream.training.rounding import Rate, RoundingConfig, pixel_size, rounded
+
+
+def test_rounding_is_drawn_and_not_felt() -> None:
+    value = torch.tensor([0.1, 0.26, -0.9, 0.0], requires_grad=True)
+    found = rounded(value, 0.25)
+    assert found.tolist() == [0.0, 0.25, -1.0, 0.0]
+    (found * torch.tensor([1.0, 2.0, 3.0, 4.0])).sum().backward()
+    assert value.grad is not None
+    assert value.grad.tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize("step", [0.013, 1 / 256, 3e-7, 123.456])
+def test_a_value_of_a_bin_stays_where_it_is(step: float) -> None:
+    """What stands still keeps its bin, frame after frame, up to the last bin that there is."""
+    step = float(np.float32(step))
+    bins = np.unique(np.rint(np.geomspace(1, LARGEST, 20_000))).astype(np.int64)
+    values = torch.from_numpy(bins.astype(np.float32) * np.float32(step))
+    assert torch.equal(rounded(values, step), values)
+    assert torch.equal(rounded(-values, step), -values)
+
+
+def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
+    """Both round in float32: the scene of a fit has no other values than those that its bins stand for."""
+    scene = random_scene(300, free=40, seed=8)
+    steps = {name: float(np.float32(step)) for name, step in RoundingConfig().steps(0.0123).items()}
+    parameters = Parameters.of(scene, trained=parameters_of_fields(CODABLE), steps=steps)  # type: ignore[arg-type]
+    drawn = {name: value.detach() for name, value in state_of(parameters.scene(scene)).items()}
+    sent = valued(binned(drawn, CODABLE, steps), CODABLE, steps)
+    for name, value in sent.items():
+        assert torch.equal(value, drawn[name]), name
+
+
+def test_there_is_a_step_for_everything_that_can_change() -> None:
+    steps = RoundingConfig(position_pixels=0.5).steps(0.01)
+    assert steps.keys() == {*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS}
+    assert steps["anchor_positions"] == steps["free_means"] == 0.005
+    assert all(step > 0 for step in steps.values())
+
+
+def test_a_pixel_is_as_large_as_it_is_seen() -> None:
+    """On the arc, at distance 3 with 40 pixels of focal length, a pixel covers 3 / 40."""
+    rig = arc_rig(5, radius=3.0)
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * 0.05
+    distance = math.hypot(3.0, 0.3)
+    assert pixel_size(points, rig) == pytest.approx(distance / 40, rel=0.01)
+    behind = torch.cat([points, torch.full((1000, 3), 100.0)])
+    assert pixel_size(behind, rig) == pytest.approx(distance / 40, rel=0.01), "what no camera sees does not count"
+    wider = arc_rig(5, radius=6.0)
+    assert pixel_size(points, wider) == pytest.approx(math.hypot(6.0, 0.3) / 40, rel=0.01)
+
+
+def test_leaving_a_bin_has_a_price() -> None:
+    parameters = Parameters.of(random_scene(10), trained=parameters_of_fields({"anchor_positions", "offset_scales"}))
+    steps = {"anchor_positions": 0.5, "offset_scales": 0.25, "covariance_mlp": 0.1}
+    rate = Rate.of(parameters, steps, weight=0.5)  # type: ignore[arg-type]
+    assert rate is not None
+    assert rate.price(parameters.values).item() == 0.0
+    values = dict(parameters.values)
+    values["anchor_positions"] = values["anchor_positions"].detach().clone()
+    values["anchor_positions"][2, 1] -= 0.5
+    values["offset_scales"] = values["offset_scales"].detach().clone()
+    values["offset_scales"][7, 0] += 0.75
+    assert rate.price(values).item() == pytest.approx(0.5 * (1.0 + 2.0) / 10, rel=1e-4)
+    price = rate.price({**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1})
+    (gradient,) = torch.autograd.grad(price, [parameters.values["anchor_positions"]])
+    assert (gradient > 0).all(), "it pulls back"
+
+
+@pytest.mark.parametrize(("steps", "weight"), [({}, 1.0), ({"covariance_mlp": 0.1}, 1.0), ({"base_scales": 0.1}, 0.0)])
+def test_no_price_where_nothing_is_paid(steps: dict, weight: float) -> None:
+    parameters = Parameters.of(random_scene(3), trained=parameters_of_fields({"anchor_positions"}))
+    assert Rate.of(parameters, steps, weight=weight) is None
