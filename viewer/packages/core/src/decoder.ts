@@ -42,6 +42,24 @@ export function packetOf(payload: Uint8Array, isKey: boolean): Packet {
   return { isKey, index, ptsSeconds, payload };
 }
 
+/**
+ * Refuses a packet that cannot come after `before`, or first when there is none.
+ *
+ * @param name what messages call the stream
+ */
+export function checkFollows(facts: Omit<Packet, "payload">, before: typeof facts | undefined, name: string): void {
+  const expected = before ? before.index + 1 : 0;
+  if (facts.index !== expected) {
+    throw new StreamError(`${name} has packet ${facts.index} where packet ${expected} belongs.`);
+  }
+  if (!before && !facts.isKey) {
+    throw new StreamError(`${name} begins with a delta packet; the first must be a key packet.`);
+  }
+  if (before && facts.ptsSeconds <= before.ptsSeconds) {
+    throw new StreamError(`In ${name} packet ${facts.index} is not presented after the one before it.`);
+  }
+}
+
 /** Decodes the packets of one stream: in order from any key packet on; with codec `raw` in any order. */
 export class SceneDecoder {
   private readonly compact: CompactDecoder | undefined;

@@ -7,7 +7,7 @@
  */
 
 import { ByteQueue } from "./byteQueue.js";
-import { type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
+import { checkFollows, type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 import { StreamError } from "./errors.js";
 import { type StreamHeader, unpackedHeader } from "./header.js";
 import {
@@ -178,16 +178,7 @@ export class StreamReader {
   }
 
   private addPacket({ payload, ...facts }: Packet, offset: number, bytes: number): void {
-    const before = this.infos.at(-1);
-    if (facts.index !== this.infos.length) {
-      throw new StreamError(`${this.name} has packet ${facts.index} where packet ${this.infos.length} belongs.`);
-    }
-    if (!before && !facts.isKey) {
-      throw new StreamError(`${this.name} begins with a delta packet; the first must be a key packet.`);
-    }
-    if (before && facts.ptsSeconds <= before.ptsSeconds) {
-      throw new StreamError(`In ${this.name} packet ${facts.index} is not presented after the one before it.`);
-    }
+    checkFollows(facts, this.infos.at(-1), this.name);
     this.infos.push({ ...facts, offset, bytes });
     this.payloads.push(payload);
   }
