@@ -8,7 +8,7 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, LARGEST, WEIGHTS, binned, valued
 from structgstream.codec.compact import CODABLE
-from structgstream.scene.state import state_of
+from structgstream.scene.state import FieldName, state_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.rounding import Rate, RoundingConfig, pixel_size, rounded
 
@@ -37,7 +37,9 @@ def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
     scene = random_scene(300, free=40, seed=8)
     steps = {name: float(np.float32(step)) for name, step in RoundingConfig().steps(0.0123).items()}
     parameters = Parameters.of(scene, trained=parameters_of_fields(CODABLE), steps=steps)  # type: ignore[arg-type]
-    drawn = {name: value.detach() for name, value in state_of(parameters.scene(scene)).items()}
+    drawn: dict[FieldName, torch.Tensor] = {
+        name: value.detach() for name, value in state_of(parameters.scene(scene)).items()
+    }
     sent = valued(binned(drawn, CODABLE, steps), CODABLE, steps)
     for name, value in sent.items():
         assert torch.equal(value, drawn[name]), name

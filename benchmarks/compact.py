@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A delta packet of the compact codec: encoding and decoding, beside the same frame as float32."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchmarks.benchmark import Benchmark, Growth, Target, Variant
+from benchmarks.contest import Contestant, Quantity, Results
+from structgstream.cameras import Camera, CameraRig
+from structgstream.codec.blocks import packed_block, unpacked_blocks
+from structgstream.codec.compact import CompactDecoder, CompactEncoder, CompactState, quantised
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.scene.order import space_order
+from structgstream.scene.state import FieldName
+from structgstream.similarity import Similarity
+
+STEPS = {
+    "anchor_positions": 1 / 512,
+    "offset_scales": 1 / 64,
+    "free_means": 1 / 512,
+    "free_log_scales": 1 / 16,
+    "free_quats": 1 / 64,
+    "free_logit_opacities": 1 / 8,
+    "free_colors": 1 / 128,
+}
+DYNAMIC: frozenset[FieldName] = frozenset({"anchor_positions", "offset_scales", "free", "free_births"})
+ROWS: frozenset[FieldName] = frozenset({"anchor_positions", "offset_scales"})
+State = Mapping[FieldName, Tensor]
+
+
+@dataclass(frozen=True)
+class Work:
+    """One delta packet, and what comes before it."""
+
+    header: StreamHeader
+    before: CompactState
+    frame: State
+    raw: bytes
+    coded: dict[FieldName, bytes]
+
+
+def workload(anchors: int) -> Work:
+    """Frame 2 of a stream: of all anchors 5 % move, in 40 balls; of 5 % as many free Gaussians a fifth, 3 % are born."""
+    g = torch.Generator().manual_seed(3)
+    positions = torch.randn(anchors, 3, generator=g)
+    positions = positions[space_order(positions)]
+    centers = positions[torch.randint(anchors, (40,), generator=g)]
+    nearest = torch.cdist(positions, centers).min(1).values
+    active = nearest <= nearest.kthvalue(max(anchors // 20, 1)).values
+    free = anchors // 20
+    state: State = {
+        "anchor_positions": positions,
+        "offset_scales": torch.randn(anchors, 3, generator=g) * 0.3 - 2.0,
+        "free": torch.randn(free, 14, generator=g) * 0.3,
+        "free_births": torch.arange(free),
+    }
+    rig = CameraRig({name: Camera(torch.eye(4).double(), torch.eye(3).double(), 8, 8, near=0.1) for name in "ab"})
+    header = StreamHeader(
+        rig=rig,
+        similarity=Similarity((0.0, 0.0, 0.0), 1.0),
+        fps=30.0,
+        codec="compact",
+        dynamic=DYNAMIC,
+        static={},
+        distance_input=True,
+        config={},
+        metadata={},
+        steps=STEPS,
+        reference=quantised(state, STEPS, ROWS),
+    )
+    encoder, before = CompactEncoder(header), None
+    for frame in range(3):
+        if frame:
+            before = encoder.state
+            state = _moved(state, active, frame, g)
+        coded = encoder.encode(state, kind=PacketKind.DELTA if frame else PacketKind.KEY, index=frame)
+    assert before is not None
+    seen = quantised(state, STEPS, DYNAMIC)
+    raw = b"".join(packed_block(name, seen[name]) for name in sorted(DYNAMIC))
+    return Work(header, before, state, raw, coded)
+
+
+def _moved(state: State, active: Tensor, frame: int, g: torch.Generator) -> State:
+    """A step of about a bin in the active rows, which are nearly the same from frame to frame."""
+    now = active & (torch.rand(len(active), generator=g) < 0.95)
+
+    def step(count: int, *, size: float) -> Tensor:
+        return torch.randn(count, 3, generator=g) * size
+
+    count, free = len(active), len(state["free"])
+    births = max(free * 3 // 100, 1)
+    changed = (torch.rand(free, 1, generator=g) < 0.2) & (torch.rand(free, 14, generator=g) < 0.7)
+    moved = state["free"] + changed * torch.randn(free, 14, generator=g) * 0.02
+    return {
+        "anchor_positions": state["anchor_positions"] + now[:, None] * step(count, size=1.5 / 512),
+        "offset_scales": state["offset_scales"] + now[:, None] * step(count, size=0.7 / 64),
+        "free": torch.cat([moved, torch.randn(births, 14, generator=g) * 0.3]),
+        "free_births": torch.cat([state["free_births"], frame * 2**32 + torch.arange(births)]),
+    }
+
+
+def _told(state: State) -> Results:
+    return [state[name] for name in sorted(DYNAMIC)]
+
+
+def contestants(*, anchors: int) -> list[Contestant]:
+    """Reading float32, decoding, encoding: all three end with the same numbers."""
+    work = workload(anchors)
+    encoder, decoder = CompactEncoder(work.header), CompactDecoder(work.header)
+    sizes = {"raw": float(len(work.raw)), "compact": float(sum(map(len, work.coded.values())))}
+
+    def decode() -> Results:
+        decoder.state = work.before
+        return _told(decoder.decode(work.coded, kind=PacketKind.DELTA, index=2))
+
+    def encode() -> Results:
+        encoder.follow(work.before)
+        encoder.encode(work.frame, kind=PacketKind.DELTA, index=2)
+        return _told(quantised(work.frame, STEPS, DYNAMIC))
+
+    def facts(name: str) -> Callable[[], Mapping[str, float]]:
+        return lambda: {"bytes": sizes[name]}
+
+    return [
+        Contestant(
+            "raw, decode, 1 thread",
+            lambda: _told(unpacked_blocks(work.raw, 0, where="The frame")),
+            1,
+            facts=facts("raw"),
+        ),
+        Contestant("compact, decode, 1 thread", decode, 1, facts=facts("compact")),
+        Contestant("compact, encode, 1 thread", encode, 1, facts=facts("compact")),
+    ]
+
+
+BENCHMARK = Benchmark(
+    name="compact",
+    work="a delta packet of 100,000 anchors, of which 5 % move, and 5,000 free Gaussians, of which 1,000 change, "
+    "with 150 births (sizes are told beside)",
+    contestants=contestants,
+    quantities=[Quantity(name, 0.0, "largest") for name in sorted(DYNAMIC)],
+    variants=[Variant("100,000 anchors", {"anchors": 100_000}, {"anchors": 2_000})],
+    growth=[
+        Growth(
+            "anchors",
+            {n: {"anchors": n} for n in (12_500, 25_000, 50_000, 100_000, 200_000)},
+            {n: {"anchors": n} for n in (500, 1_000)},
+        )
+    ],
+    targets=[Target("compact, decode, 1 thread", at_most_seconds=0.033)],
+)
