@@ -43,7 +43,7 @@ class Work:
 
 
 def workload(anchors: int) -> Work:
-    """Frame 2 of a stream: of all anchors 5 % move, in 40 balls; of 5 % as many free Gaussians a fifth, 3 % are born."""
+    """Frame 2 of a stream: 5 % of the anchors move, in 40 balls; there are 5 % as many free Gaussians."""
     g = torch.Generator().manual_seed(3)
     positions = torch.randn(anchors, 3, generator=g)
     positions = positions[space_order(positions)]
