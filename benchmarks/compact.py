@@ -71,13 +71,14 @@ def workload(anchors: int) -> Work:
         steps=STEPS,
         reference=quantised(state, STEPS, ROWS),
     )
-    encoder, before = CompactEncoder(header), None
-    for frame in range(3):
-        if frame:
-            before = encoder.state
-            state = _moved(state, active, frame, g)
-        coded = encoder.encode(state, kind=PacketKind.DELTA if frame else PacketKind.KEY, index=frame)
+    encoder = CompactEncoder(header)
+    encoder.encode(state, kind=PacketKind.KEY, index=0)
+    state = _moved(state, active, 1, g)
+    encoder.encode(state, kind=PacketKind.DELTA, index=1)
+    before = encoder.state
     assert before is not None
+    state = _moved(state, active, 2, g)
+    coded = encoder.encode(state, kind=PacketKind.DELTA, index=2)
     seen = quantised(state, STEPS, DYNAMIC)
     raw = b"".join(packed_block(name, seen[name]) for name in sorted(DYNAMIC))
     return Work(header, before, state, raw, coded)
