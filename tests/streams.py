@@ -32,7 +32,8 @@ def header_for(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -
     )
 
 
-STEPS = dict.fromkeys((*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS), 2.0 ** (-6))
+_STEPPED: list[str] = [*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS]
+STEPS = dict.fromkeys(_STEPPED, 2.0**-6)
 
 
 def compact_header(
