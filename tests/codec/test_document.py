@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documents alone: a second decoder, written from docs/bitstream.md and docs/entropy.md, number by number.
+
+It shares no code with the package and checks nothing but what it needs to go on.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import zstandard
+
+from vectors.generate import COMPACT_EXPECTED, COMPACT_STREAM
+
+Row = list[int]
+NAMES = {1: "anchor_positions", 2: "offset_scales", 3: "base_scales", 4: "anchor_offsets", 5: "anchor_features"}
+NAMES |= {6: "opacity_mlp", 7: "color_mlp", 8: "covariance_mlp", 9: "free", 10: "free_births", 11: "camera_color"}
+FREE = [("free_means", 3), ("free_log_scales", 3), ("free_quats", 4), ("free_logit_opacities", 1), ("free_colors", 3)]
+
+
+class Bits:
+    """Section Bits."""
+
+    def __init__(self, data: bytes) -> None:
+        self.text = "".join(f"{byte:08b}" for byte in data)
+
+    def bits(self, count: int) -> int:
+        taken, self.text = self.text[:count], self.text[count:]
+        assert len(taken) == count
+        return int(taken or "0", 2)
+
+    def golomb(self, k: int) -> int:
+        z = self.text.index("1")
+        self.bits(z)
+        return self.bits(z + k + 1) - 2**k
+
+    def signed(self, k: int) -> int:
+        v = self.golomb(k)
+        return -(v + 1) // 2 if v % 2 else v // 2
+
+
+def normalised(weights: Row) -> Row:
+    """Section Normalised weights."""
+    total = sum(weights)
+    row = [max(1, 4096 * w // total) if w else 0 for w in weights]
+    row[weights.index(max(weights))] += 4096 - sum(row)
+    return row
+
+
+def family(g: int, alphabet: int) -> Row:
+    """Section The geometric family."""
+    z, q, u, weights = g >> 3, g % 8, 2**16, [0] * alphabet
+    for symbol in range(1, alphabet, 2):
+        for which in range(symbol, min(symbol + 2, alphabet)):
+            weights[which] = max(u, 1)
+        u = u * (2 * q + 1) >> 4
+    weights[0] = (2 + z % 2) * 2 ** (z >> 1) * sum(weights) >> 4
+    return normalised(weights)
+
+
+def level_of(f: int, p: int) -> int:
+    """Section Levels."""
+    if f == 0:
+        return 1
+    e = f.bit_length() - 1
+    return 1 + e * 2**p + (f * 2**p // 2**e - 2**p)
+
+
+def weight_of(level: int, p: int) -> int:
+    e, r = divmod(level - 1, 2**p)
+    return (2**p + r) * 2**e
+
+
+def tables_of(bits: Bits, previous: list[Row]) -> list[Row]:
+    """Section Table sets."""
+    found = []
+    for before in previous:
+        alphabet = len(before)
+        if not bits.bits(1):
+            found.append(before)
+        elif not bits.bits(1):
+            found.append(family(bits.bits(8), alphabet))
+        else:
+            reference = family(bits.bits(8), alphabet) if bits.bits(1) else before
+            p, k = bits.bits(2), bits.bits(1)
+            if bits.bits(1):
+                present = [symbol for symbol in range(alphabet) if bits.bits(1)]
+            else:
+                present = list(range(bits.bits(5) + 1))
+            weights = [0] * alphabet
+            for symbol in present:
+                step = bits.signed(k) if len(present) > 1 else 0
+                weights[symbol] = weight_of(level_of(reference[symbol], p) + step, p)
+            found.append(normalised(weights))
+    assert "1" not in bits.text
+    assert len(bits.text) < 8
+    return found
+
+
+class Fields:
+    """Section Sections of Compact packets: the bytes of each field, read from its beginning, and the tables."""
+
+    def __init__(self, data: dict[str, bytes], tables: dict[str, list[Row]]) -> None:
+        self.data, self.tables = data, tables
+
+    def take(self, name: str, count: int) -> bytes:
+        field = name.split(".")[0]
+        taken, self.data[field] = self.data[field][:count], self.data[field][count:]
+        assert len(taken) == count
+        return taken
+
+    def number(self, name: str) -> int:
+        value = shift = 0
+        while True:
+            byte = self.take(name, 1)[0]
+            value |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                return value
+
+    def section(self, name: str, contexts: Row, c: int, alphabet: int) -> Row:
+        previous = self.tables.get(name) or [family(128, alphabet)] * c
+        self.tables[name] = rows = tables_of(Bits(self.take(name, self.number(name))), previous)
+        n = self.number(name)
+        assert n == len(contexts)
+        if not n:
+            return []
+        words, lane_code = divmod(self.number(name), 4)
+        lanes = (1, 4, 32)[lane_code]
+        states = list(struct.unpack(f"<{lanes}I", self.take(name, 4 * lanes)))
+        following = iter(struct.unpack(f"<{words}H", self.take(name, 2 * words)))
+        symbols = []
+        for i, context in enumerate(contexts):
+            row, x = rows[context], states[i % lanes]
+            slot, start, s = x % 4096, 0, 0
+            while slot >= start + row[s]:
+                start, s = start + row[s], s + 1
+            x = row[s] * (x >> 12) + slot - start
+            states[i % lanes] = x if x >= 2**16 else x * 2**16 + next(following)
+            symbols.append(s)
+        assert set(states) == {2**16}
+        assert next(following, None) is None
+        return symbols
+
+    def flags(self, name: str, contexts: Row, c: int) -> Row:
+        return self.section(name, contexts, c, 2)
+
+    def residuals(self, name: str, contexts: Row, c: int) -> Row:
+        symbols = self.section(name, contexts, c, 16)
+        escapes = Bits(self.take(name, self.number(name)))
+        found = []
+        for s in symbols:
+            if s < 15:
+                found.append(-(s + 1) // 2 if s % 2 else s // 2)
+            else:
+                size = escapes.golomb(2) + 8
+                found.append(-size if escapes.bits(1) else size)
+        return found
+
+    def naturals(self, name: str, contexts: Row, c: int) -> Row:
+        lengths = self.section(name, contexts, c, 32)
+        below = [max(length - 1, 0) for length in lengths]
+        rest = Bits(self.take(name, math.ceil(sum(below) / 8)))
+        return [2**b + rest.bits(b) if length else 0 for length, b in zip(lengths, below, strict=True)]
+
+
+def limited(value: int, most: int) -> int:
+    return max(-most, min(most, value))
+
+
+def change(fields: Fields, last: list[Row], active: Row, groups: list[tuple[str, int, int]]) -> tuple[list[Row], Row]:
+    """Section Rows: residuals and activity, from the last ones."""
+    n, first = len(last), groups[0][0]
+    level = [min((sum(active[max(i - 3, 0) : i + 4]) - active[i] + 1) // 2, 3) for i in range(n)]
+    now = [0] * (n + 1)
+    for start in (0, 1):
+        rows = range(start, n, 2)
+        beside = {i: now[i - 1] + now[i + 1] if start else 0 for i in rows}
+        contexts = [(active[i] * 3 + beside[i]) * 4 + level[i] for i in rows]
+        for i, flag in zip(rows, fields.flags(f"{first}.active{start}", contexts, 24), strict=True):
+            now[i] = flag
+    moving = [i for i in range(n) if now[i]]
+    found = [[0] * len(row) for row in last]
+    for name, begin, end in groups:
+        nothing = [0] * (end - begin)
+        for start in (0, 1):
+            contexts = []
+            for a in range(start, len(moving), 2):
+                sides = (a - 1, a + 1) if start else ()
+                near = [found[moving[b]][begin:end] if b < len(moving) else nothing for b in sides]
+                for column in range(begin, end):
+                    both = limited(sum(side[column - begin] for side in near), 3)
+                    contexts.append((limited(last[moving[a]][column], 2) + 2) * 7 + both + 3)
+            values = iter(fields.residuals(f"{name}.change{start}", contexts, 35))
+            for a in range(start, len(moving), 2):
+                found[moving[a]][begin:end] = [next(values) for _ in range(begin, end)]
+    return found, now[:n]
+
+
+class Rows:
+    """Rows of bins, and their last change."""
+
+    def __init__(self, bins: list[Row]) -> None:
+        self.bins = bins
+        self.forget()
+
+    def forget(self) -> None:
+        self.last, self.active = [[0] * len(row) for row in self.bins], [0] * len(self.bins)
+
+    def keep(self, which: Row) -> None:
+        self.bins, self.last = [self.bins[i] for i in which], [self.last[i] for i in which]
+        self.active = [self.active[i] for i in which]
+
+    def read(self, fields: Fields, groups: list[tuple[str, int, int]]) -> None:
+        self.last, self.active = change(fields, self.last, self.active, groups)
+        self.bins = [[a + b for a, b in zip(*rows, strict=True)] for rows in zip(self.bins, self.last, strict=True)]
+
+
+def read_free(fields: Fields, free: Rows, births: Row) -> Row:
+    """Section Free 3DGs; the births afterwards."""
+    alive = fields.flags("free_births.alive", free.active, 2)
+    which = [i for i, flag in enumerate(alive) if flag]
+    free.keep(which)
+    births = [births[i] for i in which]
+    groups, column = [], 0
+    for name, width in FREE:
+        groups.append((name.replace("free_", "free.", 1), column, column + width))
+        column += width
+    free.read(fields, groups)
+    n = fields.number("free_births.count")
+    if not n:
+        return births
+    frames = fields.naturals("free_births.frame", [0] * n, 1)
+    numbers = fields.naturals("free_births.number", [int(frame != 0) for frame in frames], 2)
+    frame = number = 0
+    for i, (step, value) in enumerate(zip(frames, numbers, strict=True)):
+        frame, number = frame + step, value if step or not i else number + value
+        births.append(frame * 2**32 + number)
+    values, row = fields.naturals("free.born", [*range(14)] * n, 14), [0] * 14
+    for i in range(n):
+        steps = [-(v + 1) // 2 if v % 2 else v // 2 for v in values[14 * i : 14 * i + 14]]
+        row = [a + b for a, b in zip(row, steps, strict=True)]
+        free.bins.append(row)
+        free.last.append([0] * 14)
+        free.active.append(0)
+    assert births == sorted(set(births))
+    return births
+
+
+def blocks(data: bytes) -> dict[str, tuple[list[int], bytes]]:
+    """Section Field blocks: shape and bytes by name."""
+    found = {}
+    while data:
+        code, coding, kind, dimensions = data[:4]
+        shape = list(struct.unpack(f"<{dimensions}I", data[4 : 4 + 4 * dimensions]))
+        size = math.prod(shape) * (1 if coding else (4, 8)[kind])
+        start = 4 + 4 * dimensions
+        found[NAMES[code]] = shape, data[start : start + size]
+        data = data[start + size :]
+    return found
+
+
+def records(data: bytes) -> list[tuple[int, bytes]]:
+    found, start = [], 12
+    while start < len(data) - 16:
+        length = int.from_bytes(data[start + 4 : start + 8], "little")
+        found.append((data[start], data[start + 8 : start + 8 + length]))
+        start += 12 + length
+    return found
+
+
+def values(bins: list[Row], step: float) -> list[float]:
+    return [float(np.float32(bin) * np.float32(step)) for row in bins for bin in row]
+
+
+def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> None:
+    """Section Compact packets: the dynamic fields of every frame."""
+    (_, init), *packets, _ = records(data)
+    size = int.from_bytes(init[:4], "little")
+    header = json.loads(zstandard.ZstdDecompressor().decompress(init[4 : 4 + size]))
+    steps, dynamic, stored = header["steps"], header["dynamic"], blocks(init[4 + size :])
+    anchors = [name for code, name in NAMES.items() if code <= 3 and name in dynamic]
+    weights = [name for code, name in NAMES.items() if 6 <= code <= 8 and name in dynamic]
+    tables: dict[str, list[Row]] = {}
+    rows, births = {"anchors": Rows([]), "free": Rows([])}, []
+    for kind, payload in packets:
+        if kind == 2:
+            bins = {}
+            for name in (*anchors, *weights):
+                shape, raw = stored[name]
+                numbers = [round(v / steps[name]) for v in struct.unpack(f"<{math.prod(shape)}f", raw)]
+                width = 3 if name in anchors else 1
+                bins[name] = [numbers[i : i + width] for i in range(0, len(numbers), width)]
+            beside = zip(*(bins[name] for name in anchors), strict=True)
+            rows = {"anchors": Rows([[bin for part in row for bin in part] for row in beside])}
+            rows |= {name: Rows(bins[name]) for name in weights} | {"free": Rows([])}
+            births, tables = [], {}
+        fields = Fields({name: raw for name, (_, raw) in blocks(payload[12:]).items()}, tables)
+        rows["anchors"].read(fields, [(name, 3 * i, 3 * i + 3) for i, name in enumerate(anchors)])
+        for name in weights:
+            rows[name].read(fields, [(name, 0, 1)])
+        births = read_free(fields, rows["free"], births)
+        assert not any(fields.data.values())
+        told = {name: values(rows[name].bins, steps[name]) for name in weights}
+        for i, name in enumerate(anchors):
+            told[name] = values([row[3 * i : 3 * i + 3] for row in rows["anchors"].bins], steps[name])
+        step_of = [steps[name] for name, width in FREE for _ in range(width)]
+        told["free"] = [values([[bin]], step)[0] for row in rows["free"].bins for bin, step in zip(row, step_of)]
+        emit({**told, "free_births": births})
+        if kind == 2:
+            for kept in rows.values():
+                kept.forget()
+
+
+def test_a_decoder_from_the_documents_alone_reads_the_golden_compact_stream() -> None:
+    found: list[dict[str, list[float]]] = []
+    frames_of(COMPACT_STREAM.read_bytes(), found.append)
+    frames = json.loads(COMPACT_EXPECTED.read_text())["frames"]
+    assert len(found) == len(frames) == 6
+    for got, frame in zip(found, frames, strict=True):
+        assert got.keys() == {"anchor_positions", "offset_scales", "covariance_mlp", "free", "free_births"}
+        for name, numbers in got.items():
+            assert numbers == frame["fields"][name]["values"], (frame["index"], name)
