@@ -308,7 +308,7 @@ def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> No
             told[name] = values([row[3 * i : 3 * i + 3] for row in rows["anchors"].bins], steps[name])
         step_of = [steps[name] for name, width in FREE for _ in range(width)]
         told["free"] = [values([[bin]], step)[0] for row in rows["free"].bins for bin, step in zip(row, step_of)]
-        emit({**told, "free_births": births})
+        emit({**told, "free_births": [float(birth) for birth in births]})
         if kind == 2:
             for kept in rows.values():
                 kept.forget()
