@@ -171,6 +171,16 @@ def test_a_higher_price_makes_fewer_bytes() -> None:
     assert sizes[2] < sizes[1] < sizes[0]
 
 
+def test_without_a_look_at_motion_everything_moves_f_sigma_too() -> None:
+    online = replace(CONFIG.online, motion=MotionConfig(), rounding=RoundingConfig(0.02, weight_step=1e-4))
+    run(sink := MemorySink(), config=replace(CONFIG, online=online), frames=3)
+    reader = StreamReader(sink.data)
+    assert "covariance_mlp" in reader.header.reference
+    states = [state_of(scene) for _, scene in reader.scenes()]
+    assert not torch.equal(states[0]["covariance_mlp"], states[1]["covariance_mlp"])
+    assert same(reader.scene(1), StreamReader(sink.data).scene(1))
+
+
 def test_it_is_smaller_than_raw() -> None:
     raw = run(MemorySink(), config=replace(CONFIG, codec="raw"))
     compact = whole()[1]

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free Gaussians come, change and go."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from structgstream.codec import free_rows
 from structgstream.codec.coder import Decoder, Encoder, Tables, varint
 from structgstream.codec.free_rows import MOST_FREE, FreeBins, coded_free
 from structgstream.codec.rows import Change
@@ -118,8 +121,27 @@ def test_a_count_is_refused_before_anything_is_made_of_it() -> None:
     births = writer.fields["free_births"]
     assert births[-1:] == b"\0"
     fields = {**writer.fields, "free_births": births[:-1] + varint(2**31)}
-    with pytest.raises(StreamError, match="more than 262144"):
-        coded_free(Decoder(Tables(), fields, where="Packet 0"), None, FreeBins.none(), where="Packet 0")  # type: ignore[arg-type]
+    decoder = Decoder(Tables(), fields, where="Packet 0")  # type: ignore[arg-type]
+    tracemalloc.start()
+    try:
+        with pytest.raises(StreamError, match="more than 262144"):
+            coded_free(decoder, None, FreeBins.none(), where="Packet 0")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_most_that_few_bytes_can_make(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Births that differ by nothing take no bits: only the limit bounds them, also over several packets."""
+    monkeypatch.setattr(free_rows, "MOST_FREE", 2**12)
+    many = FreeBins(np.arange(1, 2**12 + 1), np.zeros((2**12, 14), np.int32), Change.none(2**12, 14))
+    writer = Encoder(Tables())
+    coded_free(writer, many, FreeBins.none(), where="")
+    assert sum(map(len, writer.fields.values())) < 200
+    assert len(exchange(many, FreeBins.none()).births) == 2**12
+    more = FreeBins(np.arange(1, 2**12 + 2), np.zeros((2**12 + 1, 14), np.int32), many.change)
+    with pytest.raises(StreamError, match="adds 1 free Gaussians, which makes more than"):
+        coded_free(Encoder(Tables()), more, many, where="Frame 1")
 
 
 def test_a_birth_takes_few_bytes() -> None:
