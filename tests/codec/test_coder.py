@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from structgstream.codec.bits import fixed, numbers_of, packed_bits
@@ -22,6 +22,7 @@ def reader(fields: dict[str, bytes]) -> Decoder:
     return Decoder(Tables(), fields, where="Packet 0")  # type: ignore[arg-type]
 
 
+@settings(deadline=None)
 @given(st.lists(NATURAL, max_size=30), st.lists(RESIDUAL, max_size=30), st.lists(st.booleans(), max_size=30))
 def test_what_is_written_is_read(naturals: list[int], residuals: list[int], flags: list[bool]) -> None:
     writer, n = Encoder(Tables()), np.array(naturals, np.int64)
@@ -93,6 +94,7 @@ def test_tables_persist_and_a_copy_goes_on_apart() -> None:
     assert repeated.fields == again.fields
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 56), st.integers(0, 2**56 - 1)), max_size=40))
 def test_numbers_are_found_at_any_bit(pairs: list[tuple[int, int]]) -> None:
     values = [value % (1 << width) for width, value in pairs]
