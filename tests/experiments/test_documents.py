@@ -8,8 +8,8 @@ import pytest
 from outcomes import outcome, outcomes
 from structgstream.errors import ConfigError, StorageError
 from structgstream.experiments.__main__ import main
-from structgstream.experiments.documents import MARKED, refresh, refreshed
-from structgstream.experiments.results import Result, read_results, write_result
+from structgstream.experiments.documents import MARKED, read_studies, refresh, refreshed
+from structgstream.experiments.results import Result, write_result
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,7 +25,7 @@ Words between | with a bar.
 
 <!-- methods ring -->
 <!-- end -->
-<!-- readings ring -->
+<!-- readings readings -->
 | a | b |
 <!-- end -->
 <!-- made-by ring -->
@@ -34,9 +34,15 @@ Words after.
 """
 
 
-def results() -> list[Result]:
+def results() -> dict[str, list[Result]]:
     found = outcomes("full", (30.0, 31.0, 32.0)) + outcomes("without-scaling-factor", (29.8, 30.7, 31.8))
-    return [*found, outcome("reading-default"), outcome("full", psnr=99.25, capture={"name": "arc"})]
+    return {"ring": found, "readings": [outcome("reading-default")], "ring-motion": [outcome("full", psnr=99.25)]}
+
+
+def write_results(folder: Path) -> None:
+    for study, found in results().items():
+        for number, result in enumerate(found):
+            write_result(folder / study / f"{number}.json", result)
 
 
 def marked_parts(text: str) -> list[str]:
@@ -63,7 +69,7 @@ def test_the_rest_of_a_document_stays_and_a_second_time_changes_nothing() -> Non
 
 
 def test_a_capture_without_results_has_tables_without_numbers() -> None:
-    ablation, methods, _, made_by = marked_parts(refreshed(TEXT, []))
+    ablation, methods, _, made_by = marked_parts(refreshed(TEXT, {}))
     assert "33.53" in ablation
     assert "±" not in ablation + methods
     assert "No result yet." in made_by
@@ -97,8 +103,7 @@ def test_a_table_without_an_end_is_told_and_swallows_no_words(text: str) -> None
 
 
 def test_files_that_change_are_named_and_others_are_left_alone(tmp_path: Path) -> None:
-    for number, result in enumerate(results()):
-        write_result(tmp_path / "results" / f"{number}.json", result)
+    write_results(tmp_path / "results")
     table, words = tmp_path / "table.md", tmp_path / "words.md"
     table.write_text(TEXT)
     words.write_text("No table.\n")
@@ -107,18 +112,18 @@ def test_files_that_change_are_named_and_others_are_left_alone(tmp_path: Path) -
     assert table.read_text() == refreshed(TEXT, results())
     assert words.stat().st_mtime_ns == written
     assert refresh([table, words], tmp_path / "results") == []
-    (tmp_path / "results" / "other.json").write_text("{}")
+    (tmp_path / "results" / "ring" / "other.json").write_text("{}")
     with pytest.raises(StorageError, match=r"other\.json is not a result"):
         refresh([table], tmp_path / "results")
 
 
 def test_the_module_renews_documents_and_says_which(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_result(tmp_path / "r" / "0.json", results()[0])
+    write_results(tmp_path / "r")
     document = tmp_path / "d.md"
     document.write_text(TEXT)
     assert main([str(tmp_path / "r"), str(document)]) == 0
     assert "d.md" in capsys.readouterr().out
-    assert "30.00" in document.read_text()
+    assert "31.00 ± 1.00" in document.read_text()
     document.write_text("<!-- metods ring -->\n<!-- end -->\n")
     assert main([str(tmp_path / "r"), str(document)]) == 1
     assert "metods ring" in capsys.readouterr().err
@@ -128,7 +133,7 @@ def test_the_module_renews_documents_and_says_which(tmp_path: Path, capsys: pyte
 
 @pytest.mark.skipif(not (ROOT / "results").is_dir(), reason="this working copy has no results/ folder")
 def test_the_tables_of_our_documents_are_those_of_our_results() -> None:
-    found = read_results(ROOT / "results")
+    found = read_studies(ROOT / "results")
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         text = path.read_text()
         assert refreshed(text, found) == text, f"run: python -m structgstream.experiments results {path.name}"

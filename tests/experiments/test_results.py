@@ -106,7 +106,13 @@ def small_report() -> Report:
         )
         for index, (size, free, log) in enumerate(zip((1000, 100, 300), (0, 10, 30), logs))
     ]
-    return Report(frames, {"a": scores}, scores, {"metadata": {"capture": "x"}, "total_bytes": 1400}, {"cpu": "c"})
+    return Report(
+        frames,
+        {"a": scores},
+        scores,
+        {"metadata": {"capture": "x"}, "total_bytes": 1400, "not_available": {"lpips": "in /some/folder"}},
+        {"cpu": "c"},
+    )
 
 
 def test_a_result_of_a_report_has_the_costs_of_the_frames_after_the_first() -> None:
@@ -119,7 +125,7 @@ def test_a_result_of_a_report_has_the_costs_of_the_frames_after_the_first() -> N
         "online_cpu_seconds": 3.0,
     }
     assert result.mean["first_cpu_seconds"] == 60.0
-    assert result.stream == {"total_bytes": 1400}
+    assert result.stream == {"total_bytes": 1400, "not_available": ["lpips"]}
     assert [frame["psnr"] for frame in result.frames] == [30.0, 29.0, 28.0]
     assert [frame.get("cpu_seconds") for frame in result.frames] == [60.0, 3.0, None]
     assert all(key not in frame for frame in result.frames for key in ("log", "cameras", "seconds"))

@@ -7,8 +7,9 @@ A marker is a comment of Markdown on a line of its own::
     ...
     <!-- end -->
 
-with ``ablation TABLE CAPTURE``, ``methods CAPTURE``, ``readings CAPTURE`` and ``made-by CAPTURE`` for text, and
-``curves TABLE CAPTURE`` and ``plot CAPTURE`` for pictures, which go to ``images/`` beside the document.
+with ``ablation TABLE STUDY``, ``methods STUDY``, ``readings STUDY`` and ``made-by STUDY`` for text, and ``curves TABLE
+STUDY`` and ``plot STUDY`` for pictures, which go to ``images/`` beside the document. A study is a folder of results of
+one capture and one full method, named after the capture or after what is asked of it.
 """
 
 import re
@@ -17,11 +18,14 @@ from pathlib import Path
 
 from structgstream.errors import ConfigError
 from structgstream.experiments.figures import write_comparison, write_curves
-from structgstream.experiments.readings import READINGS, readings_sheet
+from structgstream.experiments.readings import readings_sheet
 from structgstream.experiments.results import Result, read_results
 from structgstream.experiments.sheets import ablation_sheet, comparison_sheet, markdown
 from structgstream.experiments.studies import COMPARED, method_key, method_titles, variant_titles
 from structgstream.experiments.variants import TABLES
+
+Studies = Mapping[str, Sequence[Result]]
+"""Results by the name of their folder."""
 
 MARKED = re.compile(r"<!-- (?P<what>[a-z-]+)(?P<rest>(?: [\w.-]+)*) -->\n(?:(?!<!-- ).)*<!-- end -->", re.DOTALL)
 
@@ -33,7 +37,7 @@ def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
         ConfigError: a marker asks for something that is not known.
         StorageError: a result cannot be read.
     """
-    found = read_results(results)
+    found = read_studies(results)
     changed = []
     for path in documents:
         old = path.read_text()
@@ -46,10 +50,19 @@ def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
     return changed
 
 
-def _draw(what: str, words: Sequence[str], results: Sequence[Result], *, folder: Path) -> None:
+def read_studies(folder: Path) -> dict[str, list[Result]]:
+    """The results in each folder of ``folder``, by its name.
+
+    Raises:
+        StorageError: a file cannot be read or is something else.
+    """
+    return {path.name: read_results(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+
+
+def _draw(what: str, words: Sequence[str], studies: Studies, *, folder: Path) -> None:
     if what not in _PICTURES:
         return
-    mine = _of(words[-1], results, READINGS)
+    mine = studies.get(words[-1], ())
     if mine and what == "curves":
         keys = list(TABLES[words[0]].rows)
         shown = [result for result in mine if result.key in keys]
@@ -58,8 +71,8 @@ def _draw(what: str, words: Sequence[str], results: Sequence[Result], *, folder:
         write_comparison(folder / f"{words[0]}-methods.png", mine, titles=_method_titles())
 
 
-def refreshed(text: str, results: Sequence[Result]) -> str:
-    """``text`` with every marked part made from ``results``.
+def refreshed(text: str, studies: Studies) -> str:
+    """``text`` with every marked part made from the results of ``studies``.
 
     Raises:
         ConfigError: a marker asks for something that is not known, or has no end.
@@ -69,7 +82,7 @@ def refreshed(text: str, results: Sequence[Result]) -> str:
         what, rest = match["what"], match["rest"].split()
         if what not in _MAKERS or len(rest) != _MAKERS[what][0]:
             raise ConfigError(f"A document asks for {match['what']}{match['rest']}; known are {', '.join(_MAKERS)}.")
-        return f"<!-- {what}{match['rest']} -->\n{_MAKERS[what][1](rest, results)}<!-- end -->"
+        return f"<!-- {what}{match['rest']} -->\n{_MAKERS[what][1](rest, studies)}<!-- end -->"
 
     new = MARKED.sub(renewed, text)
     begun = sum(len(re.findall(f"<!-- {what} .*-->", text)) for what in _MAKERS)
@@ -80,37 +93,36 @@ def refreshed(text: str, results: Sequence[Result]) -> str:
     return new
 
 
-def _ablation(words: Sequence[str], results: Sequence[Result]) -> str:
-    table, capture = words
+def _ablation(words: Sequence[str], studies: Studies) -> str:
+    table, study = words
     if table not in TABLES:
         raise ConfigError(f"A document asks for the ablation {table!r}; there are {', '.join(TABLES)}.")
-    return markdown(ablation_sheet(TABLES[table], _of(capture, results, READINGS), titles=variant_titles()))
+    return markdown(ablation_sheet(TABLES[table], studies.get(study, ()), titles=variant_titles()))
 
 
-def _methods(words: Sequence[str], results: Sequence[Result]) -> str:
-    sheet = comparison_sheet(_of(words[0], results, READINGS), titles=_method_titles(), scores=COMPARED)
-    return markdown(sheet)
+def _methods(words: Sequence[str], studies: Studies) -> str:
+    return markdown(comparison_sheet(studies.get(words[0], ()), titles=_method_titles(), scores=COMPARED))
 
 
 def _method_titles() -> dict[str, str]:
     return {method_key(name): title for name, title in method_titles().items()}
 
 
-def _curves(words: Sequence[str], results: Sequence[Result]) -> str:
+def _curves(words: Sequence[str], studies: Studies) -> str:
     return f"![Scores over the frames of {words[1]}](images/{words[1]}-{words[0]}.png)\n"
 
 
-def _plot(words: Sequence[str], results: Sequence[Result]) -> str:
+def _plot(words: Sequence[str], studies: Studies) -> str:
     return f"![Quality against bytes and seconds, {words[0]}](images/{words[0]}-methods.png)\n"
 
 
-def _readings(words: Sequence[str], results: Sequence[Result]) -> str:
-    return markdown(readings_sheet([result for result in results if result.capture == words[0]]))
+def _readings(words: Sequence[str], studies: Studies) -> str:
+    return markdown(readings_sheet(studies.get(words[0], ())))
 
 
-def _made_by(words: Sequence[str], results: Sequence[Result]) -> str:
+def _made_by(words: Sequence[str], studies: Studies) -> str:
     """Commits, machines and pictures behind the numbers, in a sentence each."""
-    mine = _of(words[0], results, {})
+    mine = studies.get(words[0], ())
     if not mine:
         return "No result yet.\n"
     commits = sorted({str(result.trained_by.get("commit")) for result in mine})
@@ -133,11 +145,7 @@ def _pictures(capture: Mapping[str, object]) -> str:
     )
 
 
-def _of(capture: str, results: Sequence[Result], without: Mapping[str, object]) -> list[Result]:
-    return [result for result in results if result.capture == capture and result.key not in without]
-
-
-_MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Sequence[Result]], str]]] = {
+_MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Studies], str]]] = {
     "ablation": (2, _ablation),
     "methods": (1, _methods),
     "readings": (1, _readings),
