@@ -191,5 +191,5 @@ def test_the_preset() -> None:
     assert PRESETS["compact"] is COMPACT
     assert COMPACT.codec == "compact"
     assert COMPACT.online.motion.enabled
-    assert COMPACT.online.dynamic == PAPER_DYNAMIC - {"covariance_mlp"}
+    assert COMPACT.online.dynamic == PAPER_DYNAMIC - {"covariance_mlp"} | {"base_scales", "appearance"}
     assert all(config.codec == "raw" for name, config in PRESETS.items() if name != "compact")

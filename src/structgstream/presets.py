@@ -79,9 +79,12 @@ MOTION = replace(
 COMPACT = replace(
     MOTION,
     codec="compact",
-    online=replace(MOTION.online, dynamic=MOTION.online.dynamic.difference(["covariance_mlp"])),
+    online=replace(
+        MOTION.online,
+        dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),
+    ),
 )
-"""As MOTION, in small packets: what moves is sent rounded, against the frame before."""
+"""As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks."""
 
 FAST = replace(
     RIG,

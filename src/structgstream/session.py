@@ -22,6 +22,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakKind, PeakMeter
 from structgstream.presets import StreamConfig, to_json
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, on_device, state_of
@@ -163,8 +164,8 @@ class Session:
             peaks.end("fit")
             fitted = time.perf_counter()
             fitted_scene = fit.scene
-            if scene is None and self._config.codec == "compact":
-                fitted_scene = in_space_order(fitted_scene)
+            if scene is None:
+                fitted_scene = self._prepared(fitted_scene)
             if encoder is None:
                 header = self._header(fitted_scene)
                 encoder, steps = SceneEncoder(header), header.steps
@@ -240,6 +241,14 @@ class Session:
             steps=steps,
             on_step=self._on_step,
         )
+
+    def _prepared(self, scene: Scene) -> Scene:
+        """Frame 0 as the frames after it need it."""
+        if self._config.codec == "compact":
+            scene = in_space_order(scene)
+        if "appearance" in self._config.online.dynamic:
+            scene = with_appearance(scene, self._config.online.appearance_rank)
+        return scene
 
     def _header(self, scene: Scene) -> StreamHeader:
         dynamic, codec = self._config.online.dynamic, self._config.codec

@@ -12,6 +12,7 @@ from streams import STEPS
 from structgstream.codec.bins import LARGEST, anchor_fields, binned, valued
 from structgstream.codec.compact import CODABLE, quantised
 from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, state_of
 
 AWKWARD = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STEPS)}
@@ -19,7 +20,7 @@ AWKWARD = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STE
 
 @pytest.mark.parametrize("dynamic", [CODABLE, PAPER_DYNAMIC, frozenset({"free", "free_births"}), frozenset()])
 def test_bins_of_the_values_of_bins_are_the_same_bins(dynamic: frozenset[FieldName]) -> None:
-    state = state_of(random_scene(7, free=5))
+    state = state_of(with_appearance(random_scene(7, free=5), 4))
     bins = binned(state, dynamic, AWKWARD)
     values = valued(bins, dynamic, AWKWARD)
     assert values.keys() == dynamic
@@ -55,12 +56,14 @@ def test_a_value_that_no_bin_stands_for(value: float) -> None:
 
 
 def test_columns_stand_in_the_order_of_the_state_table() -> None:
-    assert anchor_fields(CODABLE) == ("anchor_positions", "offset_scales", "base_scales")
-    state = state_of(random_scene(2, free=1))
+    assert anchor_fields(CODABLE) == ("anchor_positions", "offset_scales", "base_scales", "appearance")
+    state = state_of(with_appearance(random_scene(2, free=1), 4))
     state["offset_scales"] = torch.tensor([[1.0, 2, 3], [4, 5, 6]]) / 64
+    state["appearance"] = torch.arange(1, 9).reshape(2, 4) / 64
     state["free"] = torch.arange(14)[None] / 64
     found = binned(state, CODABLE, STEPS)
     assert found.anchors[:, 3:6].tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert found.anchors[:, 9:].tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
     assert found.free.bins.tolist() == [[*range(14)]]
     widths = {"free_means": 3, "free_log_scales": 3, "free_quats": 4, "free_logit_opacities": 1, "free_colors": 3}
     steps = STEPS | {name: 2.0**-7 * (i + 1) for i, name in enumerate(widths)}

@@ -26,6 +26,7 @@ from structgstream.codec.records import RECORD, RecordType, scanned
 from structgstream.codec.shapes import check_shapes
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, flatten_head, scene_of, state_of
@@ -97,6 +98,8 @@ def small() -> tuple[StreamHeader, bytes, list[Scene], list[Packet]]:
 @pytest.mark.parametrize("anchors", [0, 1, 50])
 def test_a_reader_sees_what_the_encoder_says(dynamic: frozenset[FieldName], anchors: int) -> None:
     first = random_scene(anchors, free=20 if dynamic >= FREE else 0, seed=3)
+    if "appearance" in dynamic:
+        first = with_appearance(first, 5)
     header = compact_header(first, dynamic=dynamic)
     scenes = story(first, 7, dynamic=dynamic)
     data, seen, _ = written(scenes, header)

@@ -11,6 +11,7 @@ from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
 
 NAMES = [row.name for row in STATE_TABLE]
@@ -25,7 +26,7 @@ NAMES = [row.name for row in STATE_TABLE]
     st.sampled_from([1, 2]),
 )
 def test_decoding_gives_the_scene_back_bit_for_bit(anchors: int, free: int, seed: int, dynamic: set, kind: int) -> None:
-    scene = random_scene(anchors, free=free, seed=seed, width=8)
+    scene = with_appearance(random_scene(anchors, free=free, seed=seed, width=8), 3)
     header = header_for(scene, dynamic=frozenset(dynamic))
     encoded = SceneEncoder(header).encode(scene, index=3, pts_seconds=0.1, kind=PacketKind(kind))
     receiver = SceneDecoder(unpacked_header(packed_header(header)))

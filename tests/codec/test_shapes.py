@@ -5,6 +5,7 @@ import torch
 from streams import small_scene
 from structgstream.codec.shapes import SHAPES, check_shapes
 from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
 
@@ -19,11 +20,12 @@ def test_every_field_has_a_shape() -> None:
 @pytest.mark.parametrize(("anchors", "free"), [(0, 0), (3, 0), (0, 2), (3, 2)])
 def test_scenes_fit(anchors: int, free: int) -> None:
     check(state_of(small_scene(anchors, free=free)))
+    check(state_of(with_appearance(small_scene(anchors, free=free), 1)))
 
 
 @pytest.mark.parametrize("name", [row.name for row in STATE_TABLE])
 def test_one_field_that_does_not_fit_is_named(name: FieldName) -> None:
-    fields = state_of(small_scene(3, free=2))
+    fields = state_of(with_appearance(small_scene(3, free=2), 2))
     fields[name] = torch.cat([fields[name], fields[name][:1]])
     with pytest.raises(StreamError, match="Packet 1 has (field|an MLP)") as caught:
         check(fields)

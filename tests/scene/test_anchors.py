@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import torch
 
 from rigs import arc_rig, random_scene
@@ -44,6 +46,6 @@ def test_anchors_behind_the_camera_are_culled() -> None:
     scene = random_scene(10)
     camera = arc_rig()["cam01"]
     behind = scene.anchors.positions + 20.0 * (camera.center - torch.zeros(3)).float()
-    moved = type(scene.anchors)(**{**vars(scene.anchors), "positions": behind})
-    scene = type(scene)(moved, scene.mlps, scene.free, scene.camera_color)
+    moved = replace(scene.anchors, positions=behind)
+    scene = replace(scene, anchors=moved)
     assert scene.structured(camera, reference_backend())[1].numel() == 0

@@ -2,6 +2,7 @@
 import torch
 
 from rigs import random_scene
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FREE_COLUMNS, PAPER_DYNAMIC, STATE_TABLE, scene_of, state_of
 
 
@@ -9,7 +10,7 @@ def test_state_and_scene_are_inverse() -> None:
     scene = random_scene(free=4)
     state = state_of(scene)
     again = state_of(scene_of(state, distance_input=True))
-    assert set(state) == {f.name for f in STATE_TABLE}
+    assert set(state) == {f.name for f in STATE_TABLE if not f.optional}
     for name, value in state.items():
         assert torch.equal(again[name], value), name
 
@@ -29,3 +30,13 @@ def test_size_of_the_covariance_mlp() -> None:
     state = state_of(random_scene(free=3))
     assert state["covariance_mlp"].numel() == 32 * 36 + 32 + 35 * 32 + 35 == 2339
     assert state["free"].shape == (3, FREE_COLUMNS)
+
+
+def test_appearance_is_in_the_state_of_scenes_that_have_one() -> None:
+    scene = with_appearance(random_scene(free=4), 3)
+    state = state_of(scene)
+    assert set(state) == {f.name for f in STATE_TABLE}
+    assert state["appearance"].shape == (len(scene.anchors), 3)
+    again = state_of(scene_of(state, distance_input=True))
+    for name, value in state.items():
+        assert torch.equal(again[name], value), name

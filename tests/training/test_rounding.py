@@ -8,6 +8,7 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, LARGEST, WEIGHTS, binned, valued
 from structgstream.codec.compact import CODABLE
+from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.rounding import Rate, RoundingConfig, pixel_size, rounded
@@ -34,7 +35,7 @@ def test_a_value_of_a_bin_stays_where_it_is(step: float) -> None:
 
 def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
     """Both round in float32: the scene of a fit has no other values than those that its bins stand for."""
-    scene = random_scene(300, free=40, seed=8)
+    scene = with_appearance(random_scene(300, free=40, seed=8), 8)
     steps = {name: float(np.float32(step)) for name, step in RoundingConfig().steps(0.0123).items()}
     parameters = Parameters.of(scene, trained=parameters_of_fields(CODABLE), steps=steps)  # type: ignore[arg-type]
     drawn: dict[FieldName, torch.Tensor] = {

@@ -18,8 +18,8 @@ from structgstream.codec.rows import Change, coded_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FREE_COLUMNS, FieldName
 
-ANCHOR_ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales")
-"""Fields of three numbers an anchor, which change together."""
+ANCHOR_ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales", "appearance")
+"""Fields of an anchor, which change together."""
 WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
 FREE_STEPS = ("free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors")
 _FREE_WIDTHS = (3, 3, 4, 1, 3)
@@ -32,7 +32,7 @@ class SceneBins:
     """The dynamic part of a scene, and what the last frame did to it.
 
     Args:
-        anchors: ``[M, 3 x number of dynamic anchor fields]``.
+        anchors: ``[M, columns of the dynamic anchor fields]``.
         change: of the anchors.
         weights: by field, ``[P, 1]``.
         weight_changes: by field.
@@ -60,6 +60,17 @@ def anchor_fields(dynamic: frozenset[FieldName]) -> tuple[FieldName, ...]:
     return tuple(name for name in ANCHOR_ROWS if name in dynamic)
 
 
+def _columns(fields: Sequence[FieldName], total: int) -> list[tuple[FieldName, int, int]]:
+    """``(name, first column, end)`` of each field: three columns, and for the appearance what remains of ``total``."""
+    found: list[tuple[FieldName, int, int]] = []
+    first = 0
+    for name in fields:
+        end = total if name == "appearance" else first + 3
+        found.append((name, first, end))
+        first = end
+    return found
+
+
 def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> SceneBins:
     """The nearest bins of a state's dynamic fields.
 
@@ -84,8 +95,8 @@ def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], ste
 def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> dict[FieldName, Tensor]:
     """The dynamic fields that bins stand for."""
     state: dict[FieldName, Tensor] = {}
-    for number, name in enumerate(anchor_fields(dynamic)):
-        state[name] = _values(bins.anchors[:, 3 * number : 3 * number + 3], steps[name])
+    for name, first, end in _columns(anchor_fields(dynamic), bins.anchors.shape[1]):
+        state[name] = _values(bins.anchors[:, first:end], steps[name])
     for name, weights in bins.weights.items():
         state[name] = _values(weights[:, 0], steps[name])
     if "free" in dynamic:
@@ -102,7 +113,7 @@ def coded_scene(
     Raises:
         StreamError: what is decoded contradicts itself.
     """
-    groups = [(name, 3 * number, 3 * number + 3) for number, name in enumerate(fields)]
+    groups = _columns(fields, before.anchors.shape[1])
     given = None if after is None else Change.of(after.anchors - before.anchors)
     change = coded_change(coder, given, before.change, groups=groups)
     anchors = before.anchors + change.residuals

@@ -4,7 +4,7 @@
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from structgstream.codec.blocks import packed_block, unpacked_blocks
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.shapes import check_shapes
 from structgstream.errors import CalibrationError, StreamError
-from structgstream.scene.state import STATE_TABLE, FieldName
+from structgstream.scene.state import REQUIRED, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
 
 MAX_JSON_BYTES = 16 * 2**20
@@ -25,7 +25,6 @@ MAX_IMAGE_SIDE = 65_535
 LENGTH = struct.Struct("<I")
 _ZSTD_LEVEL = 19
 _LEAST_STEP = 2.0**-64
-_FIELDS = frozenset(field.name for field in STATE_TABLE)
 
 
 def packed_header(header: StreamHeader) -> bytes:
@@ -54,7 +53,7 @@ def packed_header(header: StreamHeader) -> bytes:
     }
     text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
     packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
-    static = [packed_block(f.name, header.static[f.name]) for f in STATE_TABLE if f.name not in header.dynamic]
+    static = [packed_block(f.name, header.static[f.name]) for f in STATE_TABLE if f.name in header.static]
     reference = [packed_block(f.name, header.reference[f.name]) for f in STATE_TABLE if f.name in header.reference]
     return LENGTH.pack(len(packed)) + packed + b"".join(static + reference)
 
@@ -75,7 +74,7 @@ def unpacked_header(payload: bytes) -> StreamHeader:
         header = _header(_description(payload[LENGTH.size : LENGTH.size + length]), static)
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, ZstdError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
-    if header.dynamic | header.static.keys() != _FIELDS or (header.reference and header.codec == "raw"):
+    if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
         raise StreamError("The init record does not hold every field that packets leave out, and only those.")
     check_shapes(
         {**header.static, **header.reference},
@@ -84,6 +83,11 @@ def unpacked_header(payload: bytes) -> StreamHeader:
         where="The init record",
     )
     return header
+
+
+def _complete(names: Set[FieldName]) -> bool:
+    optional = names - REQUIRED
+    return names >= REQUIRED and (not optional or optional == {"appearance", "appearance_basis"})
 
 
 def _description(packed: bytes) -> dict[str, Any]:

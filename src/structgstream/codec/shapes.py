@@ -21,6 +21,8 @@ SHAPES: Mapping[FieldName, tuple[str | int, ...]] = {
     "free": ("F", FREE_COLUMNS),
     "free_births": ("F",),
     "camera_color": ("V", 6),
+    "appearance": ("M", "R"),
+    "appearance_basis": ("R", "D"),
 }
 """A number is a size itself; a letter is the same size wherever it stands."""
 

@@ -76,7 +76,7 @@ class ScaffoldGS:
         Raises:
             StreamError: the arrays are not those of this method.
         """
-        names: list[FieldName] = [f.name for f in STATE_TABLE]
+        names: list[FieldName] = [f.name for f in STATE_TABLE if not f.optional]
         if set(arrays) != set(names):
             raise StreamError(f"The frame has the arrays {', '.join(sorted(arrays))}; expected {', '.join(names)}.")
         fields: dict[FieldName, Tensor] = {name: torch.from_numpy(arrays[name].copy()) for name in names}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dynamic anchor points: the structured half of a scene (paper, section Structured 3DGs)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
@@ -16,6 +16,8 @@ class AnchorCloud:
         log_base_scales: ``[M, 3]`` log of the largest scale that the covariance head may give.
         offsets: ``[M, K, 3]`` the paper's O_v, in units of l_v.
         features: ``[M, D]`` the paper's f_v.
+        appearance: ``[M, R]`` how far the features have left f_v since frame 0, along the rows of the scene's
+            ``appearance_basis``. R is 0 unless a configuration lets appearance change.
 
     Note [Two scales]
     ~~~~~~~~~~~~~~~~~
@@ -29,6 +31,7 @@ class AnchorCloud:
     log_base_scales: Tensor
     offsets: Tensor
     features: Tensor
+    appearance: Tensor
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -37,3 +40,14 @@ class AnchorCloud:
     def offsets_per_anchor(self) -> int:
         """The paper's k."""
         return self.offsets.shape[1]
+
+    def select(self, rows: Tensor) -> "AnchorCloud":
+        """The anchors of a mask or of indices ``[m]``, contiguous."""
+        return AnchorCloud(**{f.name: getattr(self, f.name)[rows].contiguous() for f in fields(self)})
+
+    def with_rows(self, rows: Tensor, other: "AnchorCloud") -> "AnchorCloud":
+        """The same, those of the mask ``rows`` ``[M]`` replaced by ``other``; nothing is written in place."""
+        columns = {f.name: getattr(self, f.name).clone() for f in fields(self)}
+        for name, column in columns.items():
+            column[rows] = getattr(other, name)
+        return AnchorCloud(**columns)

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """An order of anchors in which neighbours in space are neighbours in memory and in a stream."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.scene import Scene
 
 _BITS = 20
@@ -30,5 +29,4 @@ def in_space_order(scene: Scene) -> Scene:
     """The same scene, its anchors in :func:`space_order`. It must have no free Gaussians, whose ids would change."""
     assert not len(scene.free), "ids of free Gaussians follow those of anchors"
     order = space_order(scene.anchors.positions)
-    columns = {f.name: getattr(scene.anchors, f.name)[order].contiguous() for f in fields(AnchorCloud)}
-    return replace(scene, anchors=AnchorCloud(**columns))
+    return replace(scene, anchors=scene.anchors.select(order))

@@ -24,6 +24,7 @@ class Scene:
         mlps: F_alpha, F_c and F_Sigma.
         free: the free part.
         camera_color: one row for each training camera of the rig, in rig order.
+        appearance_basis: ``[R, D]`` directions in which the anchors' features may change after frame 0.
         distance_input: whether the MLPs see the distance to the camera (the paper: yes; Scaffold-GS: no).
     """
 
@@ -31,7 +32,16 @@ class Scene:
     mlps: MLPWeights
     free: FreeGaussians
     camera_color: CameraColor
+    appearance_basis: Tensor
     distance_input: bool = True
+
+    @property
+    def features(self) -> Tensor:
+        """What the MLPs see of each anchor now, ``[M, D]``."""
+        anchors = self.anchors
+        if not len(self.appearance_basis):
+            return anchors.features
+        return anchors.features + anchors.appearance @ self.appearance_basis
 
     def structured(
         self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None
@@ -59,7 +69,7 @@ class Scene:
             anchors.log_offset_scales,
             anchors.log_base_scales,
             anchors.offsets,
-            anchors.features,
+            self.features,
             self.mlps,
             matrices.center,
             visible,

@@ -33,6 +33,8 @@ FieldName = Literal[
     "free",
     "free_births",
     "camera_color",
+    "appearance",
+    "appearance_basis",
 ]
 
 
@@ -45,12 +47,14 @@ class StateField:
         code: its number in a stream; never reused.
         symbol: the paper's symbol.
         dynamic: whether the paper changes it after frame 0.
+        optional: whether a scene may do without it.
     """
 
     name: FieldName
     code: int
     symbol: str
     dynamic: bool
+    optional: bool = False
 
 
 STATE_TABLE: tuple[StateField, ...] = (
@@ -65,8 +69,11 @@ STATE_TABLE: tuple[StateField, ...] = (
     StateField("free", 9, "free 3DGs", True),
     StateField("free_births", 10, "free 3DGs", True),
     StateField("camera_color", 11, "-", False),
+    StateField("appearance", 12, "-", False, optional=True),
+    StateField("appearance_basis", 13, "-", False, optional=True),
 )
 
+REQUIRED: frozenset[FieldName] = frozenset(f.name for f in STATE_TABLE if not f.optional)
 PAPER_DYNAMIC: frozenset[FieldName] = frozenset(f.name for f in STATE_TABLE if f.dynamic)
 FREE_COLUMNS = 14  # mean 3, log-scale 3, quaternion 4, logit opacity 1, colour 3
 
@@ -84,9 +91,9 @@ def unflatten_head(vector: Tensor, inputs: int, outputs: int, hidden: int) -> He
 
 
 def state_of(scene: Scene) -> dict[FieldName, Tensor]:
-    """The scene as named tensors, one for each row of the table."""
+    """The scene as named tensors, one for each row of the table; without appearance when it has none."""
     anchors, free, color = scene.anchors, scene.free, scene.camera_color
-    return {
+    state: dict[FieldName, Tensor] = {
         "anchor_positions": anchors.positions,
         "offset_scales": anchors.log_offset_scales,
         "base_scales": anchors.log_base_scales,
@@ -99,6 +106,9 @@ def state_of(scene: Scene) -> dict[FieldName, Tensor]:
         "free_births": free.births,
         "camera_color": torch.cat([color.gains, color.biases], dim=1),
     }
+    if len(scene.appearance_basis):
+        state |= {"appearance": anchors.appearance, "appearance_basis": scene.appearance_basis}
+    return state
 
 
 def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scene:
@@ -110,8 +120,16 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
     hidden //= inputs + 1 + k
     means, log_scales, quats, logits, colors = state["free"].split((3, 3, 4, 1, 3), dim=1)
     gains, biases = state["camera_color"].split((3, 3), dim=1)
+    anchors = AnchorCloud(
+        positions=state["anchor_positions"],
+        log_offset_scales=state["offset_scales"],
+        log_base_scales=state["base_scales"],
+        offsets=offsets,
+        features=features,
+        appearance=state.get("appearance", features[:, :0]),
+    )
     return Scene(
-        anchors=AnchorCloud(state["anchor_positions"], state["offset_scales"], state["base_scales"], offsets, features),
+        anchors=anchors,
         mlps=MLPWeights(
             opacity=unflatten_head(state["opacity_mlp"], inputs, k, hidden),
             color=unflatten_head(state["color_mlp"], inputs, 3 * k, hidden),
@@ -119,6 +137,7 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
         ),
         free=FreeGaussians(means, log_scales, quats, logits[:, 0], colors, state["free_births"]),
         camera_color=CameraColor(gains, biases),
+        appearance_basis=state.get("appearance_basis", features[:0]),
         distance_input=distance_input,
     )
 

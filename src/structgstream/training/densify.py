@@ -68,6 +68,7 @@ class Densifier:
             "base_scales": log_cells,
             "anchor_offsets": new.positions.new_zeros(len(new), k, 3),
             "anchor_features": new.features,
+            "appearance": new.positions.new_zeros(len(new), 0),
         }
         parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
         adam.replace_rows(ANCHOR_ROWS, keep=keep, added=len(new))

@@ -65,6 +65,7 @@ class OnlineRates:
     """Used only when ``base_scales`` is in the dynamic set, as are the following."""
     anchor_offsets: float = 1e-3
     anchor_features: float = 2.5e-3
+    appearance: float = 2e-2
     opacity_mlp: float = 2e-3
     color_mlp: float = 4e-3
     final_share: float = 1.0
@@ -78,6 +79,8 @@ class OnlineConfig:
     iterations: int = 100
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
     """Rows of the state table that change after frame 0; the paper's ablations edit it."""
+    appearance_rank: int = 8
+    """Directions in which the features of an anchor may change, if ``appearance`` is dynamic."""
     losses: LossWeights = field(default_factory=LossWeights)
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
@@ -95,6 +98,7 @@ def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, floa
         "base_scales": r.base_scales * falling,
         "anchor_offsets": r.anchor_offsets * falling,
         "anchor_features": r.anchor_features * falling,
+        "appearance": r.appearance * falling,
         "opacity_mlp": r.opacity_mlp * falling,
         "color_mlp": r.color_mlp * falling,
         "covariance_mlp": r.covariance_mlp * falling,

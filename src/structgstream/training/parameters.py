@@ -20,6 +20,7 @@ ParameterName = Literal[
     "base_scales",
     "anchor_offsets",
     "anchor_features",
+    "appearance",
     "opacity_mlp",
     "color_mlp",
     "covariance_mlp",
@@ -38,6 +39,7 @@ ANCHOR_ROWS: tuple[ParameterName, ...] = (
     "base_scales",
     "anchor_offsets",
     "anchor_features",
+    "appearance",
 )
 FREE_ROWS: tuple[ParameterName, ...] = (
     "free_means",
@@ -87,6 +89,7 @@ class Parameters:
             "base_scales": scene.anchors.log_base_scales,
             "anchor_offsets": scene.anchors.offsets,
             "anchor_features": scene.anchors.features,
+            "appearance": scene.anchors.appearance,
             "opacity_mlp": flatten_head(scene.mlps.opacity),
             "color_mlp": flatten_head(scene.mlps.color),
             "covariance_mlp": flatten_head(scene.mlps.covariance),
@@ -133,6 +136,7 @@ class Parameters:
                 log_base_scales=v["base_scales"],
                 offsets=v["anchor_offsets"],
                 features=v["anchor_features"],
+                appearance=v["appearance"],
             ),
             mlps=template.mlps._replace(
                 opacity=head("opacity", v["opacity_mlp"]),

@@ -6,7 +6,7 @@ moves. Its ids are its own (Note [Ids]).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +15,6 @@ from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
-from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
@@ -44,8 +43,7 @@ class Partition:
         """Take ``scene`` apart."""
 
         def part(anchors: Tensor, free: Tensor) -> Scene:
-            columns = {f.name: getattr(scene.anchors, f.name)[anchors] for f in fields(AnchorCloud)}
-            return replace(scene, anchors=AnchorCloud(**columns), free=scene.free.select(free))
+            return replace(scene, anchors=scene.anchors.select(anchors), free=scene.free.select(free))
 
         moving = part(which.anchors, which.free)
         return cls(scene, which, moving, part(~which.anchors, ~which.free))
@@ -55,13 +53,10 @@ class Partition:
 
         ``moved`` has the anchors of ``moving``; free Gaussians may have come and gone.
         """
-        columns = {f.name: getattr(self.whole.anchors, f.name).clone() for f in fields(AnchorCloud)}
-        for name, column in columns.items():
-            column[self.which.anchors] = getattr(moved.anchors, name)
         free = self.still.free.append(moved.free)
         return replace(
             self.whole,
-            anchors=AnchorCloud(**columns),
+            anchors=self.whole.anchors.with_rows(self.which.anchors, moved.anchors),
             free=free.select(free.births.argsort()),  # Births ascend, and are never used twice.
         )
 

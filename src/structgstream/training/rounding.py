@@ -20,7 +20,7 @@ from structgstream.cameras import CameraRig
 if TYPE_CHECKING:
     from structgstream.training.parameters import ParameterName, Parameters
 
-ANCHOR_FIELDS: "tuple[ParameterName, ...]" = ("anchor_positions", "offset_scales", "base_scales")
+ANCHOR_FIELDS: "tuple[ParameterName, ...]" = ("anchor_positions", "offset_scales", "base_scales", "appearance")
 
 
 class _Rounded(torch.autograd.Function):
@@ -45,6 +45,8 @@ class RoundingConfig:
     position_pixels: float = 0.25
     """Step of positions, as seen by a typical camera at a typical distance: less cannot be seen."""
     log_scale_step: float = 0.02
+    appearance_step: float = 0.1
+    """In standard deviations of the features along a direction of the basis."""
     weight_step: float = 0.002
     """Of the weights of MLPs."""
     free_log_scale_step: float = 0.05
@@ -60,6 +62,7 @@ class RoundingConfig:
             "anchor_positions": self.position_pixels * pixel,
             "offset_scales": self.log_scale_step,
             "base_scales": self.log_scale_step,
+            "appearance": self.appearance_step,
             "opacity_mlp": self.weight_step,
             "color_mlp": self.weight_step,
             "covariance_mlp": self.weight_step,
