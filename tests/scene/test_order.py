@@ -6,7 +6,7 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.scene.order import in_space_order, space_order
+from structgstream.scene.order import in_space_order, morton_cells, morton_keys, space_order
 from structgstream.scene.render import draw
 from structgstream.scene.state import state_of
 
@@ -35,9 +35,30 @@ def test_neighbours_in_memory_are_neighbours_in_space() -> None:
     assert step(points[space_order(points)]) < 0.2 * step(points)
 
 
+def test_keys_and_cells() -> None:
+    cells = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 3], [2**20 - 1] * 3, [5, 2**19, 0]])
+    keys = morton_keys(cells)
+    assert keys.tolist() == [0, 1, 2, 4, 44, 2**60 - 1, 0b1000001 | 1 << 58]
+    assert torch.equal(morton_cells(keys), cells)
+
+
+def test_the_order_of_a_grid() -> None:
+    g = torch.Generator().manual_seed(4)
+    cells = torch.randint(-4, 6, (500, 3), generator=g)
+    positions = cells * 0.37 + (torch.rand(500, 3, generator=g) - 0.5) * 0.3
+    order = space_order(positions, step=0.37)
+    keys = morton_keys(cells - cells.min(0).values)
+    assert (keys[order].diff() >= 0).all()
+    same = keys[order].diff() == 0
+    assert same.any()
+    assert (order.diff()[same] > 0).all(), "ties stay as they were"
+    assert torch.equal(space_order(positions, step=1e-9), space_order(positions)), "cells cannot be as small"
+
+
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.ones(1, 3), torch.ones(5, 3), torch.full((3, 3), -1e30)])
 def test_nothing_one_and_many_of_the_same(points: torch.Tensor) -> None:
     assert space_order(points).tolist() == [*range(len(points))]
+    assert space_order(points, step=0.5).tolist() == [*range(len(points))]
 
 
 def test_the_picture_stays() -> None:
