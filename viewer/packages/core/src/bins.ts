@@ -12,8 +12,8 @@ import { type FieldName, type Fields, FREE_COLUMNS, type Tensor } from "./fields
 import { decodedFree, type FreeBins, noFree } from "./freeRows.js";
 import { type Change, decodedChange, noChange } from "./rows.js";
 
-/** Fields of three numbers an anchor, which change together. */
-const ANCHOR_ROWS: readonly FieldName[] = ["anchor_positions", "offset_scales", "base_scales"];
+/** Fields of an anchor, which change together: three numbers each, the appearance as many as it has directions. */
+const ANCHOR_ROWS: readonly FieldName[] = ["anchor_positions", "offset_scales", "base_scales", "appearance"];
 const WEIGHTS: readonly FieldName[] = ["opacity_mlp", "color_mlp", "covariance_mlp"];
 export const FREE_STEPS = ["free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors"];
 const FREE_WIDTHS = [3, 3, 4, 1, 3];
@@ -24,7 +24,7 @@ export const CODABLE: ReadonlySet<FieldName> = new Set([...ANCHOR_ROWS, ...WEIGH
 
 export type Steps = ReadonlyMap<string, number>;
 
-/** The dynamic part of a scene, and what the last frame did to it: `anchors` is `[M, 3 for each dynamic field]`. */
+/** The dynamic part of a scene, and what the last frame did to it: `anchors` is `[M, columns of the dynamic fields]`. */
 export interface SceneBins {
   readonly anchors: Int32Array;
   readonly change: Change;
@@ -33,8 +33,19 @@ export interface SceneBins {
   readonly free: FreeBins;
 }
 
-function anchorFields(dynamic: ReadonlySet<FieldName>): FieldName[] {
-  return ANCHOR_ROWS.filter((name) => dynamic.has(name));
+interface Columns {
+  readonly name: FieldName;
+  readonly first: number;
+  readonly end: number;
+}
+
+/** The columns of each dynamic field of anchors; the appearance has what remains of `total`. */
+function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[] {
+  return ANCHOR_ROWS.filter((name) => dynamic.has(name)).map((name, number) => ({
+    name,
+    first: 3 * number,
+    end: name === "appearance" ? total : 3 * number + 3,
+  }));
 }
 
 /** The same without a last change. */
@@ -53,15 +64,15 @@ export function unmoved(bins: SceneBins): SceneBins {
  * @throws StreamError a value is too many steps from zero
  */
 export function binned(state: Fields, dynamic: ReadonlySet<FieldName>, steps: Steps): SceneBins {
-  const fields = anchorFields(dynamic);
   const rows = state.get("anchor_positions")!.shape[0]!;
-  const columns = 3 * fields.length;
+  const widths = ANCHOR_ROWS.map((name) => (dynamic.has(name) ? state.get(name)!.shape[1]! : 0));
+  const columns = widths.reduce((sum, width) => sum + width, 0);
   const anchors = new Int32Array(rows * columns);
-  for (const [number, name] of fields.entries()) {
+  for (const { name, first, end } of anchorColumns(dynamic, columns)) {
     const bins = nearest(state.get(name)!, steps.get(name)!);
-    for (let i = 0; i < bins.length; i++) {
-      const row = Math.floor(i / 3);
-      anchors[row * columns + 3 * number + i - 3 * row] = bins[i]!;
+    const width = end - first;
+    for (let row = 0; row < rows; row++) {
+      for (let i = 0; i < width; i++) anchors[row * columns + first + i] = bins[row * width + i]!;
     }
   }
   const weights = new Map<FieldName, Int32Array>();
@@ -90,15 +101,14 @@ export function valued(bins: SceneBins, dynamic: ReadonlySet<FieldName>, steps: 
   const state = new Map<FieldName, Tensor>();
   const rows = bins.change.active.length;
   const { columns } = bins.change;
-  for (const [number, name] of anchorFields(dynamic).entries()) {
+  for (const { name, first, end } of anchorColumns(dynamic, columns)) {
     const step = steps.get(name)!;
-    const data = new Float32Array(3 * rows);
-    for (let i = 0, at = 3 * number; i < data.length; i += 3, at += columns) {
-      data[i] = bins.anchors[at]! * step;
-      data[i + 1] = bins.anchors[at + 1]! * step;
-      data[i + 2] = bins.anchors[at + 2]! * step;
+    const width = end - first;
+    const data = new Float32Array(width * rows);
+    for (let i = 0, at = first; i < data.length; i += width, at += columns) {
+      for (let column = 0; column < width; column++) data[i + column] = bins.anchors[at + column]! * step;
     }
-    state.set(name, { shape: [rows, 3], data });
+    state.set(name, { shape: [rows, width], data });
   }
   for (const [name, weights] of bins.weights) {
     const step = steps.get(name)!;
@@ -124,7 +134,7 @@ export function decodedScene(
   dynamic: ReadonlySet<FieldName>,
   where: string,
 ): SceneBins {
-  const groups = anchorFields(dynamic).map((name, number) => ({ name, first: 3 * number, end: 3 * number + 3 }));
+  const groups = anchorColumns(dynamic, before.change.columns);
   const change = decodedChange(decoder, before.change, groups);
   const anchors = summed(before.anchors, change.residuals, where);
   const weights = new Map<FieldName, Int32Array>();

@@ -18,12 +18,23 @@ const FIELD_TABLE = [
   ["free", ["F", FREE_COLUMNS]],
   ["free_births", ["F"]],
   ["camera_color", ["V", 6]],
+  ["appearance", ["M", "R"]],
+  ["appearance_basis", ["R", "D"]],
 ] as const;
 
 export type FieldName = (typeof FIELD_TABLE)[number][0];
 
 /** Every field, in the order of their codes. */
 export const FIELD_NAMES: readonly FieldName[] = FIELD_TABLE.map(([name]) => name);
+
+/** Fields that a scene may do without; it has both or neither. */
+const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis"];
+
+/** Whether these are the fields of a scene. */
+export function isScene(names: ReadonlySet<FieldName>): boolean {
+  const optional = OPTIONAL.filter((name) => names.has(name)).length;
+  return FIELD_NAMES.every((name) => names.has(name) || OPTIONAL.includes(name)) && optional !== 1;
+}
 
 /** Numbers of a field, the last dimension fastest; identities are 64-bit integers. */
 export interface Tensor {

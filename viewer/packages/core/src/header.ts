@@ -4,7 +4,7 @@
 import { unpackedBlocks } from "./blocks.js";
 import { checkCodec } from "./compact.js";
 import { StreamError } from "./errors.js";
-import { checkShapes, FIELD_NAMES, type FieldName, type Fields, isFieldName, type Tensor } from "./fields.js";
+import { checkShapes, type FieldName, type Fields, isFieldName, isScene, type Tensor } from "./fields.js";
 import { unpackedJson } from "./json.js";
 import { viewOf } from "./records.js";
 
@@ -62,7 +62,7 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   if (end > payload.length) throw new StreamError("The init record states a longer description than it holds.");
   const description = object(unpackedJson(payload.subarray(LENGTH_BYTES, end)), "the description");
   const header = headerOf(description, unpackedBlocks(payload, end, "The init record"));
-  if (header.dynamic.size + header.static.size !== FIELD_NAMES.length) {
+  if (!isScene(new Set([...header.dynamic, ...header.static.keys()]))) {
     throw new StreamError("The init record does not hold every field that packets leave out, and only those.");
   }
   const facts = { distanceInput: header.distanceInput, trainingCameras: trainingCameras(header) };
