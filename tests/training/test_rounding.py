@@ -53,6 +53,21 @@ def test_there_is_a_step_for_everything_that_can_change() -> None:
     assert all(step > 0 for step in steps.values())
 
 
+@pytest.mark.parametrize("quality", [-2.0, -0.5, 1.0, 3.0])
+def test_one_more_of_quality_is_twice_as_fine_and_a_quarter_as_dear(quality: float) -> None:
+    plain, other = RoundingConfig(rate_weight=3e-4), RoundingConfig(rate_weight=3e-4, quality=quality)
+    ratios = {name: step / plain.steps(0.01)[name] for name, step in other.steps(0.01).items()}
+    assert ratios == pytest.approx(dict.fromkeys(plain.steps(0.01), 2.0**-quality))
+    assert other.bit_weight == pytest.approx(3e-4 * 4.0**-quality)
+
+
+def test_without_quality_everything_is_as_its_field_says() -> None:
+    config = RoundingConfig(log_scale_step=0.3, rate_weight=0.7)
+    assert config.steps(1.0)["offset_scales"] == 0.3
+    assert config.bit_weight == 0.7
+    assert RoundingConfig(rate_weight=0.0, quality=-4.0).bit_weight == 0.0
+
+
 def test_a_pixel_is_as_large_as_it_is_seen() -> None:
     """On the arc, at distance 3 with 40 pixels of focal length, a pixel covers 3 / 40."""
     rig = arc_rig(5, radius=3.0)
