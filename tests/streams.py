@@ -12,6 +12,7 @@ from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.sinks import MemorySink
+from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 from structgstream.similarity import Similarity
@@ -34,6 +35,7 @@ def header_for(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -
 
 _STEPPED: list[str] = [*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS]
 STEPS = dict.fromkeys(_STEPPED, 2.0**-6)
+STATIC_STEP = 2.0**-7
 
 
 def compact_header(
@@ -42,8 +44,14 @@ def compact_header(
     """As :func:`header_for`, with codec ``compact``; ``scene`` is the reference."""
     rows = dynamic.difference(["free", "free_births"])
     used = {name: step for name, step in steps.items() if name in rows or (name in FREE_STEPS and "free" in dynamic)}
-    reference = quantised(state_of(scene), used, rows)
-    return replace(header_for(scene, dynamic=dynamic), codec="compact", steps=used, reference=reference)
+    state = state_of(scene)
+    reference = quantised(state, used, rows)
+    init_steps: dict[FieldName, float] = {
+        name: used.get(name, STATIC_STEP) for name in state if name not in AS_THEY_ARE
+    }
+    header = header_for(scene, dynamic=dynamic)
+    static = on_bins(header.static, init_steps)
+    return replace(header, codec="compact", static=static, steps=used, reference=reference, init_steps=init_steps)
 
 
 def small_scene(anchors: int = 3, *, free: int = 0, seed: int = 0) -> Scene:

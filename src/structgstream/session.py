@@ -15,6 +15,7 @@ from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader
+from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
@@ -255,12 +256,15 @@ class Session:
         state = state_of(scene)
         steps: dict[str, float] = {}
         reference: dict[FieldName, torch.Tensor] = {}
+        init_steps: dict[FieldName, float] = {}
         if codec == "compact":
             pixel = pixel_size(scene.anchors.positions, self._rig)
             known = self._config.online.rounding.steps(pixel)
             used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
             steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
             reference = quantised(state, steps, dynamic.difference(["free", "free_births"]))
+            init_steps = {name: steps.get(name, 2.0**-10) for name in state if name not in AS_THEY_ARE}
+            state = on_bins(state, init_steps)
         return StreamHeader(
             rig=self._source.rig,
             similarity=self._similarity,
@@ -273,6 +277,7 @@ class Session:
             metadata=self._metadata,
             steps=steps,
             reference=reference,
+            init_steps=init_steps,
         )
 
     def _check_resumable(self, header: StreamHeader) -> None:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rigs import random_scene
-from streams import STEPS, compact_header, same, small_scene
+from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 from structgstream.codec.blocks import coded_fields
 from structgstream.codec.compact import CODABLE, CompactDecoder, CompactEncoder
 from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
@@ -111,7 +111,8 @@ def test_a_reader_sees_what_the_encoder_says(dynamic: frozenset[FieldName], anch
         for name in dynamic - {"free_births"}:
             assert torch.allclose(state[name], wanted[name], atol=2.0**-7, rtol=0), name
     for name in state_of(first).keys() - dynamic:
-        assert torch.equal(state_of(seen[-1])[name], state_of(first)[name]), name
+        assert torch.allclose(state_of(seen[-1])[name], state_of(first)[name], atol=STATIC_STEP / 2, rtol=0), name
+        assert torch.equal(state_of(seen[-1])[name], state_of(seen[0])[name]), name
 
 
 @settings(max_examples=15, deadline=None)
@@ -381,7 +382,7 @@ def test_truncated_fields(field: FieldName) -> None:
 def test_values_stay_within_range_over_frames() -> None:
     """A residual that leads beyond 22 bits is damage."""
     far = small_scene()
-    positions = far.anchors.positions.clone()
+    positions = far.anchors.positions + 2.0**16 - 100.0
     positions[0, 0] = 2.0**16  # the last bin
     far = replace(far, anchors=replace(far.anchors, positions=positions))
     header = compact_header(far)

@@ -77,16 +77,16 @@ def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], ste
     Raises:
         StreamError: a value is too many steps from zero.
     """
-    rows = [_bins(state[name], steps[name]) for name in anchor_fields(dynamic)]
+    rows = [nearest_bins(state[name], steps[name]) for name in anchor_fields(dynamic)]
     count = len(state["anchor_positions"])
     anchors = np.concatenate(rows, axis=1) if rows else np.zeros((count, 0), np.int32)
     weights: dict[FieldName, Bins] = {
-        name: _bins(state[name], steps[name])[:, None] for name in WEIGHTS if name in dynamic
+        name: nearest_bins(state[name], steps[name])[:, None] for name in WEIGHTS if name in dynamic
     }
     free = FreeBins.none()
     if "free" in dynamic:
         births = state["free_births"].cpu().numpy().astype(np.int64)
-        bins = _bins(state["free"], _free_steps(steps))
+        bins = nearest_bins(state["free"], _free_steps(steps))
         free = FreeBins(births, bins, Change.none(len(births), FREE_COLUMNS))
     changes: dict[FieldName, Change] = {name: Change.none(*bins.shape) for name, bins in weights.items()}
     return SceneBins(anchors, Change.none(*anchors.shape), weights, changes, free)
@@ -96,11 +96,11 @@ def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, f
     """The dynamic fields that bins stand for."""
     state: dict[FieldName, Tensor] = {}
     for name, first, end in _columns(anchor_fields(dynamic), bins.anchors.shape[1]):
-        state[name] = _values(bins.anchors[:, first:end], steps[name])
+        state[name] = values_of(bins.anchors[:, first:end], steps[name])
     for name, weights in bins.weights.items():
-        state[name] = _values(weights[:, 0], steps[name])
+        state[name] = values_of(weights[:, 0], steps[name])
     if "free" in dynamic:
-        state["free"] = _values(bins.free.bins, _free_steps(steps))
+        state["free"] = values_of(bins.free.bins, _free_steps(steps))
         state["free_births"] = torch.from_numpy(bins.free.births.copy())
     return state
 
@@ -136,12 +136,18 @@ def _free_steps(steps: Mapping[str, float]) -> NDArray[np.float32]:
     return np.repeat(np.array([steps[name] for name in FREE_STEPS], np.float32), _FREE_WIDTHS)
 
 
-def _bins(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
+def nearest_bins(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
+    """The bin nearest to every number of a tensor.
+
+    Raises:
+        StreamError: one is too many steps from zero.
+    """
     found = np.rint(value.detach().cpu().numpy().astype(np.float64) / np.asarray(step, np.float32))
     if found.size and not np.abs(found).max() <= LARGEST:
         raise StreamError(f"A value is {np.abs(found).max():g} steps from zero, at most {LARGEST} can be coded.")
     return found.astype(np.int32)
 
 
-def _values(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
+def values_of(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
+    """What bins stand for."""
     return torch.from_numpy(bins.astype(np.float32) * np.asarray(step, np.float32))

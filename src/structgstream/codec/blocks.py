@@ -102,9 +102,26 @@ def unpacked_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName
     for block in blocks_in(payload, start, where=where):
         if block.coding != RAW:
             raise StreamError(f"{where} holds field {block.name} coded, where its numbers as they are belong.")
-        array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
-        values[block.name] = torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))
+        values[block.name] = _numbers(payload, block)
     return values
+
+
+def mixed_blocks(
+    payload: bytes, start: int, *, where: str
+) -> tuple[dict[FieldName, Tensor], dict[FieldName, memoryview]]:
+    """The tensors of all blocks from byte ``start`` to the end that are not coded, and the bytes of those that are.
+
+    Raises:
+        StreamError: as :func:`blocks_in`.
+    """
+    values: dict[FieldName, Tensor] = {}
+    coded: dict[FieldName, memoryview] = {}
+    for block in blocks_in(payload, start, where=where):
+        if block.coding == RAW:
+            values[block.name] = _numbers(payload, block)
+        else:
+            coded[block.name] = memoryview(payload)[block.data : block.end]
+    return values, coded
 
 
 def coded_fields(payload: bytes, start: int, *, where: str) -> dict[FieldName, memoryview]:
@@ -119,3 +136,8 @@ def coded_fields(payload: bytes, start: int, *, where: str) -> dict[FieldName, m
             raise StreamError(f"{where} holds field {block.name} as it is, where it should be coded.")
         found[block.name] = memoryview(payload)[block.data : block.end]
     return found
+
+
+def _numbers(payload: bytes, block: Block) -> Tensor:
+    array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
+    return torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))

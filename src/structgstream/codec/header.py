@@ -13,9 +13,10 @@ from torch import Tensor
 from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.blocks import packed_block, unpacked_blocks
+from structgstream.codec.blocks import coded_block, mixed_blocks, packed_block
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.shapes import check_shapes
+from structgstream.codec.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import REQUIRED, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
@@ -28,7 +29,11 @@ _LEAST_STEP = 2.0**-64
 
 
 def packed_header(header: StreamHeader) -> bytes:
-    """The payload of an init record."""
+    """The payload of an init record.
+
+    Raises:
+        StreamError: with codec ``compact``, a field is not made of bins.
+    """
     description = {
         "cameras": [
             {
@@ -50,12 +55,19 @@ def packed_header(header: StreamHeader) -> bytes:
         "config": header.config,
         "metadata": header.metadata,
         **({"steps": dict(header.steps)} if header.steps else {}),
+        **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
     }
     text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
     packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
-    static = [packed_block(f.name, header.static[f.name]) for f in STATE_TABLE if f.name in header.static]
-    reference = [packed_block(f.name, header.reference[f.name]) for f in STATE_TABLE if f.name in header.reference]
-    return LENGTH.pack(len(packed)) + packed + b"".join(static + reference)
+    fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
+    coded = encoded_fields(fields, header.init_steps) if header.codec == "compact" else {}
+    blocks = [
+        coded_block(f.name, coded[f.name]) if f.name in coded else packed_block(f.name, part[f.name])
+        for part in (header.static, header.reference)
+        for f in STATE_TABLE
+        if f.name in part
+    ]
+    return LENGTH.pack(len(packed)) + packed + b"".join(blocks)
 
 
 def unpacked_header(payload: bytes) -> StreamHeader:
@@ -69,9 +81,10 @@ def unpacked_header(payload: bytes) -> StreamHeader:
     (length,) = LENGTH.unpack_from(payload)
     if LENGTH.size + length > len(payload):
         raise StreamError("The init record states a longer description than it holds.")
-    static = unpacked_blocks(payload, LENGTH.size + length, where="The init record")
+    values, coded = mixed_blocks(payload, LENGTH.size + length, where="The init record")
     try:
-        header = _header(_description(payload[LENGTH.size : LENGTH.size + length]), static)
+        description = _description(payload[LENGTH.size : LENGTH.size + length])
+        header = _header(description, _fields(description, values, coded))
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, ZstdError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
     if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
@@ -98,16 +111,33 @@ def _description(packed: bytes) -> dict[str, Any]:
     return json.loads(ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES))
 
 
+def _fields(
+    description: dict[str, Any], values: dict[FieldName, Tensor], coded: dict[FieldName, memoryview]
+) -> dict[FieldName, Tensor]:
+    if description["codec"] != "compact":
+        if coded:
+            raise StreamError(f"The init record holds field {next(iter(coded))} coded, which its codec does not know.")
+        return values
+    if plain := sorted(values.keys() - AS_THEY_ARE):
+        raise StreamError(f"The init record holds field {plain[0]} as it is, where it should be coded.")
+    return values | decoded_fields(coded, _steps(description.get("init_steps", {})))
+
+
+def _steps(found: object) -> dict[Any, float]:
+    if not isinstance(found, dict):
+        raise TypeError("steps must be objects")
+    return {name: _step(value) for name, value in found.items()}
+
+
 def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> StreamHeader:
     cameras = {entry["name"]: _camera(entry) for entry in description["cameras"]}
     if len(cameras) != len(description["cameras"]) or not all(isinstance(name, str) for name in cameras):
         raise ValueError("camera names must be texts, each used once")
     dynamic: frozenset[FieldName] = frozenset(description["dynamic"])
     x, y, z = (_number(value) for value in description["similarity"]["center"])
-    steps = description.get("steps", {})
-    plain = [description["config"], description["metadata"], steps]
+    plain = [description["config"], description["metadata"]]
     if not all(isinstance(value, dict) for value in plain) or not isinstance(description["distance_input"], bool):
-        raise TypeError("config, metadata and steps must be objects, distance_input true or false")
+        raise TypeError("config and metadata must be objects, distance_input true or false")
     return StreamHeader(
         rig=CameraRig(cameras, frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])),
         similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),
@@ -118,7 +148,8 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         distance_input=description["distance_input"],
         config=description["config"],
         metadata=description["metadata"],
-        steps={name: _step(value) for name, value in steps.items()},
+        steps=_steps(description.get("steps", {})),
+        init_steps=_steps(description.get("init_steps", {})),
         reference={name: value for name, value in static.items() if name in dynamic},
     )
 

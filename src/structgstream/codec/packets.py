@@ -29,6 +29,8 @@ class StreamHeader:
         metadata: capture name, creator, start frame and the like, as plain JSON values.
         steps: of the ``compact`` codec, by name (``bins.py``); each is a float32 number.
         reference: of the ``compact`` codec, the dynamic fields that key packets change: those of anchors and MLPs.
+        init_steps: of the ``compact`` codec, by field: of what ``static`` and ``reference`` are multiples
+            (``static_fields.py``); each is a float32 number.
     """
 
     rig: CameraRig
@@ -42,6 +44,7 @@ class StreamHeader:
     metadata: Mapping[str, Any]
     steps: Mapping[str, float] = field(default_factory=dict)
     reference: Mapping[FieldName, Tensor] = field(default_factory=dict)
+    init_steps: Mapping[FieldName, float] = field(default_factory=dict)
 
 
 class PacketKind(IntEnum):
