@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -58,14 +59,21 @@ def test_one_more_of_quality_is_twice_as_fine_and_a_quarter_as_dear(quality: flo
     plain, other = RoundingConfig(rate_weight=3e-4), RoundingConfig(rate_weight=3e-4, quality=quality)
     ratios = {name: step / plain.steps(0.01)[name] for name, step in other.steps(0.01).items()}
     assert ratios == pytest.approx(dict.fromkeys(plain.steps(0.01), 2.0**-quality))
-    assert other.bit_weight == pytest.approx(3e-4 * 4.0**-quality)
+    assert other.resolved().rate_weight == pytest.approx(3e-4 * 4.0**-quality)
 
 
 def test_without_quality_everything_is_as_its_field_says() -> None:
     config = RoundingConfig(log_scale_step=0.3, rate_weight=0.7)
     assert config.steps(1.0)["offset_scales"] == 0.3
-    assert config.bit_weight == 0.7
-    assert RoundingConfig(rate_weight=0.0, quality=-4.0).bit_weight == 0.0
+    assert config.resolved() == config
+
+
+def test_every_field_follows_the_quality() -> None:
+    plain, resolved = RoundingConfig(quality=1.0), RoundingConfig(quality=1.0).resolved()
+    assert resolved.quality == 0.0
+    assert resolved.resolved() == resolved
+    others = {field.name for field in fields(plain)} - {"quality", "rate_weight"}
+    assert all(getattr(resolved, name) == getattr(plain, name) / 2 for name in others)
 
 
 def test_a_pixel_is_as_large_as_it_is_seen() -> None:

@@ -194,7 +194,7 @@ class _Fit:
         trained = parameters_of_fields(dynamic)
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(scene, trained=trained, steps=steps)
-        rate = Rate.of(parameters, steps, weight=config.rounding.bit_weight)
+        rate = Rate.of(parameters, steps, weight=config.rounding.resolved().rate_weight)
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()

@@ -9,7 +9,7 @@ bins is exact and nothing drifts.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -53,33 +53,38 @@ class RoundingConfig:
     free_quat_step: float = 1 / 64
     free_logit_opacity_step: float = 0.125
     free_color_step: float = 1 / 128
+    first_noise_levels: float = 0.5
+    """Noise that rounding frame 0 may add to the pictures: root of the mean square, in 8-bit levels."""
+    first_weight_step: float = 1 / 1024
+    """Of the weights of MLPs in frame 0."""
     rate_weight: float = 1e-4
     """Weight in the loss of the bits of a moving anchor."""
     quality: float = 0.0
     """One knob over all of the above: 1 more makes every step half as large, and a bit a quarter as dear."""
 
-    @property
-    def bit_weight(self) -> float:
-        """Weight in the loss of the bits of a moving anchor at this quality: errors grow with the square of a step."""
-        return self.rate_weight * 4.0**-self.quality
+    def resolved(self) -> "RoundingConfig":
+        """The same, with the quality put into the other fields and itself 0."""
+        finer = {field.name: getattr(self, field.name) * 2.0**-self.quality for field in fields(self)}
+        # Errors grow with the square of a step.
+        return RoundingConfig(**finer | {"rate_weight": self.rate_weight * 4.0**-self.quality, "quality": 0.0})
 
     def steps(self, pixel: float) -> dict[str, float]:
         """The step of everything that can change, by name; ``pixel`` is what one covers, in units of the scene."""
-        plain = {
-            "anchor_positions": self.position_pixels * pixel,
-            "offset_scales": self.log_scale_step,
-            "base_scales": self.log_scale_step,
-            "appearance": self.appearance_step,
-            "opacity_mlp": self.weight_step,
-            "color_mlp": self.weight_step,
-            "covariance_mlp": self.weight_step,
-            "free_means": self.position_pixels * pixel,
-            "free_log_scales": self.free_log_scale_step,
-            "free_quats": self.free_quat_step,
-            "free_logit_opacities": self.free_logit_opacity_step,
-            "free_colors": self.free_color_step,
+        plain = self.resolved()
+        return {
+            "anchor_positions": plain.position_pixels * pixel,
+            "offset_scales": plain.log_scale_step,
+            "base_scales": plain.log_scale_step,
+            "appearance": plain.appearance_step,
+            "opacity_mlp": plain.weight_step,
+            "color_mlp": plain.weight_step,
+            "covariance_mlp": plain.weight_step,
+            "free_means": plain.position_pixels * pixel,
+            "free_log_scales": plain.free_log_scale_step,
+            "free_quats": plain.free_quat_step,
+            "free_logit_opacities": plain.free_logit_opacity_step,
+            "free_colors": plain.free_color_step,
         }
-        return {name: step * 2.0**-self.quality for name, step in plain.items()}
 
 
 def pixel_size(positions: Tensor, rig: CameraRig) -> float:
