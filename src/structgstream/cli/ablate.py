@@ -2,7 +2,7 @@
 """``structgstream ablate``."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -10,18 +10,24 @@ from rich.console import Console
 from structgstream.cli.experiment import ExperimentOptions, capture_part, print_sheet, swept
 from structgstream.cli.options import Folder, parsed_with_rest, resolved_config
 
-TableName = Literal["structured", "free", "patching", "distance", "readings"]
+if TYPE_CHECKING:
+    from structgstream.experiments.tasks import Variation
+
+TableName = Literal["structured", "free", "patching", "distance", "readings", "effects", "rates"]
 
 
 @dataclass(frozen=True)
 class Ablate(ExperimentOptions):
-    """Runs the paper's ablations on a capture, and prints ours beside the paper's figures.
+    """Runs the paper's ablations on a capture, and prints ours beside the paper's figures; or what each part of the
+    compact stream is worth (effects), and its quality against its bytes (rates).
 
     Variants of one seed begin with the same frame 0. FOLDER gets TABLE.md, TABLE-curves.png and TABLE-detail.png for
-    each table, results/ with everything that was measured as JSON, and streams/. Ctrl-C, or a crash, loses no frame:
-    the same command goes on.
+    each table (and rates.png), results/ with everything that was measured as JSON, and streams/. Ctrl-C, or a crash,
+    loses no frame: the same command goes on.
 
     Example: structgstream ablate basketball --table free -o ablations --frames 20
+
+    Example: structgstream ablate basketball --table effects rates -o compact --frames 20 --held-out 0 10 15 30
 
     Example: structgstream ablate basketball -o ablations --preset fast --scale 0.5 --online.iterations 60
     """
@@ -35,25 +41,32 @@ class Ablate(ExperimentOptions):
         "distance",
     )
     """structured (what is trained online), free (generation and pruning), patching (inherited or independent),
-    distance (the regularisation of frame 0); readings (what the paper leaves open). Default: the first four."""
+    distance (the regularisation of frame 0); readings (what the paper leaves open); effects (of the switches of the
+    compact stream); rates (the compact stream at five qualities). Default: the first four."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """The full method, of which the variants are edits. Default: rig."""
+    """The full method, of which the variants are edits. Default: rig, and compact for effects and rates."""
 
 
 def main(arguments: list[str]) -> None:
     """Runs, prints, draws."""
     options, rest = parsed_with_rest(Ablate, "ablate", arguments=arguments)
     full, _ = resolved_config(options.preset, rest, command="ablate", seed=None)
+    compact, _ = resolved_config(options.preset or "compact", rest, command="ablate", seed=None)
+    paper, _ = resolved_config(None, rest, command="ablate", seed=None)
     capture, frames = capture_part(options.scene, options)
-    from structgstream.experiments.studies import ablation_runs, needed, write_ablation
+    from structgstream.experiments.studies import COMPACT_TABLES, ablation_runs, needed, write_ablation
     from structgstream.kernels.backend import select_backend
 
-    runs = ablation_runs(
-        options.table, full, capture, frames=frames, seeds=options.seeds, folder=options.output
-    )  # fmt: skip
+    runs: list[Variation] = []
+    of_compact = [name for name in options.table if name in COMPACT_TABLES]
+    others = [name for name in options.table if name not in COMPACT_TABLES]
+    for tables, config in ((others, full), (of_compact, compact)):
+        runs += ablation_runs(
+            tables, config, capture, frames=frames, seeds=options.seeds, folder=options.output, paper=paper
+        )
     swept(needed(runs), options)
     console = Console()
     for table in options.table:
-        sheet = write_ablation(options.output, table, runs, backend=select_backend(options.device))
-        print_sheet(sheet, console)
+        for sheet in write_ablation(options.output, table, runs, backend=select_backend(options.device)):
+            print_sheet(sheet, console)
     console.print(f"Tables and pictures: {options.output}", highlight=False, markup=False, soft_wrap=True)

@@ -7,9 +7,10 @@ A marker is a comment of Markdown on a line of its own::
     ...
     <!-- end -->
 
-with ``ablation TABLE STUDY``, ``methods STUDY``, ``readings STUDY`` and ``made-by STUDY`` for text, and ``curves TABLE
-STUDY`` and ``plot STUDY`` for pictures, which go to ``images/`` beside the document. A study is a folder of results of
-one capture and one full method, named after the capture or after what is asked of it.
+with ``ablation TABLE STUDY``, ``methods STUDY``, ``readings STUDY``, ``effects STUDY``, ``rates STUDY``, ``bd-rate
+STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE STUDY``, ``plot STUDY`` and ``rate-plot STUDY`` for
+pictures, which go to ``images/`` beside the document. A study is a folder of results of one capture and one full
+method, named after the capture or after what is asked of it.
 """
 
 import re
@@ -17,11 +18,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from structgstream.errors import ConfigError
+from structgstream.experiments.effects import effects_sheet
 from structgstream.experiments.figures import write_comparison, write_curves
+from structgstream.experiments.rate_distortion import bd_sheet, listed, rates_sheet, versus_sheet
+from structgstream.experiments.rate_figures import write_rates
 from structgstream.experiments.readings import readings_sheet
 from structgstream.experiments.results import Result, read_results
 from structgstream.experiments.sheets import ablation_sheet, comparison_sheet, markdown
-from structgstream.experiments.studies import COMPARED, method_key, method_titles, variant_titles
+from structgstream.experiments.studies import COMPARED, effect_titles, method_key, method_titles, variant_titles
 from structgstream.experiments.variants import TABLES
 
 Studies = Mapping[str, Sequence[Result]]
@@ -67,6 +71,8 @@ def _draw(what: str, words: Sequence[str], studies: Studies, *, folder: Path) ->
         keys = list(TABLES[words[0]].rows)
         shown = [result for result in mine if result.key in keys]
         write_curves(folder / f"{words[1]}-{words[0]}.png", shown, keys=keys, titles=variant_titles())
+    elif mine and what == "rate-plot":
+        write_rates(folder / f"{words[0]}-rates.png", mine)
     elif mine:
         write_comparison(folder / f"{words[0]}-methods.png", mine, titles=_method_titles())
 
@@ -116,6 +122,31 @@ def _plot(words: Sequence[str], studies: Studies) -> str:
     return f"![Quality against bytes and seconds, {words[0]}](images/{words[0]}-methods.png)\n"
 
 
+def _effects(words: Sequence[str], studies: Studies) -> str:
+    return markdown(effects_sheet(studies.get(words[0], ()), titles=effect_titles()))
+
+
+def _rates(words: Sequence[str], studies: Studies) -> str:
+    """The points, and where there is something to compare them with, that too."""
+    mine = studies.get(words[0], ())
+    versus, remarks = versus_sheet(mine)
+    return markdown(rates_sheet(mine)) + (f"\n{markdown(versus)}{listed(remarks)}" if versus.rows else "")
+
+
+def _bd_rate(words: Sequence[str], studies: Studies) -> str:
+    one, other = (studies.get(word, ()) for word in words)
+    if not one or not other:
+        return "No result yet.\n"
+    sheet, remarks = bd_sheet(one, other)
+    return markdown(sheet) + listed(remarks)
+
+
+def _rate_plot(words: Sequence[str], studies: Studies) -> str:
+    if not studies.get(words[0]):
+        return "No result yet.\n"
+    return f"![Quality against bytes, {words[0]}](images/{words[0]}-rates.png)\n"
+
+
 def _readings(words: Sequence[str], studies: Studies) -> str:
     return markdown(readings_sheet(studies.get(words[0], ())))
 
@@ -149,8 +180,12 @@ _MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Studies], str]]] = {
     "ablation": (2, _ablation),
     "methods": (1, _methods),
     "readings": (1, _readings),
+    "effects": (1, _effects),
+    "rates": (1, _rates),
+    "bd-rate": (2, _bd_rate),
     "made-by": (1, _made_by),
     "curves": (2, _curves),
     "plot": (1, _plot),
+    "rate-plot": (1, _rate_plot),
 }
-_PICTURES = ("curves", "plot")
+_PICTURES = ("curves", "plot", "rate-plot")

@@ -32,18 +32,18 @@ def write_curves(path: Path, results: Iterable[Result], *, keys: Sequence[str], 
     """
     found = summaries(results)
     shown = [name for name in CURVES if any(_known(found[key], name) for key in keys if key in found)]
-    figure = _figure(9.0, 2.4 * len(shown) + 0.4)
+    figure = figure_of(9.0, 2.4 * len(shown) + 0.4)
     axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     for axis, name in zip(axes, shown):
         for number, key in enumerate(key for key in keys if key in found):
             colour = INK if key == FULL else COLOURS[number % len(COLOURS)]
             _curve(axis, found[key], name, label=titles[key], colour=colour, width=2.0 if key == FULL else 1.2)
         axis.set_ylabel(SCORES[name].title, fontsize=9)
-        _plain(axis)
+        without_frame(axis)
     axes[0].legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
     axes[-1].set_xlabel("frame", fontsize=9)
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[str, str]) -> None:
@@ -53,7 +53,7 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
         MissingExtraError: matplotlib is not installed.
     """
     found = summaries(results)
-    figure = _figure(10.0, 4.2)
+    figure = figure_of(10.0, 4.2)
     axes = figure.subplots(1, 2, sharey=True)
     panels = (("online_bytes", "MB a frame after the first"), ("online_cpu_seconds", "core-seconds a frame"))
     for axis, (name, caption) in zip(axes, panels):
@@ -68,9 +68,9 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
         axis.set_xscale("log")
         axis.margins(x=0.25, y=0.12)
         axis.set_xlabel(caption, fontsize=9)
-        _plain(axis)
+        without_frame(axis)
     axes[0].set_ylabel("PSNR of held-out cameras, dB", fontsize=9)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *, title: str) -> None:
@@ -89,7 +89,7 @@ def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *
     cells = {**pictures, "ground truth": truth}
     columns = min(len(cells), 4)
     rows = -(-len(cells) // columns)
-    figure = _figure(3.2 * columns, 3.2 * rows * height / width + 0.35 * rows + 0.4)
+    figure = figure_of(3.2 * columns, 3.2 * rows * height / width + 0.35 * rows + 0.4)
     figure.suptitle(title, fontsize=10, fontweight="bold", color=INK)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes:
@@ -97,7 +97,7 @@ def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *
     for axis, (name, picture) in zip(axes, cells.items()):
         axis.imshow(picture[top : top + height, left : left + width], interpolation="nearest")
         axis.set_title(name, fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def disagreement(pictures: Sequence[Picture]) -> NDArray[np.int64]:
@@ -132,7 +132,12 @@ def _curve(axis: "Axes", summary: Summary, name: str, *, label: str, colour: str
         axis.fill_between(index, mean - deviation, mean + deviation, color=colour, alpha=0.12, linewidth=0)
 
 
-def _figure(width: float, height: float) -> "Figure":
+def figure_of(width: float, height: float) -> "Figure":
+    """An empty figure, in inches.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -143,13 +148,15 @@ def _figure(width: float, height: float) -> "Figure":
     return figure
 
 
-def _plain(axis: "Axes") -> None:
+def without_frame(axis: "Axes") -> None:
+    """Lines where values are read off, and no more."""
     axis.grid(axis="y", color=FAINT, linewidth=0.8)
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
     axis.tick_params(labelsize=8)
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Writes a PNG, and the folder where there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

@@ -40,6 +40,7 @@ SCORES: Mapping[str, Score] = {
     "drop_from_first_db": Score("drop, dB", 2, better=-1),
     "online_free_bytes": Score("free 3DGs, MB a frame", 2, 1e-6, -1),
     "online_bytes": Score("MB a frame", 2, 1e-6, -1),
+    "online_kilobytes": Score("KB a frame", 1, 1e-3, -1),
     "e_warp": Score("E_warp, 1e-3", 3, 1e3, -1),
     "t_lpips": Score("T-LPIPS, 1e-2", 3, 1e2, -1),
     "temporal_flip": Score("temporal FLIP, 1e-3", 2, 1e3, -1),

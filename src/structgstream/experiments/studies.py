@@ -8,10 +8,22 @@ from typing import TYPE_CHECKING
 
 from structgstream.errors import ConfigError
 from structgstream.experiments.captures import CapturePart
+from structgstream.experiments.effects import EFFECTS_TABLE, effects, effects_sheet
 from structgstream.experiments.figures import Picture, write_comparison, write_curves, write_details
 from structgstream.experiments.peer_runs import PEER_TITLES, PeerRun
+from structgstream.experiments.rate_distortion import (
+    QUALITIES,
+    RATES_TABLE,
+    curve_titles,
+    listed,
+    qualities,
+    quality_key,
+    rates_sheet,
+    versus_sheet,
+)
+from structgstream.experiments.rate_figures import write_rates
 from structgstream.experiments.readings import READINGS, readings_sheet
-from structgstream.experiments.results import Result, read_result
+from structgstream.experiments.results import Result, read_result, read_results
 from structgstream.experiments.sheets import Sheet, ablation_sheet, comparison_sheet, markdown
 from structgstream.experiments.sweep import unique
 from structgstream.experiments.tasks import Variation
@@ -23,6 +35,9 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
 
 READINGS_TABLE = "readings"
+COMPACT_TABLES = (EFFECTS_TABLE, RATES_TABLE)
+"""Tables of the compact stream."""
+COMPACT_PRESET = "compact"
 COMPARED = (
     "psnr_first", "psnr", "ssim", "ms_ssim", "lpips_alex", "flip", "psnr_changed", "psnr_still", "drift_db_per_frame",
     "online_bytes", "online_cpu_seconds", "first_cpu_seconds", "e_warp", "t_lpips", "temporal_flip",
@@ -39,27 +54,50 @@ def ablation_runs(
     frames: int,
     seeds: Sequence[int],
     folder: Path,
+    paper: StreamConfig = PRESETS[DEFAULT_PRESET],
 ) -> list[Variation]:
-    """Every variant of the tables (keys of ``variants.TABLES``, and ``readings``) with every seed, seed by seed.
+    """Every variant of the tables with every seed, seed by seed.
+
+    Args:
+        tables: keys of ``variants.TABLES``, ``readings``, and of :data:`COMPACT_TABLES`.
+        full: what the variants are edits of.
+        capture: which pictures.
+        frames: number of frames of ``capture``.
+        seeds: of frame 0.
+        folder: where everything goes.
+        paper: paper mode, a row of the table of effects.
 
     Raises:
-        ConfigError: there is no such table.
+        ConfigError: there is no such table, or it is one of the compact stream and ``full`` is none.
     """
+    known = [*TABLES, READINGS_TABLE, *COMPACT_TABLES]
     for name in tables:
-        if name not in TABLES and name != READINGS_TABLE:
-            raise ConfigError(f"There is no table {name!r}; there are {', '.join(TABLES)} and {READINGS_TABLE}.")
+        if name not in known:
+            raise ConfigError(f"There is no table {name!r}; there are {', '.join(known)}.")
     runs = []
     for seed in seeds:
-        seeded = replace(full, seed=seed)
-        configs = {key: variant.config for key, variant in variants(seeded).items()}
-        configs |= {key: reading.edit(seeded) for key, reading in READINGS.items()}
+        configs = _configs(tables, replace(full, seed=seed), replace(paper, seed=seed))
         keys = dict.fromkeys(key for name in tables for key in rows_of(name))
         runs += [Variation(key, capture, configs[key], folder, frames) for key in keys]
     return runs
 
 
+def _configs(tables: Sequence[str], full: StreamConfig, paper: StreamConfig) -> dict[str, StreamConfig]:
+    configs = {key: reading.edit(full) for key, reading in READINGS.items()}
+    found = variants(full)
+    if EFFECTS_TABLE in tables:
+        found |= effects(full, paper=paper)
+    if RATES_TABLE in tables:
+        found |= qualities(full)
+    return configs | {key: variant.config for key, variant in found.items()}
+
+
 def rows_of(table: str) -> list[str]:
     """Keys of the runs of a table."""
+    if table == EFFECTS_TABLE:
+        return list(effect_titles())
+    if table == RATES_TABLE:
+        return [quality_key(quality) for quality in QUALITIES]
     return list(READINGS if table == READINGS_TABLE else TABLES[table].rows)
 
 
@@ -137,19 +175,43 @@ def results_of(runs: Iterable[Variation | PeerRun]) -> list[Result]:
     return [found for run in runs if (found := read_result(run.result)) is not None]
 
 
-def write_ablation(folder: Path, table: str, runs: Sequence[Variation], *, backend: "Backend") -> Sheet:
-    """The table of one ablation, and in ``folder`` ``TABLE.md``, ``TABLE-curves.png`` and ``TABLE-detail.png``."""
-    titles = variant_titles() | {key: f"{one.question}: {one.answer}" for key, one in READINGS.items()}
-    rows = rows_of(table)
+def write_ablation(folder: Path, table: str, runs: Sequence[Variation], *, backend: "Backend") -> list[Sheet]:
+    """The tables of one ablation, and in ``folder`` ``TABLE.md``, ``TABLE-curves.png`` and ``TABLE-detail.png``.
+
+    Of the rates there is ``rates.png`` too, beside whatever else the folder has results of.
+    """
+    titles, rows = _titles(table), rows_of(table)
     mine = [run for run in runs if run.key in rows]
     results = results_of(mine)
-    readings = table == READINGS_TABLE
-    sheet = readings_sheet(results) if readings else ablation_sheet(TABLES[table], results, titles=titles)
-    _write_sheet(folder / f"{table}.md", sheet)
+    if table == RATES_TABLE:
+        around = read_results(folder / "results")
+        versus, remarks = versus_sheet(around)
+        sheets = [rates_sheet(around), versus]
+        _write_sheets(folder / "rates.md", sheets, remarks)
+        if results:
+            write_rates(folder / "rates.png", around)
+    else:
+        sheets, remarks = [_ablation_sheet(table, results)], []
+        _write_sheets(folder / f"{table}.md", sheets)
     if results:
         write_curves(folder / f"{table}-curves.png", results, keys=rows, titles=titles)
         _write_details(folder / f"{table}-detail.png", mine, titles=titles, backend=backend)
-    return sheet
+    return sheets
+
+
+def _titles(table: str) -> dict[str, str]:
+    if table == READINGS_TABLE:
+        return {key: f"{one.question}: {one.answer}" for key, one in READINGS.items()}
+    of_compact = {EFFECTS_TABLE: effect_titles, RATES_TABLE: curve_titles}
+    return of_compact.get(table, variant_titles)()
+
+
+def _ablation_sheet(table: str, results: Sequence[Result]) -> Sheet:
+    if table == READINGS_TABLE:
+        return readings_sheet(results)
+    if table == EFFECTS_TABLE:
+        return effects_sheet(results, titles=effect_titles())
+    return ablation_sheet(TABLES[table], results, titles=variant_titles())
 
 
 def write_methods(folder: Path, runs: Sequence[Variation | PeerRun], *, backend: "Backend") -> Sheet:
@@ -157,7 +219,7 @@ def write_methods(folder: Path, runs: Sequence[Variation | PeerRun], *, backend:
     titles = {method_key(name): title for name, title in method_titles().items()}
     results = results_of(runs)
     sheet = comparison_sheet(results, titles=titles, scores=COMPARED)
-    _write_sheet(folder / "methods.md", sheet)
+    _write_sheets(folder / "methods.md", [sheet])
     if results:
         write_comparison(folder / "methods.png", results, titles=titles)
         _write_details(folder / "methods-detail.png", runs, titles=titles, backend=backend)
@@ -169,9 +231,15 @@ def variant_titles() -> dict[str, str]:
     return {key: variant.title for key, variant in variants(PRESETS[DEFAULT_PRESET]).items()}
 
 
-def _write_sheet(path: Path, sheet: Sheet) -> None:
+def effect_titles() -> dict[str, str]:
+    """The rows of the table of effects, in its order."""
+    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[DEFAULT_PRESET])
+    return {key: variant.title for key, variant in found.items()}
+
+
+def _write_sheets(path: Path, sheets: Sequence[Sheet], remarks: Sequence[str] = ()) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"# {sheet.title}\n\n{markdown(sheet)}")
+    path.write_text("\n".join(f"# {sheet.title}\n\n{markdown(sheet)}" for sheet in sheets) + listed(remarks))
 
 
 def _write_details(

@@ -13,6 +13,7 @@ from structgstream.errors import ConfigError, ExperimentError
 from structgstream.experiments.captures import CapturePart, capture_facts
 from structgstream.experiments.results import Result, read_result, result_of, rounded, write_result
 from structgstream.presets import StreamConfig, to_json
+from structgstream.rate_control import RateConfig
 from structgstream.training.online import OnlineConfig
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class FirstFrame:
     @property
     def name(self) -> str:
         """What it is called in logs; the same for tasks that give the same frame 0."""
-        decides = {key: value for key, value in to_json(self.config).items() if key != "online"}
+        decides = {key: value for key, value in to_json(self._alone).items() if key != "online"}
         text = json.dumps(
             [decides, {**vars(self.capture), "folder": str(self.capture.folder), "frames": None, "scored": None}]
         )
@@ -53,6 +54,11 @@ class FirstFrame:
         """The stream of one frame."""
         return self.folder / "first" / f"{self.name}.sgs"
 
+    @property
+    def _alone(self) -> StreamConfig:
+        """What decides it, and how it is kept: as it was fitted, since streams round it in ways of their own."""
+        return replace(self.config, online=OnlineConfig(), codec="raw", rate=RateConfig())
+
     def done(self) -> bool:
         """Whether the frame is there; a stream that was interrupted has none."""
         from structgstream.codec.reader import open_stream
@@ -69,8 +75,7 @@ class FirstFrame:
         """Fits and stores it."""
         if self.done():
             return
-        alone = replace(self.config, online=OnlineConfig())
-        _reconstruct(replace(self.capture, frames=1), alone, self.stream, backend, first=None)
+        _reconstruct(replace(self.capture, frames=1), self._alone, self.stream, backend, first=None)
 
     def fitted(self) -> "FitResult":
         """The frame as ``Session`` takes it, read from the file."""

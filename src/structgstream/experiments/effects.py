@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each part of the compact stream is worth: the whole, and the whole with one switch thrown at a time."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from structgstream.errors import ConfigError
+from structgstream.experiments.results import Result
+from structgstream.experiments.sheets import SCORES, Sheet, written
+from structgstream.experiments.summary import Summary, summaries
+from structgstream.experiments.variants import FULL, Variant
+from structgstream.presets import StreamConfig
+from structgstream.scene.state import FieldName
+from structgstream.training.online import OnlineConfig
+
+EFFECTS_TABLE = "effects"
+WHOLE = "compact"
+"""Key of the compact stream with everything, as ``structgstream compare`` calls it."""
+REFRESH_FRAMES = 5
+"""MLPs can change only in frames in which everything may move; this often, where one is trained."""
+
+_COLUMNS = (
+    ("psnr_changed", "psnr_changed"),
+    ("psnr_still", "psnr_still"),
+    ("drift_db_per_frame", "drift_db_per_frame"),
+    ("online_bytes", "online_kilobytes"),
+    ("flicker", "flicker"),
+    ("e_warp", "e_warp"),
+    ("online_cpu_seconds", "online_cpu_seconds"),
+)
+"""Scores beside PSNR, and how each is written."""
+
+
+def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
+    """The rows of the table, by key.
+
+    Args:
+        full: the compact stream with everything.
+        paper: what it is measured against, with its key :data:`~structgstream.experiments.variants.FULL`.
+
+    Raises:
+        ConfigError: ``full`` is no compact stream.
+    """
+    require_compact(full)
+    rows = [Variant(FULL, "paper mode", paper), Variant(WHOLE, "compact, with everything", full)]
+
+    def online(key: str, title: str, config: OnlineConfig, *changes: str) -> None:
+        paths = frozenset(f"online.{change}" for change in changes)
+        rows.append(Variant(f"{WHOLE}-{key}", title, replace(full, online=config), paths))
+
+    def dynamic(key: str, title: str, fields: frozenset[FieldName]) -> None:
+        online(key, title, replace(whole, dynamic=fields), "dynamic")
+
+    whole = full.online
+    motion, rounding, patching = whole.motion, whole.rounding, whole.patching
+    online("without-gate", "w/o change gate", replace(whole, motion=replace(motion, enabled=False)), "motion.enabled")
+    unpriced = replace(whole, rounding=replace(rounding, rate_weight=0.0))
+    online("without-rate", "w/o rate penalty", unpriced, "rounding.rate_weight")
+    dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
+    for rank in (4, 16):
+        ranked = replace(whole, appearance_rank=rank)
+        online(f"rank-{rank}", f"appearance in {rank} directions", ranked, "appearance_rank")
+    dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
+    spawnless = replace(whole, patching=replace(patching, spawn="off"))
+    online("without-free", "w/o free 3DGs", spawnless, "patching.spawn")
+    refreshed = replace(
+        whole,
+        dynamic=whole.dynamic.union(["covariance_mlp"]),
+        motion=replace(motion, full_every_frames=REFRESH_FRAMES),
+    )
+    title = f"F_Sigma trained in every {REFRESH_FRAMES}th frame, ungated"
+    online("with-covariance-mlp", title, refreshed, "dynamic", "motion.full_every_frames")
+    return {row.key: row for row in rows}
+
+
+def require_compact(config: StreamConfig) -> None:
+    """Refuses a configuration whose streams are not compact.
+
+    Raises:
+        ConfigError: it says so.
+    """
+    if config.codec != "compact":
+        raise ConfigError(
+            f"The tables of the compact stream need codec 'compact', got {config.codec!r}; take --preset compact."
+        )
+
+
+def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str]) -> Sheet:
+    """Every row with its difference to the whole, seed by seed; rows without a result have dashes.
+
+    Args:
+        results: of one capture.
+        titles: of the rows, in their order.
+    """
+    found = summaries(result for result in results if result.key in titles)
+    whole = found.get(WHOLE)
+    heads = ["variant", "seeds", SCORES["psnr"].title, "to compact, dB"]
+    columns = [*heads, *(SCORES[name].title for _, name in _COLUMNS)]
+    return Sheet("Effects", columns, [[title, *_cells(found.get(key), whole)] for key, title in titles.items()])
+
+
+def _cells(summary: Summary | None, whole: Summary | None) -> list[str]:
+    if summary is None:
+        return ["-"] * (3 + len(_COLUMNS))
+    difference = None if whole is None or summary.key == WHOLE else summary.difference(whole, "psnr")
+    cells = [
+        str(len(summary.results)),
+        written(summary.score("psnr"), "psnr"),
+        written(difference, "psnr", signed=True),
+    ]
+    return cells + [written(summary.score(score), name) for score, name in _COLUMNS]

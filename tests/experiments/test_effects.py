@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of effects: each row throws the switches that it names and no others, and is compared with the whole."""
+
+from dataclasses import replace
+
+import pytest
+
+from outcomes import outcome, outcomes
+from structgstream.errors import ConfigError
+from structgstream.experiments.effects import REFRESH_FRAMES, WHOLE, effects, effects_sheet
+from structgstream.experiments.studies import COMPACT_PRESET, effect_titles, method_key, variant_titles
+from structgstream.experiments.variants import FULL
+from structgstream.presets import COMPACT, PRESETS, RIG, to_json
+from test_variants import differing
+
+ROWS = effects(COMPACT, paper=RIG)
+
+
+@pytest.mark.parametrize("key", ROWS.keys() - {FULL})
+def test_a_row_differs_from_the_whole_in_the_fields_it_names_and_no_others(key: str) -> None:
+    row = ROWS[key]
+    assert differing(to_json(COMPACT), to_json(row.config)) == row.changes
+    assert bool(row.changes) == (key != WHOLE)
+    assert len(row.changes) <= 2
+
+
+def test_what_the_switches_are() -> None:
+    online = {key: row.config.online for key, row in ROWS.items()}
+    whole = online[WHOLE]
+    assert ROWS[WHOLE].config == COMPACT
+    assert ROWS[FULL].config == RIG
+    assert not online["compact-without-gate"].motion.enabled
+    assert "covariance_mlp" not in online["compact-without-gate"].dynamic
+    assert online["compact-without-rate"].rounding.rate_weight == 0.0
+    assert whole.dynamic - online["compact-without-appearance"].dynamic == {"appearance"}
+    assert whole.dynamic - online["compact-without-base-scales"].dynamic == {"base_scales"}
+    assert online["compact-without-free"].patching.spawn == "off"
+    assert [online[f"compact-rank-{rank}"].appearance_rank for rank in (4, 16)] == [4, 16]
+    trained = online["compact-with-covariance-mlp"]
+    assert trained.dynamic - whole.dynamic == {"covariance_mlp"}
+    assert trained.motion.full_every_frames == REFRESH_FRAMES, "otherwise nothing that all anchors share is trained"
+
+
+def test_no_two_rows_are_the_same_and_no_key_or_title_is_of_another_table() -> None:
+    assert len({str(to_json(row.config)) for row in ROWS.values()}) == len(ROWS)
+    titles = effect_titles()
+    assert len(set(titles.values())) == len(titles) == len(ROWS)
+    assert titles.keys() & variant_titles().keys() == {FULL}
+    assert method_key(COMPACT_PRESET) == WHOLE in PRESETS
+
+
+def test_a_stream_that_is_not_compact_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"need codec 'compact', got 'raw'; take --preset compact"):
+        effects(replace(COMPACT, codec="raw"), paper=RIG)
+
+
+def test_rows_beside_the_whole_seed_by_seed() -> None:
+    mean = {"online_bytes": 12_345.0, "psnr_changed": 26.5, "flicker": 0.4321}
+    found = [outcome(WHOLE, seed, psnr=psnr, mean=mean) for seed, psnr in enumerate((30.0, 31.0, 32.0))]
+    found += outcomes("compact-without-gate", (30.1, 31.2, 32.3))
+    found += [outcome(FULL, psnr=29.5, mean={"online_bytes": 1.73e6}), outcome("held", psnr=5.0)]
+    sheet = effects_sheet(found, titles=effect_titles())
+    rows = {row[0]: dict(zip(sheet.columns, row, strict=True)) for row in sheet.rows}
+    assert list(rows) == list(effect_titles().values())
+    whole, gate, paper = (rows[effect_titles()[key]] for key in (WHOLE, "compact-without-gate", FULL))
+    assert whole["KB a frame"] == "12.3 ± 0.0"
+    assert (whole["seeds"], whole["PSNR, dB"], whole["to compact, dB"]) == ("3", "31.00 ± 1.00", "-")
+    assert (whole["changed, dB"], whole["flicker, 1/255"]) == ("26.50 ± 0.00", "0.432 ± 0.000")
+    assert gate["to compact, dB"] == "+0.20 ± 0.10"
+    assert (paper["seeds"], paper["to compact, dB"], paper["KB a frame"]) == ("1", "-0.50", "1730.0")
+    assert set(rows["w/o appearance"].values()) == {"w/o appearance", "-"}
+
+
+def test_without_the_whole_nothing_is_compared() -> None:
+    sheet = effects_sheet([outcome(FULL)], titles=effect_titles())
+    assert {row[3] for row in sheet.rows} == {"-"}
+    assert all(len(row) == len(sheet.columns) for row in sheet.rows)
