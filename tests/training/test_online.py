@@ -114,7 +114,7 @@ FOLLOWING = replace(
 )
 
 
-def followed(scene, world, index, *, config=FOLLOWING, seed=0):
+def followed(scene, world, index, *, config=FOLLOWING, seed=0, last_motion=None):
     return fit_next_frame(
         scene,
         world.frames[index],
@@ -123,6 +123,7 @@ def followed(scene, world, index, *, config=FOLLOWING, seed=0):
         backend=reference_backend(),
         seed=seed,
         before=world.frames[index - 1],
+        last_motion=last_motion,
     )
 
 
@@ -139,6 +140,36 @@ def test_only_what_moves_is_fitted_and_as_well_as_when_everything_is() -> None:
     unfitted, everything, followed_only = (psnr(rendered(s, world, "cam00"), truth) for s in (world.scene, full, part))
     assert followed_only > unfitted + 2.0
     assert followed_only > everything - 0.3
+
+
+def test_what_moves_begins_where_its_last_step_leads() -> None:
+    """No iteration: the fit is where it began. What stands still stays, whatever it did before."""
+    world = moving_world(2, speed=0.06, movers=20)
+    motion = torch.full_like(world.scene.anchors.positions, 0.01)
+    config = replace(FOLLOWING, iterations=0, motion_prior=0.5)
+    for moved in (replace(config, motion=MotionConfig()), config):
+        result = followed(world.scene, world, 1, config=moved, last_motion=motion)
+        steps = result.scene.anchors.positions - world.scene.anchors.positions
+        went = (steps != 0).any(1)
+        assert went.sum() == result.moving > 10
+        torch.testing.assert_close(steps[went], 0.5 * motion[went])
+    assert torch.equal(
+        followed(world.scene, world, 1, config=config).scene.anchors.positions[went],
+        world.scene.anchors.positions[went],
+    )
+
+
+def test_a_true_last_step_helps() -> None:
+    world = moving_world(2, speed=0.12, movers=20)
+    truth = world.frames[1].images["cam00"]
+    motion = torch.zeros_like(world.scene.anchors.positions)
+    motion[:20, 0] = 0.12
+    config = replace(FOLLOWING, motion_prior=1.0)
+    without, led = (
+        psnr(rendered(followed(world.scene, world, 1, config=config, last_motion=m).scene, world, "cam00"), truth)
+        for m in (None, motion)
+    )
+    assert led > without + 0.5
 
 
 def test_whole_pictures_give_the_same_quality_as_tiles() -> None:

@@ -85,6 +85,8 @@ class OnlineConfig:
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    motion_prior: float = 0.0
+    """Anchors that move begin a frame this share of their last step further on (the paper: 0, where they are)."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
 
 
@@ -122,6 +124,7 @@ def fit_next_frame(
     seed: int,
     before: MultiViewFrame | None = None,
     steps: Mapping[str, float] | None = None,
+    last_motion: Tensor | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult:
     """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
@@ -134,6 +137,7 @@ def fit_next_frame(
         backend: what computes.
         seed: all randomness comes from it, so a frame can be repeated alone.
         steps: of what is sent rounded (Note [Bins]); what it names is drawn rounded and comes back so.
+        last_motion: ``[M, 3]`` the anchors' last step, scene units, for ``config.motion_prior``; None for none.
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
@@ -146,12 +150,14 @@ def fit_next_frame(
     def fitted(stepping: Backend) -> FitResult:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
         fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
+        ahead = None if last_motion is None else config.motion_prior * last_motion
         if earlier is None:
-            return fit.run(scene, views)
+            return fit.run(scene, views, ahead=ahead)
         with watch.stage("find motion"):
             which = moving_parts(scene, views, earlier, config=config.motion, backend=backend)
             partition = Partition.of(scene, which)
-        result = fit.run(partition.moving, views, partition=partition)
+        ahead = None if ahead is None else ahead[which.anchors]
+        result = fit.run(partition.moving, views, partition=partition, ahead=ahead)
         return replace(result, scene=partition.together(result.scene))
 
     if backend.device.type != "cuda":
@@ -181,8 +187,13 @@ class _Fit:
     steps: Mapping[str, float]
     on_step: StepListener | None
 
-    def run(self, scene: Scene, views: list[View], *, partition: Partition | None = None) -> FitResult:
-        """Fit ``scene`` to the pictures; with a partition it is its moving part, where that shows."""
+    def run(
+        self, scene: Scene, views: list[View], *, partition: Partition | None = None, ahead: Tensor | None = None
+    ) -> FitResult:
+        """Fit ``scene`` to the pictures, its anchors starting ``ahead`` ``[M, 3]`` of where they are.
+
+        With a partition it is its moving part, where that shows.
+        """
         config, watch, patching = self.config, self.watch, self.config.patching
         places = None if partition is None else self._places(partition, views)
         still_free = 0 if partition is None else len(partition.still.free)
@@ -195,6 +206,8 @@ class _Fit:
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(scene, trained=trained, steps=steps)
         rate = Rate.of(parameters, steps, weight=config.rounding.resolved().rate_weight)
+        if ahead is not None and "anchor_positions" in trained:  # What a step costs is counted from the last frame.
+            parameters.values["anchor_positions"].data += ahead
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
