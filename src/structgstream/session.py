@@ -11,11 +11,10 @@ import torch
 
 from structgstream.cameras import CameraRig
 from structgstream.codec.bins import FREE_STEPS
-from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
+from structgstream.codec.static_fields import on_bins
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
@@ -26,9 +25,10 @@ from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, on_device, state_of
+from structgstream.scene.state import FieldName, on_device, scene_of, state_of
 from structgstream.similarity import Similarity, normalising_similarity
 from structgstream.training.initial import fit_first_frame
+from structgstream.training.first_bins import Sensitivity, first_bins, regauged, sensitivity_of
 from structgstream.training.online import fit_next_frame
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.rounding import pixel_size
@@ -166,11 +166,11 @@ class Session:
             fitted = time.perf_counter()
             fitted_scene = fit.scene
             if scene is None:
-                fitted_scene = self._prepared(fitted_scene)
-            if encoder is None:
-                header = self._header(fitted_scene)
-                encoder, steps = SceneEncoder(header), header.steps
-                self._sink.open(header)
+                fitted_scene, header = self._prepared(fitted_scene)
+                if encoder is None:
+                    encoder, steps = SceneEncoder(header), header.steps
+                    self._sink.open(header)
+            assert encoder is not None, "there is one with a scene"
             kind = PacketKind.KEY if frame.index % self._key_interval == 0 else PacketKind.DELTA
             encoded = encoder.encode(fitted_scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
             scene = encoded.reconstruction
@@ -243,41 +243,52 @@ class Session:
             on_step=self._on_step,
         )
 
-    def _prepared(self, scene: Scene) -> Scene:
-        """Frame 0 as the frames after it need it."""
-        if self._config.codec == "compact":
-            scene = in_space_order(scene)
-        if "appearance" in self._config.online.dynamic:
+    def _prepared(self, scene: Scene) -> tuple[Scene, StreamHeader]:
+        """Frame 0 as the frames after it need it, and the header that they need."""
+        dynamic, rounding = self._config.online.dynamic, self._config.online.rounding
+        compact = self._config.codec == "compact"
+        if compact:
+            scene = regauged(scene, self._sensitivity(scene))
+        if "appearance" in dynamic:
             scene = with_appearance(scene, self._config.online.appearance_rank)
-        return scene
+        if not compact:
+            return scene, self._header(scene)
+        known = rounding.steps(pixel_size(scene.anchors.positions, self._rig))
+        used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
+        steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
+        voxel_size = self._config.initial.voxel_size
+        scene, init_steps = first_bins(
+            scene, self._sensitivity(scene), config=rounding, voxel_size=voxel_size, steps=steps
+        )
+        state = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
+        scene = scene_of(state, distance_input=scene.distance_input)
+        return scene, self._header(scene, steps=steps, init_steps=init_steps)
 
-    def _header(self, scene: Scene) -> StreamHeader:
-        dynamic, codec = self._config.online.dynamic, self._config.codec
-        state = state_of(scene)
-        steps: dict[str, float] = {}
-        reference: dict[FieldName, torch.Tensor] = {}
-        init_steps: dict[FieldName, float] = {}
-        if codec == "compact":
-            pixel = pixel_size(scene.anchors.positions, self._rig)
-            known = self._config.online.rounding.steps(pixel)
-            used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
-            steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
-            reference = quantised(state, steps, dynamic.difference(["free", "free_births"]))
-            init_steps = {name: steps.get(name, 2.0**-10) for name in state if name not in AS_THEY_ARE}
-            state = on_bins(state, init_steps)
+    def _sensitivity(self, scene: Scene) -> Sensitivity:
+        return sensitivity_of(scene, self._rig, backend=self._backend, seed=frame_seed(self._config.seed, 0))
+
+    def _header(
+        self,
+        scene: Scene,
+        *,
+        steps: Mapping[str, float] | None = None,
+        init_steps: Mapping[FieldName, float] | None = None,
+    ) -> StreamHeader:
+        dynamic, state = self._config.online.dynamic, state_of(scene)
+        reference = dynamic.difference(["free", "free_births"]) if steps else ()
         return StreamHeader(
             rig=self._source.rig,
             similarity=self._similarity,
             fps=self._source.fps,
-            codec=codec,
+            codec=self._config.codec,
             dynamic=dynamic,
             static={name: value.cpu() for name, value in state.items() if name not in dynamic},
             distance_input=scene.distance_input,
             config=to_json(self._config),
             metadata=self._metadata,
-            steps=steps,
-            reference=reference,
-            init_steps=init_steps,
+            steps=steps or {},
+            reference={name: state[name].cpu() for name in reference},
+            init_steps=init_steps or {},
         )
 
     def _check_resumable(self, header: StreamHeader) -> None:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.codec.bins import LARGEST, nearest_bins, values_of
-from structgstream.codec.coder import Bins, Coder, Decoder, Encoder, Naturals, Tables, bit_lengths
+from structgstream.codec.coder import Bins, Coder, Contexts, Decoder, Encoder, Naturals, Tables, bit_lengths
+from structgstream.codec.residual_symbols import LARGEST as LARGEST_SYMBOL
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
 from structgstream.scene.state import STATE_TABLE, FieldName
@@ -197,10 +198,23 @@ def _coded_rows(
         middles = middle + (1 << shifts >> 1) >> shifts
         values = None if bins is None else (bins[:, column] >> shifts) - middles
         contexts = shifts * _SIZES + np.minimum(bit_lengths(last + before), _SIZES - 1)
-        values = coder.residuals(f"{name}.value", values, contexts.astype(np.uint16), count=SHIFTS * _SIZES)
-        last, before = np.abs(values.astype(np.int64)), last
-        found[:, column] = _checked(values.astype(np.int64) + middles << shifts)
+        values = _coded_values(coder, name, values, contexts.astype(np.uint16))
+        last, before = np.abs(values), last
+        found[:, column] = _checked(values + middles << shifts)
     return found, shifts
+
+
+def _coded_values(coder: Coder, name: FieldName, values: Naturals | None, contexts: Contexts) -> Naturals:
+    """Signed numbers ``[n]``: those up to 6 as they are, 7 for all above, and what these have more than 7."""
+    clipped = None if values is None else np.clip(values, -LARGEST_SYMBOL, LARGEST_SYMBOL).astype(np.int32)
+    found = coder.residuals(f"{name}.value", clipped, contexts, count=SHIFTS * _SIZES).astype(np.int64)
+    if len(found) and int(np.abs(found).max()) > LARGEST_SYMBOL:
+        raise StreamError(f"{_WHERE} holds {name} beyond {LARGEST_SYMBOL} where the rest follows; it is damaged.")
+    large = np.flatnonzero(np.abs(found) == LARGEST_SYMBOL)
+    more = None if values is None else np.abs(values[large]).astype(np.int64) - LARGEST_SYMBOL
+    more = coder.naturals(f"{name}.more", more, np.zeros(len(large), np.uint16), count=1)
+    found[large] += np.sign(found[large]) * more
+    return found
 
 
 def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:

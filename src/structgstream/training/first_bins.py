@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame 0 as whole numbers of steps, which the init record codes: as few bits as the pictures allow.
+
+Note [Sensitivity]
+~~~~~~~~~~~~~~~~~~
+What an error of a number does to the pictures is, to first order, the square of their derivative by it. One backward
+pass of a picture weighted with random signs has the sum of these squares over all pixels as the expectation of its
+squared gradients (Hutchinson, 1989), so a pass over the cameras tells what every number is worth. Steps follow from
+it: each number may add the same error.
+
+Note [Gauges]
+~~~~~~~~~~~~~
+Many scenes draw the same pictures. Features may be mapped by any invertible matrix if the MLPs' first layers undo it;
+of these the one is taken in which every direction is worth the same and directions do not depend on each other
+(Karhunen-Loeve), so most columns of most anchors become zero. l_v only multiplies O_v, and both are fitted: l_v
+becomes 1, and the offsets lengths in the scene. What a position loses on its grid its offsets get.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import CameraRig
+from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.backend import Backend
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import FieldName, scene_of, state_of
+from structgstream.training.rounding import RoundingConfig, rounded
+
+MEASURED: tuple[FieldName, ...] = ("base_scales", "anchor_offsets", "anchor_features")
+FINEST, COARSEST = -1, 2
+"""Of an anchor's step, as powers of two times that of an average one: what is hidden now may come to light."""
+_LEAST_SHARE = 1e-4  # of the largest eigenvalue: directions of features are not stretched further than by 100
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How pictures depend on a scene: means over all their numbers, in units of full scale (Note [Sensitivity]).
+
+    Args:
+        fields: squared derivatives by each number of the :data:`MEASURED` fields, of their shapes.
+        features: ``[D, D]``, products of the derivatives by an anchor's features, summed over anchors.
+        used: ``[M, K]``, the offsets whose opacity is above zero for some camera.
+    """
+
+    fields: Mapping[FieldName, Tensor]
+    features: Tensor
+    used: Tensor
+
+
+def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int) -> Sensitivity:
+    """What the training cameras of ``rig`` (in the scene's units) see of every number."""
+    generator = torch.Generator().manual_seed(seed)
+    state: dict[FieldName, Tensor] = {name: value.detach() for name, value in state_of(scene).items()}
+    for name in MEASURED:
+        state[name] = state[name].clone().requires_grad_()
+    squares: dict[FieldName, Tensor] = {name: torch.zeros_like(state[name], requires_grad=False) for name in MEASURED}
+    features = state["anchor_features"].shape[1]
+    products = torch.zeros(features, features, dtype=torch.float64, device=scene.anchors.positions.device)
+    used = torch.zeros(state["anchor_offsets"].shape[:2], dtype=torch.bool, device=products.device)
+    count = 0
+    for name in rig.training:
+        open_scene = scene_of(state, distance_input=scene.distance_input)
+        structured, visible = open_scene.structured(rig[name], backend)
+        image = draw(open_scene.dressed(structured), rig[name], backend).image
+        signs = (torch.randint(0, 2, image.shape, generator=generator) * 2 - 1).to(image)
+        found = torch.autograd.grad((image * signs).sum(), [state[field] for field in MEASURED], allow_unused=True)
+        for field, gradient in zip(MEASURED, found, strict=True):
+            if gradient is not None:
+                squares[field] += gradient.square()
+                if field == "anchor_features":
+                    products += gradient.double().T @ gradient.double()
+        used[visible] |= structured.raw_opacities > 0
+        count += image.numel()
+    for value in (*squares.values(), products):
+        value /= max(count, 1)
+    return Sensitivity(squares, products, used)
+
+
+def regauged(scene: Scene, sensitivity: Sensitivity) -> Scene:
+    """A scene that draws the same with numbers that cost less (Note [Gauges])."""
+    anchors = scene.anchors
+    features, mlps = _independent(anchors.features, sensitivity.features, scene.mlps)
+    offsets = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
+    return replace(
+        scene,
+        anchors=replace(
+            anchors,
+            features=features,
+            offsets=torch.where(sensitivity.used[..., None], offsets, 0.0),
+            log_offset_scales=torch.zeros_like(anchors.log_offset_scales),
+        ),
+        mlps=mlps,
+    )
+
+
+def _independent(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[Tensor, MLPWeights]:
+    """Features whose directions are worth the same and are independent, the most varied first, and MLPs for them."""
+    values, vectors = torch.linalg.eigh(products)
+    if not len(features) or not float(values.max()) > 0.0:
+        return features, mlps
+    lengths = values.clamp(min=_LEAST_SHARE * float(values.max())).sqrt()
+    mean = features.double().mean(0)
+    worth = (features.double() - mean) @ (vectors * lengths)
+    turn = torch.linalg.eigh(worth.T @ worth).eigenvectors.flip(1)
+    there, back = vectors * lengths @ turn, turn.T @ (vectors / lengths).T
+    width = len(mean)
+    # The scale is free: weights stay as large as they are, for steps and rates that are used to it.
+    before, after = (
+        sum(float((head.w1[:, :width].double() @ by).square().sum()) for head in mlps)
+        for by in (torch.eye(width, dtype=torch.float64, device=back.device), back.T)
+    )
+    scale = (after / before) ** 0.5 if before > 0.0 and after > 0.0 else 1.0
+
+    def head(old: HeadWeights) -> HeadWeights:
+        seen = old.w1[:, :width].double()
+        w1 = torch.cat([(seen @ back.T / scale).to(old.w1), old.w1[:, width:]], dim=1)
+        return old._replace(w1=w1, b1=(old.b1.double() + seen @ mean).to(old.b1))
+
+    new = ((features.double() - mean) @ there * scale).to(features)
+    return new.contiguous(), MLPWeights(head(mlps.opacity), head(mlps.color), head(mlps.covariance))
+
+
+def first_bins(
+    scene: Scene,
+    sensitivity: Sensitivity,
+    *,
+    config: RoundingConfig,
+    voxel_size: float,
+    steps: Mapping[str, float],
+) -> tuple[Scene, dict[FieldName, float]]:
+    """The scene with all that the init record codes as whole numbers of steps, and these steps by field.
+
+    Args:
+        scene: frame 0, as :func:`regauged` gave it.
+        sensitivity: of ``scene``.
+        config: how much may be lost.
+        voxel_size: the grid of the anchors.
+        steps: of what changes later: what the frames after this one round to.
+    """
+    config, state = config.resolved(), state_of(scene)
+    used = sensitivity.used[..., None].expand_as(state["anchor_offsets"])
+    counted = {"anchor_offsets": used}
+    numbers = sum(
+        int((worth > 0).logical_and(counted.get(name, worth > 0)).sum()) for name, worth in sensitivity.fields.items()
+    )
+    # A step has the error of its square over twelve; all numbers have the same.
+    plain = config.resolved()
+    most = plain.first_noise_levels / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
+    found: dict[FieldName, float] = {"anchor_positions": float32(voxel_size)}
+    state["anchor_positions"] = rounded(state["anchor_positions"], found["anchor_positions"])
+    shown = state["anchor_positions"]
+    if "anchor_positions" in steps:
+        shown = rounded(shown, steps["anchor_positions"])
+    lost = (scene.anchors.positions - shown) / scene.anchors.log_offset_scales.exp()
+    state["anchor_offsets"] = torch.where(used, state["anchor_offsets"] + lost[:, None], 0.0)
+    for name, worth in sensitivity.fields.items():
+        found[name], state[name] = _coarsened(state[name], worth, most, counted=counted.get(name))
+    for name in ("opacity_mlp", "color_mlp", "covariance_mlp"):
+        found[name] = float32(plain.first_weight_step)
+        state[name] = rounded(state[name], found[name])
+    found["offset_scales"] = float32(steps.get("offset_scales", plain.log_scale_step))
+    state["offset_scales"] = rounded(state["offset_scales"], found["offset_scales"])
+    if "appearance" in state:
+        found["appearance"] = float32(steps.get("appearance", plain.appearance_step))
+        shortest = float(state["appearance_basis"].norm(dim=1).min())
+        found["appearance_basis"] = float32(max(shortest / 64, 1e-9))
+        for name in ("appearance", "appearance_basis"):
+            state[name] = rounded(state[name], found[name])
+    return scene_of(state, distance_input=scene.distance_input), found
+
+
+def _coarsened(values: Tensor, worth: Tensor, most: float, *, counted: Tensor | None) -> tuple[float, Tensor]:
+    """A step, and values ``[M, ...]`` as multiples of it times a power of two for each row."""
+    counted = worth > 0 if counted is None else counted
+    flat, rows = worth * counted, tuple(range(1, worth.dim()))
+    mean = float(flat.sum() / counted.sum().clamp(min=1))
+    if not mean > 0.0:
+        mean = 1.0
+    of_row = flat.sum(rows) / counted.sum(rows).clamp(min=1)
+    powers = (0.5 * (mean / of_row.clamp(min=1e-30)).log2()).round().clamp(FINEST, COARSEST)
+    step = float32(most / mean**0.5 * 2.0**FINEST)
+    sizes = step * torch.exp2(powers - FINEST).reshape(-1, *[1] * len(rows))
+    return step, (values / sizes).round() * sizes
+
+
+def float32(value: float) -> float:
+    """The nearest float32 number."""
+    return float(torch.tensor(value, dtype=torch.float32))
