@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of documents are made from results; nothing else of a document changes, and ours are up to date."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,56 @@ def test_marked_parts_are_made_from_results() -> None:
     assert "ring (0123456789ab), 3 frames of 64x48, 5 training cameras, held out a, b." in made_by
     assert "old" not in ablation
     assert "99.25" not in ablation + methods + readings + made_by
+
+
+COMPACT = """<!-- effects ring -->
+<!-- end -->
+<!-- rates ring -->
+<!-- end -->
+<!-- rate-plot ring -->
+<!-- end -->
+<!-- bd-rate ring other -->
+<!-- end -->
+"""
+
+
+def compact_results() -> dict[str, list[Result]]:
+    ring = [
+        outcome(key, psnr=30.0 + i, mean={"online_bytes": 1e4 * 2**i})
+        for i, key in enumerate(("quality-m1", "compact", "quality-p1"))
+    ]
+    other = [replace(result, mean={**result.mean, "online_bytes": 2 * result.mean["online_bytes"]}) for result in ring]
+    return {"ring": [*ring, outcome("full", psnr=31.0, mean={"online_bytes": 1e6})], "other": other}
+
+
+def test_parts_about_the_compact_stream() -> None:
+    effects, rates, plot, differences = marked_parts(refreshed(COMPACT, compact_results()))
+    assert "| compact, with everything | 1 | 31.00 | - | - | - | - | 20.0 |" in effects
+    assert "| paper mode | 1 | 31.00 | +0.00 | - | - | - | 1000.0 |" in effects
+    assert "| compact, quality +1 | 1 | 32.00 | - | 40.0 | 9.60 | - |" in rates
+    assert "| paper mode, PSNR | 1 | 1000.0 | 31.00 | 20.0 | -98.0 | - | - |" in rates
+    assert "\n- paper mode, PSNR: Its 1000.0 KB a frame are not on the curve, which ends at 40.0 KB.\n" in rates
+    assert "](images/ring-rates.png)" in plot
+    assert "| PSNR | 1 | -50.0 | +1.00 |" in differences
+
+
+def test_without_results_of_the_compact_stream_there_are_rows_of_dashes() -> None:
+    effects, rates, plot, differences = marked_parts(refreshed(COMPACT, {}))
+    assert "| w/o change gate | - | - |" in effects
+    assert "| compact, quality -2 | - | - |" in rates
+    assert "against" not in rates
+    assert "No result yet." in plot
+    assert "No result yet." in differences
+    assert refreshed(refreshed(COMPACT, {}), {}) == refreshed(COMPACT, {})
+
+
+def test_the_picture_of_the_rates_is_drawn_beside_the_document(tmp_path: Path) -> None:
+    for study, found in compact_results().items():
+        for result in found:
+            write_result(tmp_path / "r" / study / f"{result.key}.json", result)
+    (tmp_path / "d.md").write_text(COMPACT)
+    refresh([tmp_path / "d.md"], tmp_path / "r")
+    assert [path.name for path in (tmp_path / "images").iterdir()] == ["ring-rates.png"]
 
 
 def test_the_rest_of_a_document_stays_and_a_second_time_changes_nothing() -> None:

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from outcomes import outcome
-from small_runs import CLIP, quick
+from small_runs import CLIP, compact, quick
 from structgstream.errors import ConfigError
 from structgstream.experiments.readings import READINGS
 from structgstream.experiments.results import write_result
 from structgstream.experiments.studies import (
+    COMPACT_TABLES,
     ablation_runs,
     comparison_runs,
     method_titles,
@@ -80,6 +81,47 @@ def test_methods_are_presets_and_the_floor(tmp_path: Path) -> None:
     assert method_titles().keys() >= {*PRESETS, "held"}
 
 
+def test_tables_of_the_compact_stream_share_its_runs(tmp_path: Path) -> None:
+    paper = replace(quick(), initial=replace(quick().initial, voxel_size=0.5))
+    runs = ablation_runs(
+        ["effects", "rates"], compact(), CLIP, frames=3, seeds=(0, 3), folder=tmp_path, paper=paper
+    )  # fmt: skip
+    keys = [run.key for run in runs if run.seed == 3]
+    assert set(keys) == {*rows_of("effects"), *rows_of("rates")}
+    assert len(keys) == len(set(keys)) == len(rows_of("effects")) + len(rows_of("rates")) - 1
+    configs = {run.key: run.config for run in runs if run.seed == 3}
+    assert configs["compact"] == replace(compact(), seed=3)
+    assert configs[FULL] == replace(paper, seed=3)
+    assert configs["quality-m2"].online.rounding.quality == -2.0
+
+
+def test_every_stream_of_a_seed_begins_with_one_frame_0(tmp_path: Path) -> None:
+    """Paper mode's as well, so that differences to it are not those of two frames 0."""
+    runs = ablation_runs(
+        ["effects", "rates"], compact(), CLIP, frames=3, seeds=(0,), folder=tmp_path, paper=quick()
+    )  # fmt: skip
+    assert len({run.first.name for run in runs}) == 1
+
+
+@pytest.mark.parametrize("table", COMPACT_TABLES)
+def test_tables_of_the_compact_stream_are_of_nothing_else(tmp_path: Path, table: str) -> None:
+    with pytest.raises(ConfigError, match="take --preset compact"):
+        runs_of(table, folder=tmp_path)
+
+
+def test_rates_are_written_with_what_else_the_folder_has(tmp_path: Path) -> None:
+    backend = select_backend("reference")
+    runs = ablation_runs(["rates"], compact(), CLIP, frames=3, seeds=(0,), folder=tmp_path)
+    write_result(tmp_path / "results" / "paper.json", outcome(FULL, psnr=31.25, mean={"online_bytes": 1.5e6}))
+    points, versus = write_ablation(tmp_path, "rates", runs, backend=backend)
+    assert [row[0] for row in points.rows][-1] == "paper mode"
+    assert versus.rows == []
+    text = (tmp_path / "rates.md").read_text()
+    assert "| paper mode | 1 | 31.25 | - | 1500.0 | 360.00 | - |" in text
+    (effects,) = write_ablation(tmp_path, "effects", [], backend=backend)
+    assert (tmp_path / "effects.md").read_text().startswith(f"# {effects.title}\n\n| variant |")
+
+
 def test_results_are_those_that_are_there(tmp_path: Path) -> None:
     runs = runs_of("free", folder=tmp_path, seeds=(0,))
     write_result(runs[1].result, outcome(runs[1].key))
@@ -88,7 +130,8 @@ def test_results_are_those_that_are_there(tmp_path: Path) -> None:
 
 def test_a_table_of_no_result_is_written_without_pictures(tmp_path: Path) -> None:
     backend = select_backend("reference")
-    sheet = write_ablation(tmp_path / "out", "structured", runs_of("structured", folder=tmp_path), backend=backend)
+    runs = runs_of("structured", folder=tmp_path)
+    (sheet,) = write_ablation(tmp_path / "out", "structured", runs, backend=backend)
     assert (tmp_path / "out" / "structured.md").read_text().startswith(f"# {sheet.title}\n\n| variant |")
     assert write_methods(tmp_path / "out", [], backend=backend).rows == []
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"structured.md", "methods.md"}
