@@ -21,6 +21,7 @@ from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import COMPACT, PRESETS, TINY, StreamConfig
+from structgstream.rate_control import RateConfig
 from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -149,6 +150,26 @@ def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Pa
         done = 0 if resumed is None else len(resumed)
         assert len(run(sink, resumed=resumed)) == FRAMES - done
         assert path.read_bytes() == data, cut
+
+
+def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
+    """The target is half of what frame 2 takes without one; the pressure after it is a matter of record."""
+    free = whole()[1]
+    config = replace(CONFIG, rate=RateConfig(free[2].bytes * 8 * Capture.fps / 2e6, 2 / Capture.fps))
+    sink = MemorySink()
+    reports = run(sink, config=config)
+    assert [r.bytes for r in reports[:2]] == [r.bytes for r in free[:2]]
+    assert reports[3].bytes < free[3].bytes
+    path = tmp_path / "a.sgs"
+    path.write_bytes(sink.data[: [*scanned(sink.data)][-3].end])
+    file, resumed = FileSink.resume(path)
+    run(file, resumed=resumed, config=config)
+    assert path.read_bytes() == sink.data
+
+
+def test_a_target_rate_for_raw_packets_is_refused() -> None:
+    with pytest.raises(ConfigError, match="codec 'raw', whose packets are as large as they are"):
+        run(MemorySink(), config=replace(CONFIG, codec="raw", rate=RateConfig(1.0)))
 
 
 def test_another_codec_does_not_continue_it(tmp_path: Path) -> None:

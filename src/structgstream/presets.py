@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from structgstream.data.points import PointsConfig
+from structgstream.rate_control import RateConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.losses import LossWeights
@@ -28,6 +29,8 @@ class StreamConfig:
     """A key packet, from which a viewer can start, comes this often in media time."""
     codec: Literal["raw", "compact"] = "raw"
     """How frames are coded: as float32, or rounded (``online.rounding``) and entropy coded."""
+    rate: RateConfig = field(default_factory=RateConfig)
+    """A rate to keep to; only with the codec ``compact``."""
     seed: int = 0
 
 

@@ -22,13 +22,14 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakKind, PeakMeter
 from structgstream.presets import StreamConfig, to_json
+from structgstream.rate_control import RateController, pressed
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, on_device, scene_of, state_of
 from structgstream.similarity import Similarity, normalising_similarity
-from structgstream.training.initial import fit_first_frame
 from structgstream.training.first_bins import Sensitivity, first_bins, regauged, sensitivity_of
+from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.rounding import pixel_size
@@ -119,6 +120,11 @@ class Session:
         self._on_step = on_step
         self._similarity = normalising_similarity(source.rig, radius=config.normalised_radius)
         self._rig = self._similarity.rig(source.rig)
+        if config.rate.target_mbits is not None and config.codec != "compact":
+            raise ConfigError(
+                f"A target of {config.rate.target_mbits:g} Mbit/s was given for a stream with codec {config.codec!r}, "
+                "whose packets are as large as they are; take --preset compact, or leave the target out."
+            )
         if resumed is not None:
             self._check_resumable(resumed.header)
 
@@ -139,11 +145,14 @@ class Session:
         encoder: SceneEncoder | None = None
         scene: Scene | None = None
         steps: Mapping[str, float] = {}
+        controller = RateController(self._config.rate, self._source.fps)
         start = 0
         if self._resumed is not None:
             encoder, steps = SceneEncoder(self._resumed.header), self._resumed.header.steps
             self._sink.open(self._resumed.header)
             start = len(self._resumed)
+            for info in self._resumed.packets:
+                controller.add(info.bytes, info.kind)
             for packet in self._resumed.group(start - 1) if start else ():
                 scene = encoder.follow(packet)
         if start >= len(self._source):
@@ -160,7 +169,7 @@ class Session:
                 return
             peaks.end("read")
             read = time.perf_counter()
-            fit = self._fit(scene, frame, before, steps)
+            fit = self._fit(scene, frame, before, steps, controller.pressure)
             before = frame if self._config.online.motion.enabled else None
             peaks.end("fit")
             fitted = time.perf_counter()
@@ -176,6 +185,7 @@ class Session:
             scene = encoded.reconstruction
             coded = time.perf_counter()
             size = self._sink.write(encoded.packet)
+            controller.add(size, kind)
             peaks.end("store")
             done = time.perf_counter()
             yield FrameReport(
@@ -209,7 +219,12 @@ class Session:
         return max(1, round(self._source.fps * self._config.key_interval_seconds))
 
     def _fit(
-        self, scene: Scene | None, frame: MultiViewFrame, before: MultiViewFrame | None, steps: Mapping[str, float]
+        self,
+        scene: Scene | None,
+        frame: MultiViewFrame,
+        before: MultiViewFrame | None,
+        steps: Mapping[str, float],
+        pressure: float,
     ) -> FitResult:
         seed = frame_seed(self._config.seed, frame.index)
         if scene is None:
@@ -235,7 +250,7 @@ class Session:
             on_device(scene, self._backend.device),
             frame,
             self._rig,
-            config=self._config.online,
+            config=pressed(self._config.online, pressure),
             backend=self._backend,
             seed=seed,
             before=before,
