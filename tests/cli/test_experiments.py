@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ablate`` and ``compare`` on the bundled clip, and what they say when something is wrong."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,12 +19,19 @@ from structgstream.experiments.results import read_results
 from structgstream.experiments.sheets import Sheet
 from structgstream.experiments.studies import ablation_runs, needed
 from structgstream.experiments.sweep import Outcome, Progress
+from structgstream.experiments.tasks import Variation
+from structgstream.experiments.worker import Task
 from structgstream.kernels.backend import select_backend
+from structgstream.presets import PRESETS, StreamConfig
 
 CLIP = str(bundled_clip_path())
 SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", "reference", "--jobs", "2"]
 QUICK = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2"]
 QUICK += ["--online.patching.iteration", "1"]
+
+
+def with_iterations(config: StreamConfig, iterations: int) -> StreamConfig:
+    return replace(config, online=replace(config.online, iterations=iterations))
 
 
 def ablate(folder: Path) -> list[str]:
@@ -143,6 +152,45 @@ def test_ctrl_c_says_how_to_go_on(
     extra = ["--methods", "fast"] if command == "compare" else []
     error = error_of([command, CLIP, "-o", str(tmp_path), *SMALL, *extra], capsys, status=130)
     assert error == "\nInterrupted. Whole frames are stored; go on with the same command.\n"
+
+
+def configs_asked(arguments: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, StreamConfig]:
+    """What ``ablate`` would run, by key; nothing is."""
+    asked: dict[str, StreamConfig] = {}
+
+    def noted(tasks: Sequence[Task], *_: object, **__: object) -> Outcome:
+        asked.update({task.key: task.config for task in tasks if isinstance(task, Variation)})
+        return Outcome((), (), ())
+
+    monkeypatch.setattr("structgstream.experiments.sweep.sweep", noted)
+    assert main(["ablate", CLIP, "-o", str(folder), *SMALL, *arguments]) == 0
+    return asked
+
+
+def test_tables_of_the_compact_stream_are_of_its_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--table", "distance", "effects", "rates", "--online.iterations", "7"]
+    asked = configs_asked(arguments, tmp_path, monkeypatch)
+    assert asked["compact"] == with_iterations(PRESETS["compact"], 7)
+    assert asked["full"] == with_iterations(PRESETS["rig"], 7)
+    assert asked["quality-p2"].online.rounding.quality == 2.0
+    assert asked["without-distance"].codec == "raw"
+    assert "w/o change gate" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"distance.md", "effects.md", "rates.md"}
+
+
+def test_the_paper_alone_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = configs_asked([], tmp_path, monkeypatch)
+    assert asked["full"] == PRESETS["rig"]
+    assert not [key for key in asked if key.startswith(("compact", "quality"))]
+
+
+def test_another_full_method_of_the_compact_tables_must_be_compact(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = error_of(["ablate", CLIP, "-o", str(tmp_path), "--table", "rates", "--preset", "fast"], capsys, status=1)
+    assert "need codec 'compact', got 'raw'; take --preset compact." in error
 
 
 def test_failed_steps_are_named_with_those_that_were_not_begun(

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 
-from small_runs import CLIP, quick
+from small_runs import CLIP, compact, quick
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import ExperimentError
@@ -96,8 +96,17 @@ def test_what_decides_frame_0_decides_its_name(runs: Runs) -> None:
     same = [
         replace(first, capture=replace(CLIP, frames=7, scored=("cam00",))),
         replace(first, config=variants(quick())["random-spawn"].config),
+        replace(first, config=compact()),
     ]
     assert {one.name for one in same} == {first.name}
+
+
+def test_frame_0_is_kept_as_it_was_fitted(runs: Runs, tmp_path: Path) -> None:
+    """A compact stream rounds it, by its own steps; what was rounded before would not say what those cost."""
+    first = FirstFrame(CLIP, compact(), tmp_path)
+    first.run(runs.backend)
+    assert open_stream(first.stream).header.codec == "raw"
+    assert packets(first.stream) == packets(runs.first.stream)
 
 
 def test_what_frame_0_cost_is_what_its_fit_cost(runs: Runs) -> None:
