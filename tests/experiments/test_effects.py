@@ -41,6 +41,14 @@ def test_what_the_switches_are() -> None:
     assert trained.motion.full_every_frames == REFRESH_FRAMES, "otherwise nothing that all anchors share is trained"
 
 
+@pytest.mark.parametrize(("whole", "other"), [(0.0, 1.0), (0.7, 0.0)])
+def test_a_prior_is_left_out_where_there_is_one_and_tried_where_there_is_none(whole: float, other: float) -> None:
+    full = replace(COMPACT, online=replace(COMPACT.online, motion_prior=whole))
+    row = effects(full, paper=RIG)["compact-motion-prior"]
+    assert row.config.online.motion_prior == other
+    assert row.title.startswith("w/o") == (other == 0.0)
+
+
 def test_no_two_rows_are_the_same_and_no_key_or_title_is_of_another_table() -> None:
     assert len({str(to_json(row.config)) for row in ROWS.values()}) == len(ROWS)
     titles = effect_titles()

@@ -61,6 +61,9 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
         ranked = replace(whole, appearance_rank=rank)
         online(f"rank-{rank}", f"appearance in {rank} directions", ranked, "appearance_rank")
     dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
+    prior = 0.0 if whole.motion_prior else 1.0
+    title = "motion prior: the last step again" if prior else "w/o motion prior"
+    online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
     spawnless = replace(whole, patching=replace(patching, spawn="off"))
     online("without-free", "w/o free 3DGs", spawnless, "patching.spawn")
     refreshed = replace(

@@ -41,7 +41,7 @@ def qualities(full: StreamConfig) -> dict[str, Variant]:
         rounding = replace(full.online.rounding, quality=full.online.rounding.quality + quality)
         config = replace(full, online=replace(full.online, rounding=rounding))
         changes = frozenset({"online.rounding.quality"} if quality else ())
-        rows[quality_key(quality)] = Variant(quality_key(quality), f"compact, quality {quality:+d}", config, changes)
+        rows[quality_key(quality)] = Variant(quality_key(quality), quality_title(quality), config, changes)
     return rows
 
 
@@ -50,9 +50,14 @@ def quality_key(quality: int) -> str:
     return f"quality-{'m' if quality < 0 else 'p'}{abs(quality)}" if quality else WHOLE
 
 
+def quality_title(quality: int) -> str:
+    """Name of a point of the curve in tables."""
+    return f"compact, quality {quality:+d}" if quality else "compact, quality 0"
+
+
 def curve_titles() -> dict[str, str]:
     """The points of the curve and the methods beside it, with their names in tables."""
-    return {quality_key(quality): f"compact, quality {quality:+d}" for quality in QUALITIES} | dict(OTHERS)
+    return {quality_key(quality): quality_title(quality) for quality in QUALITIES} | dict(OTHERS)
 
 
 def rates_sheet(results: Iterable[Result]) -> Sheet:
@@ -155,7 +160,7 @@ def curve_of(found: Mapping[str, Summary], score: str, seeds: set[int]) -> tuple
         key = quality_key(quality)
         point = _point(found[key], score, seeds) if key in found and seeds else None
         if point is not None:
-            points.append((point, f"quality {quality:+d}"))
+            points.append((point, quality_title(quality)))
     kept: list[Point] = []
     remarks = []
     for (rate, decibels), name in sorted(points, key=lambda entry: (entry[0][0], -entry[0][1])):
