@@ -127,10 +127,19 @@ def test_steps_are_float32_and_come_from_a_pixel() -> None:
     assert header.reference.keys() == dynamic.difference(["free", "free_births"])
 
 
-def test_anchors_stand_in_space_order() -> None:
+def test_anchors_stand_on_their_grid_in_space_order() -> None:
     header = StreamReader(whole()[0]).header
-    steps = space_order(header.reference["anchor_positions"]).diff()
-    assert (steps == 1).float().mean() > 0.8, "but for those that rounding has moved to another cell"
+    positions, step = header.reference["anchor_positions"], header.init_steps["anchor_positions"]
+    assert step == float(np.float32(CONFIG.initial.voxel_size))
+    assert torch.equal(space_order(positions, step=step), torch.arange(len(positions)))
+    assert torch.equal((positions.double() / step).round().float() * step, positions)
+
+
+def test_the_header_is_a_fraction_of_its_numbers() -> None:
+    data = whole()[0]
+    header = StreamReader(data).header
+    numbers = sum(value.numel() for part in (header.static, header.reference) for value in part.values())
+    assert next(scanned(data)).end < 0.5 * 4 * numbers, "most are the MLPs' here, which get ten bits each"
 
 
 def test_what_stands_still_keeps_its_bins() -> None:

@@ -261,26 +261,22 @@ class Session:
     def _prepared(self, scene: Scene) -> tuple[Scene, StreamHeader]:
         """Frame 0 as the frames after it need it, and the header that they need."""
         dynamic, rounding = self._config.online.dynamic, self._config.online.rounding
-        compact = self._config.codec == "compact"
-        if compact:
-            scene = regauged(scene, self._sensitivity(scene))
+        worth: Sensitivity | None = None
+        if self._config.codec == "compact":
+            worth = sensitivity_of(scene, self._rig, backend=self._backend, seed=frame_seed(self._config.seed, 0))
+            scene, worth = regauged(scene, worth)
         if "appearance" in dynamic:
             scene = with_appearance(scene, self._config.online.appearance_rank)
-        if not compact:
+        if worth is None:
             return scene, self._header(scene)
         known = rounding.steps(pixel_size(scene.anchors.positions, self._rig))
         used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
         steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
         voxel_size = self._config.initial.voxel_size
-        scene, init_steps = first_bins(
-            scene, self._sensitivity(scene), config=rounding, voxel_size=voxel_size, steps=steps
-        )
+        scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
         state = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
         scene = scene_of(state, distance_input=scene.distance_input)
         return scene, self._header(scene, steps=steps, init_steps=init_steps)
-
-    def _sensitivity(self, scene: Scene) -> Sensitivity:
-        return sensitivity_of(scene, self._rig, backend=self._backend, seed=frame_seed(self._config.seed, 0))
 
     def _header(
         self,

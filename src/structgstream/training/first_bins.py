@@ -80,48 +80,52 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
     return Sensitivity(squares, products, used)
 
 
-def regauged(scene: Scene, sensitivity: Sensitivity) -> Scene:
-    """A scene that draws the same with numbers that cost less (Note [Gauges])."""
-    anchors = scene.anchors
-    features, mlps = _independent(anchors.features, sensitivity.features, scene.mlps)
-    offsets = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
+def regauged(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
+    """A scene that draws the same with numbers that cost less (Note [Gauges]), and what they are worth."""
+    anchors, fields = scene.anchors, dict(sensitivity.fields)
+    lengths = anchors.log_offset_scales.exp()[:, None]
+    fields["anchor_offsets"] = fields["anchor_offsets"] / lengths.square()
+    there, back = _independent(anchors.features, sensitivity.features, scene.mlps)
+    features = anchors.features.double()
+    mean = features.mean(0) if len(features) else features.new_zeros(features.shape[1])
+    products = back @ sensitivity.features @ back.T
+    # Of an anchor's directions together as before, of all anchors together as now.
+    worth = products.diagonal().sum() / sensitivity.features.diagonal().sum().clamp(min=1e-300)
+    fields["anchor_features"] = fields["anchor_features"] * worth.to(fields["anchor_features"])
     return replace(
         scene,
         anchors=replace(
             anchors,
-            features=features,
-            offsets=torch.where(sensitivity.used[..., None], offsets, 0.0),
+            features=((features - mean) @ there).to(anchors.features).contiguous(),
+            offsets=torch.where(sensitivity.used[..., None], anchors.offsets * lengths, 0.0),
             log_offset_scales=torch.zeros_like(anchors.log_offset_scales),
         ),
-        mlps=mlps,
-    )
+        mlps=MLPWeights(*(_seeing(head, mean, back) for head in scene.mlps)),
+    ), Sensitivity(fields, products, sensitivity.used)
 
 
-def _independent(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[Tensor, MLPWeights]:
-    """Features whose directions are worth the same and are independent, the most varied first, and MLPs for them."""
+def _independent(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[Tensor, Tensor]:
+    """A matrix ``[D, D]`` that makes directions worth the same and independent, the most varied first; its inverse."""
     values, vectors = torch.linalg.eigh(products)
     if not len(features) or not float(values.max()) > 0.0:
-        return features, mlps
-    lengths = values.clamp(min=_LEAST_SHARE * float(values.max())).sqrt()
-    mean = features.double().mean(0)
-    worth = (features.double() - mean) @ (vectors * lengths)
-    turn = torch.linalg.eigh(worth.T @ worth).eigenvectors.flip(1)
-    there, back = vectors * lengths @ turn, turn.T @ (vectors / lengths).T
-    width = len(mean)
+        same = torch.eye(len(products)).to(products)
+        return same, same
+    stretched = vectors * values.clamp(min=_LEAST_SHARE * float(values.max())).sqrt()
+    centred = features.double() - features.double().mean(0)
+    turn = torch.linalg.eigh((centred @ stretched).T @ (centred @ stretched)).eigenvectors.flip(1)
+    there = stretched @ turn
+    back = torch.linalg.inv(there)
     # The scale is free: weights stay as large as they are, for steps and rates that are used to it.
-    before, after = (
-        sum(float((head.w1[:, :width].double() @ by).square().sum()) for head in mlps)
-        for by in (torch.eye(width, dtype=torch.float64, device=back.device), back.T)
-    )
-    scale = (after / before) ** 0.5 if before > 0.0 and after > 0.0 else 1.0
+    seen = torch.cat([head.w1[:, : len(products)] for head in mlps]).double()
+    scale = ((seen @ back.T).square().sum() / seen.square().sum().clamp(min=1e-300)).sqrt().clamp(min=1e-30)
+    return there * scale, back / scale
 
-    def head(old: HeadWeights) -> HeadWeights:
-        seen = old.w1[:, :width].double()
-        w1 = torch.cat([(seen @ back.T / scale).to(old.w1), old.w1[:, width:]], dim=1)
-        return old._replace(w1=w1, b1=(old.b1.double() + seen @ mean).to(old.b1))
 
-    new = ((features.double() - mean) @ there * scale).to(features)
-    return new.contiguous(), MLPWeights(head(mlps.opacity), head(mlps.color), head(mlps.covariance))
+def _seeing(head: HeadWeights, mean: Tensor, back: Tensor) -> HeadWeights:
+    """The MLP for features less ``mean``, times the inverse of ``back``."""
+    seen, rest = head.w1[:, : len(mean)].double(), head.w1[:, len(mean) :]
+    w1 = torch.cat([(seen @ back.T).to(rest), rest], dim=1)
+    return head._replace(w1=w1, b1=(head.b1.double() + seen @ mean).to(head.b1))
 
 
 def first_bins(
