@@ -11,6 +11,7 @@ import torch
 
 from streams import moved, same, small_scene
 from structgstream import session
+from structgstream.beginning import frame_seed
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
@@ -21,7 +22,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import TINY, StreamConfig
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
-from structgstream.session import Session, frame_seed
+from structgstream.session import Session
 from structgstream.training.result import FitResult
 from worlds import moving_world
 
@@ -62,7 +63,7 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         seeds.append(seed)
         return FitResult(small_scene(seed=seed % 1000), 1, 20.0)
 
-    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None, steps=None):
+    def following(scene, frame, rig, *, config, backend, seed, on_step, **options):
         seeds.append(seed)
         return FitResult(moved(scene, seed % 7), 1, 21.0, spawned=2, pruned=1, seconds={"render": 0.5})
 
@@ -102,7 +103,7 @@ def test_every_frame_is_reported_and_readable(quick_fits: list[int]) -> None:
 def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     started_from = []
 
-    def following(scene, frame, rig, *, config, backend, seed, on_step, before=None, steps=None):
+    def following(scene, frame, rig, *, config, backend, seed, on_step, **options):
         """A trainer that touches a static field, which no packet carries."""
         started_from.append(scene)
         fitted = moved(scene, frame.index)
@@ -259,6 +260,7 @@ def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[in
         "points",
         "normalised_radius",
         "key_interval_seconds",
+        "rate",
         "codec",
         "seed",
     }

@@ -42,6 +42,7 @@ CONFIG = replace(
         iterations=8,
         patching=replace(TINY.online.patching, iteration=4),
         motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
+        motion_prior=0.5,
         # Eight iterations in pictures of 48 pixels do not carry an anchor further than half a common step.
         rounding=RoundingConfig(position_pixels=0.02),
     ),

@@ -6,33 +6,26 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-import numpy as np
-import torch
+from torch import Tensor
 
-from structgstream.cameras import CameraRig
-from structgstream.codec.bins import FREE_STEPS
+from structgstream.beginning import begun, frame_seed, initial_points_of
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
+from structgstream.codec.packets import PacketKind, PacketSink
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.static_fields import on_bins
-from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakKind, PeakMeter
-from structgstream.presets import StreamConfig, to_json
+from structgstream.presets import StreamConfig
 from structgstream.rate_control import RateController, pressed
-from structgstream.scene.appearance import with_appearance
-from structgstream.scene.order import in_space_order
+from structgstream.resuming import check_resumable
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, on_device, scene_of, state_of
-from structgstream.similarity import Similarity, normalising_similarity
-from structgstream.training.first_bins import Sensitivity, first_bins, regauged, sensitivity_of
+from structgstream.scene.state import FieldName, on_device
+from structgstream.similarity import normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame
 from structgstream.training.result import FitResult, StepListener
-from structgstream.training.rounding import pixel_size
 
 
 @dataclass(frozen=True)
@@ -62,22 +55,19 @@ class FrameReport:
     cpu_seconds: float = 0.0
 
 
-def frame_seed(seed: int, index: int) -> int:
-    """A seed of its own for each frame, so that a frame can be repeated alone."""
-    return (seed * 1_000_003 + index) % 2**63
+@dataclass
+class _Past:
+    """What a frame is fitted after: the last scene, the one before it, and the last pictures, as far as they count."""
 
+    scene: Scene | None = None
+    older: Scene | None = None
+    frame: MultiViewFrame | None = None
 
-def initial_points_of(
-    source: FrameSource, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
-) -> torch.Tensor:
-    """Points ``[P, 3]`` of the capture or made from ``frame``, normalised, after a look at the poses."""
-    from structgstream.data.pose_check import check_poses
-
-    check_poses(frame, source.rig)
-    given = source.points
-    if given is None:
-        given = initial_points(frame, source.rig, config=config, seed=seed).positions
-    return similarity.points(torch.from_numpy(given))
+    @property
+    def last_motion(self) -> Tensor | None:
+        if self.scene is None or self.older is None:
+            return None
+        return self.scene.anchors.positions - self.older.anchors.positions
 
 
 class Session:
@@ -126,7 +116,7 @@ class Session:
                 "whose packets are as large as they are; take --preset compact, or leave the target out."
             )
         if resumed is not None:
-            self._check_resumable(resumed.header)
+            check_resumable(resumed.header, source, config=config, metadata=self._metadata)
 
     def run(self) -> Iterator[FrameReport]:
         """Fit, encode and write every frame that the sink does not hold yet; yields a report for each.
@@ -143,7 +133,7 @@ class Session:
 
     def _frames(self) -> Iterator[FrameReport]:
         encoder: SceneEncoder | None = None
-        scene: Scene | None = None
+        past, online = _Past(), self._config.online
         steps: Mapping[str, float] = {}
         controller = RateController(self._config.rate, self._source.fps)
         start = 0
@@ -154,13 +144,15 @@ class Session:
             for info in self._resumed.packets:
                 controller.add(info.bytes, info.kind)
             for packet in self._resumed.group(start - 1) if start else ():
-                scene = encoder.follow(packet)
+                past.scene = encoder.follow(packet)
+            if online.motion_prior and start > 1:
+                past.older = self._resumed.scene(start - 2)
         if start >= len(self._source):
             return
         # What moves shows against the frame before, so a resumed stream reads that one once more.
-        again = start > 0 and self._config.online.motion.enabled
+        again = start > 0 and online.motion.enabled
         frames = self._source.frames(start - again)
-        before = next(frames) if again else None
+        past.frame = next(frames) if again else None
         while True:
             peaks = PeakMeter(self._backend.device)
             started, cpu_started = time.perf_counter(), time.process_time()
@@ -169,13 +161,19 @@ class Session:
                 return
             peaks.end("read")
             read = time.perf_counter()
-            fit = self._fit(scene, frame, before, steps, controller.pressure)
-            before = frame if self._config.online.motion.enabled else None
+            fit = self._fit(past, frame, steps, controller.pressure)
             peaks.end("fit")
             fitted = time.perf_counter()
             fitted_scene = fit.scene
-            if scene is None:
-                fitted_scene, header = self._prepared(fitted_scene)
+            if past.scene is None:
+                fitted_scene, header = begun(
+                    fitted_scene,
+                    self._source,
+                    config=self._config,
+                    metadata=self._metadata,
+                    similarity=self._similarity,
+                    backend=self._backend,
+                )
                 if encoder is None:
                     encoder, steps = SceneEncoder(header), header.steps
                     self._sink.open(header)
@@ -183,6 +181,11 @@ class Session:
             kind = PacketKind.KEY if frame.index % self._key_interval == 0 else PacketKind.DELTA
             encoded = encoder.encode(fitted_scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
             scene = encoded.reconstruction
+            past = _Past(
+                scene,
+                older=past.scene if online.motion_prior else None,
+                frame=frame if online.motion.enabled else None,
+            )
             coded = time.perf_counter()
             size = self._sink.write(encoded.packet)
             controller.add(size, kind)
@@ -218,16 +221,9 @@ class Session:
     def _key_interval(self) -> int:
         return max(1, round(self._source.fps * self._config.key_interval_seconds))
 
-    def _fit(
-        self,
-        scene: Scene | None,
-        frame: MultiViewFrame,
-        before: MultiViewFrame | None,
-        steps: Mapping[str, float],
-        pressure: float,
-    ) -> FitResult:
+    def _fit(self, past: _Past, frame: MultiViewFrame, steps: Mapping[str, float], pressure: float) -> FitResult:
         seed = frame_seed(self._config.seed, frame.index)
-        if scene is None:
+        if past.scene is None:
             if self._first is not None:
                 return self._first
             points = initial_points_of(
@@ -247,99 +243,14 @@ class Session:
                 on_step=self._on_step,
             )
         return fit_next_frame(
-            on_device(scene, self._backend.device),
+            on_device(past.scene, self._backend.device),
             frame,
             self._rig,
             config=pressed(self._config.online, pressure),
             backend=self._backend,
             seed=seed,
-            before=before,
+            before=past.frame,
             steps=steps,
+            last_motion=past.last_motion,
             on_step=self._on_step,
         )
-
-    def _prepared(self, scene: Scene) -> tuple[Scene, StreamHeader]:
-        """Frame 0 as the frames after it need it, and the header that they need."""
-        dynamic, rounding = self._config.online.dynamic, self._config.online.rounding
-        worth: Sensitivity | None = None
-        if self._config.codec == "compact":
-            worth = sensitivity_of(scene, self._rig, backend=self._backend, seed=frame_seed(self._config.seed, 0))
-            scene, worth = regauged(scene, worth)
-        if "appearance" in dynamic:
-            scene = with_appearance(scene, self._config.online.appearance_rank)
-        if worth is None:
-            return scene, self._header(scene)
-        known = rounding.steps(pixel_size(scene.anchors.positions, self._rig))
-        used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
-        steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
-        voxel_size = self._config.initial.voxel_size
-        scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
-        state = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
-        scene = scene_of(state, distance_input=scene.distance_input)
-        return scene, self._header(scene, steps=steps, init_steps=init_steps)
-
-    def _header(
-        self,
-        scene: Scene,
-        *,
-        steps: Mapping[str, float] | None = None,
-        init_steps: Mapping[FieldName, float] | None = None,
-    ) -> StreamHeader:
-        dynamic, state = self._config.online.dynamic, state_of(scene)
-        reference = dynamic.difference(["free", "free_births"]) if steps else ()
-        return StreamHeader(
-            rig=self._source.rig,
-            similarity=self._similarity,
-            fps=self._source.fps,
-            codec=self._config.codec,
-            dynamic=dynamic,
-            static={name: value.cpu() for name, value in state.items() if name not in dynamic},
-            distance_input=scene.distance_input,
-            config=to_json(self._config),
-            metadata=self._metadata,
-            steps=steps or {},
-            reference={name: state[name].cpu() for name in reference},
-            init_steps=init_steps or {},
-        )
-
-    def _check_resumable(self, header: StreamHeader) -> None:
-        """Refuse to continue a stream with another configuration or capture: its frames would not fit together."""
-        differing = list(_differences(dict(header.config), to_json(self._config)))
-        if differing:
-            raise ConfigError(
-                f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
-                "Resume with the same preset and options, or start again with --overwrite."
-            )
-        differing = list(_differences(_capture_facts(header.rig, header.fps, header.metadata), self._facts()))
-        if differing:
-            raise ConfigError(
-                f"The stream was made from another capture or another part of it: {', '.join(differing[:5])} differ. "
-                "Resume with the same capture and options, or start again with --overwrite."
-            )
-
-    def _facts(self) -> dict[str, object]:
-        return _capture_facts(self._source.rig, self._source.fps, self._metadata)
-
-
-def _capture_facts(rig: CameraRig, fps: float, metadata: Mapping[str, object]) -> dict[str, object]:
-    """What two captures must have in common for their frames to fit into one stream, as plain values."""
-    cameras = {
-        name: {
-            "viewmat": rig[name].viewmat.tolist(),
-            "K": rig[name].K.tolist(),
-            "size": [rig[name].width, rig[name].height],
-            "near": rig[name].near,
-            "held out": name in rig.held_out,
-        }
-        for name in rig
-    }
-    return {"order of cameras": [*rig], "cameras": cameras, "fps": fps, **metadata}
-
-
-def _differences(old: object, new: object, path: str = "") -> Iterator[str]:
-    """Paths at which two trees of plain JSON values differ."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in sorted({*old, *new}):
-            yield from _differences(old.get(key), new.get(key), f"{path}.{key}" if path else key)
-    elif old != new:
-        yield path

@@ -9,6 +9,7 @@ from typing import Any, Generic, cast
 
 import torch
 
+from structgstream.beginning import frame_seed, initial_points_of
 from structgstream.cameras import CameraRig
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind, StreamHeader
@@ -24,7 +25,7 @@ from structgstream.peers.method import Memory, PeerMethod, State
 from structgstream.presets import RIG, to_json
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName
-from structgstream.session import FrameReport, frame_seed, initial_points_of
+from structgstream.session import FrameReport
 from structgstream.similarity import normalising_similarity
 from structgstream.training.result import StepListener
 

@@ -150,7 +150,7 @@ def fit_next_frame(
     def fitted(stepping: Backend) -> FitResult:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
         fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
-        ahead = None if last_motion is None else config.motion_prior * last_motion
+        ahead = None if last_motion is None else config.motion_prior * last_motion.to(scene.anchors.positions)
         if earlier is None:
             return fit.run(scene, views, ahead=ahead)
         with watch.stage("find motion"):

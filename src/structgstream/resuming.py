@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a stream can be continued: only by the same run, or its frames would not fit together."""
+
+from collections.abc import Iterator, Mapping
+
+from structgstream.cameras import CameraRig
+from structgstream.codec.packets import StreamHeader
+from structgstream.data.source import FrameSource
+from structgstream.errors import ConfigError
+from structgstream.presets import StreamConfig, to_json
+
+
+def check_resumable(
+    header: StreamHeader, source: FrameSource, *, config: StreamConfig, metadata: Mapping[str, object]
+) -> None:
+    """Refuses to continue a stream with another configuration or capture.
+
+    Raises:
+        ConfigError: naming what differs.
+    """
+    differing = list(_differences(dict(header.config), to_json(config)))
+    if differing:
+        raise ConfigError(
+            f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
+            "Resume with the same preset and options, or start again with --overwrite."
+        )
+    ours = _capture_facts(source.rig, source.fps, metadata)
+    differing = list(_differences(_capture_facts(header.rig, header.fps, header.metadata), ours))
+    if differing:
+        raise ConfigError(
+            f"The stream was made from another capture or another part of it: {', '.join(differing[:5])} differ. "
+            "Resume with the same capture and options, or start again with --overwrite."
+        )
+
+
+def _capture_facts(rig: CameraRig, fps: float, metadata: Mapping[str, object]) -> dict[str, object]:
+    """What two captures must have in common for their frames to fit into one stream, as plain values."""
+    cameras = {
+        name: {
+            "viewmat": rig[name].viewmat.tolist(),
+            "K": rig[name].K.tolist(),
+            "size": [rig[name].width, rig[name].height],
+            "near": rig[name].near,
+            "held out": name in rig.held_out,
+        }
+        for name in rig
+    }
+    return {"order of cameras": [*rig], "cameras": cameras, "fps": fps, **metadata}
+
+
+def _differences(old: object, new: object, path: str = "") -> Iterator[str]:
+    """Paths at which two trees of plain JSON values differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _differences(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+    elif old != new:
+        yield path
