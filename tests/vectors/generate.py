@@ -50,6 +50,18 @@ COMPACT_STEPS = {
     "free_logit_opacities": 1 / 8,
     "free_colors": float(np.float32(0.007)),
 }
+COMPACT_INIT_STEPS: dict[FieldName, float] = {
+    "anchor_positions": 1 / 256,
+    "offset_scales": float(np.float32(0.02)),
+    "base_scales": float(np.float32(0.01)),
+    "anchor_offsets": 1 / 16,
+    "anchor_features": float(np.float32(0.03)),
+    "opacity_mlp": 1 / 32,
+    "color_mlp": 1 / 16,
+    "covariance_mlp": float(np.float32(0.003)),
+    "appearance": 1 / 8,
+    "appearance_basis": float(np.float32(0.001)),
+}
 COLUMNS = {"free_means": 3, "free_log_scales": 3, "free_quats": 4, "free_logit_opacities": 1, "free_colors": 3}
 
 
@@ -105,9 +117,10 @@ def golden_header() -> StreamHeader:
 
 
 def compact_scene(frame: int) -> Scene:
-    """Anchors 3 to 8 wander, 14 jumps far in frame 4, weights of F_Sigma change in frames 1 and 4; free ones come and go.
+    """Anchors 3 to 8 wander, 14 jumps in frame 4, weights of F_Sigma change in frames 1 and 4; free ones come and go.
 
-    Every number is exactly that of a bin, so this is also what a decoder must find.
+    Anchors are in no order, 20 is far from all others, and rows of what stays are multiples of powers of two. Every
+    number is exactly that of a bin, so this is also what a decoder must find.
     """
     moves = torch.zeros(COMPACT_ANCHORS, 6, dtype=torch.int64)
     for past in range(1, frame + 1):
@@ -122,19 +135,24 @@ def compact_scene(frame: int) -> Scene:
     free[:, :2] += frame // 2 * whole(len(births), 2, salt=3, most=4)
     steps = COMPACT_STEPS
     rows = whole(COMPACT_ANCHORS, 6, salt=1, most=300) + moves
+    rows[20, :3] += torch.tensor([600_000, -9, 400_000])
+    init_steps, powers = COMPACT_INIT_STEPS, 2 ** (torch.arange(COMPACT_ANCHORS)[:, None] % 5)
+    features = whole(COMPACT_ANCHORS, FEATURES, salt=5, most=4) * powers
     columns = free.split([*COLUMNS.values()], dim=1)
     state: dict[FieldName, Tensor] = {
         "anchor_positions": valued(rows[:, :3], steps["anchor_positions"]),
         "offset_scales": valued(rows[:, 3:], steps["offset_scales"]),
-        "base_scales": numbers(COMPACT_ANCHORS, 3, salt=3),
+        "base_scales": valued(whole(COMPACT_ANCHORS, 3, salt=3, most=9) * powers - 400, init_steps["base_scales"]),
         "anchor_offsets": numbers(COMPACT_ANCHORS, K, 3, salt=4),
-        "anchor_features": numbers(COMPACT_ANCHORS, FEATURES, salt=5),
+        "anchor_features": valued(features, init_steps["anchor_features"]),
         "opacity_mlp": numbers(mlp_size(1), salt=6),
         "color_mlp": numbers(mlp_size(3), salt=7),
         "covariance_mlp": valued(weights, steps["covariance_mlp"]),
         "free": torch.cat([valued(part, steps[name]) for part, name in zip(columns, COLUMNS, strict=True)], dim=1),
         "free_births": births,
         "camera_color": numbers(2, 6, salt=11),
+        "appearance": valued(whole(COMPACT_ANCHORS, 3, salt=12, most=1) * powers, init_steps["appearance"]),
+        "appearance_basis": valued(whole(3, FEATURES, salt=13, most=300), init_steps["appearance_basis"]),
     }
     return scene_of(state, distance_input=True)
 
@@ -159,6 +177,7 @@ def compact_header() -> StreamHeader:
         static={name: value for name, value in state.items() if name not in PAPER_DYNAMIC},
         steps=COMPACT_STEPS,
         reference={name: state[name] for name in ("anchor_positions", "offset_scales", "covariance_mlp")},
+        init_steps=COMPACT_INIT_STEPS,
     )
 
 

@@ -17,7 +17,7 @@ const ANCHOR_ROWS: readonly FieldName[] = ["anchor_positions", "offset_scales", 
 const WEIGHTS: readonly FieldName[] = ["opacity_mlp", "color_mlp", "covariance_mlp"];
 export const FREE_STEPS = ["free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors"];
 const FREE_WIDTHS = [3, 3, 4, 1, 3];
-const LARGEST = 2 ** 22;
+export const LARGEST = 2 ** 22;
 
 /** Fields that may be dynamic. */
 export const CODABLE: ReadonlySet<FieldName> = new Set([...ANCHOR_ROWS, ...WEIGHTS, "free", "free_births"] as const);

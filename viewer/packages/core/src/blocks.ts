@@ -76,11 +76,35 @@ export function unpackedBlocks(payload: Uint8Array, start: number, where: string
     if (block.coded) {
       throw new StreamError(`${where} holds field ${block.name} coded, where its numbers as they are belong.`);
     }
-    const { buffer } = payload.slice(block.data, block.end);
-    const data = block.itemBytes === 8 ? new BigInt64Array(buffer) : new Float32Array(buffer);
-    fields.set(block.name, { shape: block.shape, data });
+    fields.set(block.name, tensorOf(payload, block));
   }
   return fields;
+}
+
+/**
+ * The tensors of all blocks from byte `start` to the end that are not coded, as {@link unpackedBlocks}, and the bytes
+ * of those that are, not copied.
+ *
+ * @throws StreamError as {@link blocksIn}
+ */
+export function mixedBlocks(
+  payload: Uint8Array,
+  start: number,
+  where: string,
+): { values: Map<FieldName, Tensor>; coded: Map<FieldName, Uint8Array> } {
+  const values = new Map<FieldName, Tensor>();
+  const coded = new Map<FieldName, Uint8Array>();
+  for (const block of blocksIn(payload, start, where)) {
+    if (block.coded) coded.set(block.name, payload.subarray(block.data, block.end));
+    else values.set(block.name, tensorOf(payload, block));
+  }
+  return { values, coded };
+}
+
+function tensorOf(payload: Uint8Array, block: Block): Tensor {
+  const { buffer } = payload.slice(block.data, block.end);
+  const data = block.itemBytes === 8 ? new BigInt64Array(buffer) : new Float32Array(buffer);
+  return { shape: block.shape, data };
 }
 
 /**

@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The init record: what a receiver knows before the first frame (docs/bitstream.md, section Init record). */
 
-import { unpackedBlocks } from "./blocks.js";
+import { mixedBlocks } from "./blocks.js";
 import { checkCodec } from "./compact.js";
 import { StreamError } from "./errors.js";
-import { checkShapes, type FieldName, type Fields, isFieldName, isScene, type Tensor } from "./fields.js";
+import { checkShapes, type FieldName, type Fields, isFieldName, isScene, mergedFields, type Tensor } from "./fields.js";
 import { unpackedJson } from "./json.js";
 import { viewOf } from "./records.js";
+import { AS_THEY_ARE, decodedFields } from "./staticFields.js";
 
 const LENGTH_BYTES = 4;
 const MAX_IMAGE_SIDE = 65535;
@@ -61,7 +62,7 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   const end = LENGTH_BYTES + viewOf(payload).getUint32(0, true);
   if (end > payload.length) throw new StreamError("The init record states a longer description than it holds.");
   const description = object(unpackedJson(payload.subarray(LENGTH_BYTES, end)), "the description");
-  const header = headerOf(description, unpackedBlocks(payload, end, "The init record"));
+  const header = headerOf(description, fieldsOf(description, payload, end));
   if (!isScene(new Set([...header.dynamic, ...header.static.keys()]))) {
     throw new StreamError("The init record does not hold every field that packets leave out, and only those.");
   }
@@ -71,13 +72,29 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   return header;
 }
 
+/** With `compact`, all fields but a few are coded; with another codec none is. */
+function fieldsOf(description: Record<string, unknown>, payload: Uint8Array, start: number): Fields {
+  const { values, coded } = mixedBlocks(payload, start, "The init record");
+  if (description.codec !== "compact") {
+    for (const name of coded.keys()) {
+      throw new StreamError(`The init record holds field ${name} coded, which its codec does not know.`);
+    }
+    return values;
+  }
+  for (const name of values.keys()) {
+    if (!AS_THEY_ARE.has(name)) {
+      throw new StreamError(`The init record holds field ${name} as it is, where it should be coded.`);
+    }
+  }
+  return mergedFields(values, decodedFields(coded, stepsOf(description.init_steps, "init_steps")));
+}
+
 function headerOf(description: Record<string, unknown>, fields: Fields): StreamHeader {
   const cameras = list(description.cameras, "cameras").map(cameraOf);
   if (new Set(cameras.map((camera) => camera.name)).size !== cameras.length) throw wrong("camera names", "used once");
   if (cameras.filter((camera) => !camera.heldOut).length < 2) throw wrong("cameras", "at least two not held out");
   const similarity = object(description.similarity, "similarity");
   const dynamic = new Set(list(description.dynamic, "dynamic").map(fieldNameOf));
-  const steps = Object.entries(object(description.steps ?? {}, "steps"));
   return {
     cameras,
     similarity: {
@@ -89,7 +106,7 @@ function headerOf(description: Record<string, unknown>, fields: Fields): StreamH
     dynamic,
     static: selected(fields, (name) => !dynamic.has(name)),
     reference: selected(fields, (name) => dynamic.has(name)),
-    steps: new Map(steps.map(([name, value]) => [name, stepOf(value, `steps.${name}`)])),
+    steps: stepsOf(description.steps, "steps"),
     distanceInput: flag(description.distance_input, "distance_input"),
     config: object(description.config, "config"),
     metadata: object(description.metadata, "metadata"),
@@ -171,6 +188,11 @@ function imageSide(value: unknown): number {
     throw wrong("the side of a picture", `1 to ${MAX_IMAGE_SIDE}`);
   }
   return side;
+}
+
+function stepsOf(value: unknown, what: string): Map<string, number> {
+  const steps = Object.entries(object(value ?? {}, what));
+  return new Map(steps.map(([name, step]) => [name, stepOf(step, `${what}.${name}`)]));
 }
 
 function stepOf(value: unknown, what: string): number {

@@ -50,6 +50,7 @@ test("keys that are not known are ignored", () => {
 
 test.each<[string, (d: Description) => void]>([
   ["coded with 'later'; this version knows 'raw' and 'compact'", (d) => Object.assign(d, { codec: "later" })],
+  ["holds field base_scales as it is, where it should be coded", (d) => Object.assign(d, { codec: "compact" })],
   ["codec must be a text", (d) => Object.assign(d, { codec: 3 })],
   ["fps must be positive", (d) => Object.assign(d, { fps: 0 })],
   ["fps must be a finite number", (d) => Object.assign(d, { fps: "30" })],
@@ -86,6 +87,11 @@ test.each<[string, (d: Description) => void]>([
   ["steps.free_means must be a float32 number", (d) => Object.assign(d.steps, { free_means: 0.1 })],
   ["steps.free_means must be a float32 number", (d) => Object.assign(d.steps, { free_means: 2 ** -65 })],
   ["steps must be an object", (d) => Object.assign(d, { steps: [] })],
+  ["states no step for color_mlp in the init record", (d) => delete d.init_steps.color_mlp],
+  ["states no step for base_scales in the init record", (d) => delete d.init_steps],
+  ["init_steps.color_mlp must be a float32 number", (d) => Object.assign(d.init_steps, { color_mlp: 0.1 })],
+  ["init_steps must be an object", (d) => Object.assign(d, { init_steps: [] })],
+  ["holds field base_scales coded, which its codec does not know", (d) => Object.assign(d, { codec: "raw" })],
   ["no coding for camera_color", (d) => d.dynamic.push("camera_color")],
 ])("a compact header is refused: %s", (message, edit) => {
   expect(compact(edit)).toThrow(message);

@@ -20,6 +20,8 @@ from structgstream.codec.compact import CODABLE, quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.sinks import MemorySink
+from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
+from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 from structgstream.similarity import Similarity
@@ -28,11 +30,14 @@ FOLDER = Path(__file__).parent / "fixtures"
 GROUP = 4
 ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales")
 WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
-STEPS = dict.fromkeys((*ROWS, *WEIGHTS, *FREE_STEPS), 2.0 ** (-9)) | {"offset_scales": float(torch.tensor(0.01))}
+STEPS = dict.fromkeys((*ROWS, *WEIGHTS, *FREE_STEPS), 2.0 ** (-9)) | {
+    "offset_scales": float(torch.tensor(0.01)),
+    "appearance": 2.0**-5,
+}
 
 
 def first_state(
-    anchors: int, *, k: int, features: int, hidden: int, inputs: int, g: torch.Generator
+    anchors: int, *, k: int, features: int, hidden: int, inputs: int, directions: int, g: torch.Generator
 ) -> dict[FieldName, Tensor]:
     """A scene of random numbers without free Gaussians."""
 
@@ -42,8 +47,9 @@ def first_state(
     def head(outputs: int) -> Tensor:
         return numbers(hidden * (inputs + 1) + outputs * (hidden + 1)) / 4
 
-    return {
-        "anchor_positions": numbers(anchors, 3),
+    positions = numbers(anchors, 3)
+    state: dict[FieldName, Tensor] = {
+        "anchor_positions": positions[space_order(positions, step=STEPS["anchor_positions"])],
         "offset_scales": numbers(anchors, 3),
         "base_scales": numbers(anchors, 3),
         "anchor_offsets": numbers(anchors, k, 3),
@@ -55,15 +61,19 @@ def first_state(
         "free_births": torch.zeros(0, dtype=torch.int64),
         "camera_color": numbers(2, 6),
     }
+    if directions:
+        state |= {"appearance": torch.zeros(anchors, directions), "appearance_basis": numbers(directions, features)}
+    return state
 
 
 def next_state(state: dict[FieldName, Tensor], frame: int, g: torch.Generator, *, share: float, born: int) -> None:
     """A share of the anchors moves by some steps, one value far; some free Gaussians die and ``born`` new ones come."""
     moving = torch.rand(len(state["anchor_positions"]), generator=g) < (share if frame else 1)
-    for name in (*ROWS, *WEIGHTS, "free"):
+    names: tuple[FieldName, ...] = (*ROWS, "appearance") if "appearance" in state else ROWS
+    for name in (*names, *WEIGHTS, "free"):
         value = state[name]
-        active = moving if name in ROWS else torch.rand(len(value), generator=g) < 0.8
-        noise = torch.randn(value.shape, generator=g) * 2.0**-8
+        active = moving if name in names else torch.rand(len(value), generator=g) < 0.8
+        noise = torch.randn(value.shape, generator=g) * (2.0**-4 if name == "appearance" else 2.0**-8)
         state[name] = value + torch.where(active.reshape(-1, *[1] * (value.dim() - 1)), noise, 0)
     state["anchor_positions"][frame % len(state["anchor_positions"]), frame % 3] += 1.5 - frame
     alive = torch.rand(len(state["free"]), generator=g) < 0.8
@@ -81,17 +91,20 @@ def header_for(state: dict[FieldName, Tensor], dynamic: frozenset[FieldName], *,
         K_matrix = torch.tensor([[40.0, 0, 24], [0, 40.25, 16], [0, 0, 1]], dtype=torch.float64)
         cameras[name] = Camera(viewmat, K_matrix, 48, 32, near=0.125)
     reference = dynamic - {"free", "free_births"}
+    init_steps: dict[FieldName, float] = {name: STEPS.get(name, 2.0**-6) for name in state if name not in AS_THEY_ARE}
+    static = on_bins({name: value for name, value in state.items() if name not in dynamic}, init_steps)
     return StreamHeader(
         rig=CameraRig(cameras, frozenset({"middle"})),
         similarity=Similarity((0.25, -0.5, 3.0), 0.75),
         fps=30.0,
         codec="compact",
         dynamic=dynamic,
-        static={name: value for name, value in state.items() if name not in dynamic},
+        static=static,
         distance_input=distance_input,
         config={"seed": 7},
         metadata={"capture": "fixture"},
         steps=STEPS,
+        init_steps=init_steps,
         reference=quantised(state, STEPS, reference),
     )
 
@@ -109,7 +122,8 @@ def stream(
     """A whole stream and the scenes that a decoder finds in it; ``wide`` has the network sizes of real scenes."""
     g = torch.Generator().manual_seed(anchors)
     k, features, hidden = (10, 32, 32) if wide else (2, 2, 3)
-    state = first_state(anchors, k=k, features=features, hidden=hidden, inputs=features + 3 + distance_input, g=g)
+    inputs, directions = features + 3 + distance_input, 3 if "appearance" in dynamic else 0
+    state = first_state(anchors, k=k, features=features, hidden=hidden, inputs=inputs, directions=directions, g=g)
     header = header_for(state, dynamic, distance_input=distance_input)
     encoder, sink = SceneEncoder(header), MemorySink()
     sink.open(header)
