@@ -17,6 +17,7 @@ from vectors.generate import COMPACT_EXPECTED, COMPACT_STREAM
 Row = list[int]
 NAMES = {1: "anchor_positions", 2: "offset_scales", 3: "base_scales", 4: "anchor_offsets", 5: "anchor_features"}
 NAMES |= {6: "opacity_mlp", 7: "color_mlp", 8: "covariance_mlp", 9: "free", 10: "free_births", 11: "camera_color"}
+NAMES |= {12: "appearance", 13: "appearance_basis"}
 FREE = [("free_means", 3), ("free_log_scales", 3), ("free_quats", 4), ("free_logit_opacities", 1), ("free_colors", 3)]
 
 
@@ -275,12 +276,76 @@ def values(bins: list[Row], step: float) -> list[float]:
     return [float(np.float32(bin) * np.float32(step)) for row in bins for bin in row]
 
 
+def signed(v: int) -> int:
+    return -(v + 1) // 2 if v % 2 else v // 2
+
+
+def read_positions(fields: Fields) -> list[Row]:
+    """Section Positions."""
+    name = "anchor_positions"
+    m = fields.number(f"{name}.rows")
+    origin = [signed(fields.number(f"{name}.origin")) for _ in range(3)]
+    descends = fields.number(f"{name}.descends")
+    far = fields.naturals(f"{name}.far", [0] * m, 1)
+    near = fields.naturals(f"{name}.near", [int(f != 0) for f in far], 2)
+    key, found = 0, []
+    for v in (f * 2**30 + n for f, n in zip(far, near, strict=True)):
+        key += signed(v) if descends else v
+        place = [sum((key >> 3 * b + a & 1) << b for b in range(20)) for a in range(3)]
+        found.append([p + o for p, o in zip(place, origin, strict=True)])
+    return found
+
+
+def read_anchors(fields: Fields, name: str, before: Row) -> tuple[list[Row], Row]:
+    """Section Rows of anchors: bins, and shifts."""
+    c, m = fields.number(f"{name}.columns"), len(before)
+    shifts = fields.residuals(f"{name}.shift", before, 8)
+    found: list[Row] = [[] for _ in range(m)]
+    seen = [[0, 0] for _ in range(m)]
+    for _ in range(c):
+        middle = signed(fields.number(f"{name}.middle"))
+        contexts = [s * 5 + min((abs(a) + abs(b)).bit_length(), 4) for s, (a, b) in zip(shifts, seen, strict=True)]
+        told = fields.residuals(f"{name}.value", contexts, 40)
+        more = iter(fields.naturals(f"{name}.more", [0] * sum(abs(v) == 7 for v in told), 1))
+        for i, (v, shift) in enumerate(zip(told, shifts, strict=True)):
+            if abs(v) == 7:
+                v += next(more) if v > 0 else -next(more)
+            half = 2 ** (shift - 1) if shift else 0
+            found[i].append((v + (middle + half >> shift)) * 2**shift)
+            seen[i] = [seen[i][1], v]
+    return found, shifts
+
+
+def read_init(data: bytes, steps: dict[str, float]) -> dict[str, tuple[int, list[float]]]:
+    """Section Coded init fields: width of a row, and numbers, by name; and the fields that are not coded."""
+    stored = blocks(data)
+    plain = {name: stored.pop(name)[1] for name in ("camera_color",)}
+    found = {name: (6, [*struct.unpack(f"<{len(raw) // 4}f", raw)]) for name, raw in plain.items()}
+    fields = Fields({name: raw for name, (_, raw) in stored.items()}, {})
+    rows = read_positions(fields)
+    found["anchor_positions"] = 3, values(rows, steps["anchor_positions"])
+    shifts = [0] * len(rows)
+    for code in (2, 3, 4, 5, 12):
+        name = NAMES[code]
+        rows, shifts = read_anchors(fields, name, shifts)
+        found[name] = len(rows[0]), values(rows, steps[name])
+    for code in (6, 7, 8, 13):
+        name = NAMES[code]
+        n = fields.number(f"{name}.count")
+        bins = [signed(v) for v in fields.naturals(f"{name}.value", [0] * n, 1)]
+        found[name] = 1, values([bins], steps[name])
+    assert not any(fields.data.values())
+    return found
+
+
 def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> None:
-    """Section Compact packets: the dynamic fields of every frame."""
+    """Section Compact packets: the fields of every frame."""
     (_, init), *packets, _ = records(data)
     size = int.from_bytes(init[:4], "little")
     header = json.loads(zstandard.ZstdDecompressor().decompress(init[4 : 4 + size]))
-    steps, dynamic, stored = header["steps"], header["dynamic"], blocks(init[4 + size :])
+    steps, dynamic = header["steps"], header["dynamic"]
+    stored = read_init(init[4 + size :], header["init_steps"])
+    static = {name: numbers for name, (_, numbers) in stored.items() if name not in dynamic}
     anchors = [name for code, name in NAMES.items() if code <= 3 and name in dynamic]
     weights = [name for code, name in NAMES.items() if 6 <= code <= 8 and name in dynamic]
     tables: dict[str, list[Row]] = {}
@@ -289,9 +354,7 @@ def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> No
         if kind == 2:
             bins = {}
             for name in (*anchors, *weights):
-                shape, raw = stored[name]
-                numbers = [round(v / steps[name]) for v in struct.unpack(f"<{math.prod(shape)}f", raw)]
-                width = 3 if name in anchors else 1
+                width, numbers = stored[name][0], [round(v / steps[name]) for v in stored[name][1]]
                 bins[name] = [numbers[i : i + width] for i in range(0, len(numbers), width)]
             beside = zip(*(bins[name] for name in anchors), strict=True)
             rows = {"anchors": Rows([[bin for part in row for bin in part] for row in beside])}
@@ -308,7 +371,7 @@ def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> No
             told[name] = values([row[3 * i : 3 * i + 3] for row in rows["anchors"].bins], steps[name])
         step_of = [steps[name] for name, width in FREE for _ in range(width)]
         told["free"] = [values([[bin]], step)[0] for row in rows["free"].bins for bin, step in zip(row, step_of)]
-        emit({**told, "free_births": [float(birth) for birth in births]})
+        emit({**static, **told, "free_births": [float(birth) for birth in births]})
         if kind == 2:
             for kept in rows.values():
                 kept.forget()
@@ -320,6 +383,6 @@ def test_a_decoder_from_the_documents_alone_reads_the_golden_compact_stream() ->
     frames = json.loads(COMPACT_EXPECTED.read_text())["frames"]
     assert len(found) == len(frames) == 6
     for got, frame in zip(found, frames, strict=True):
-        assert got.keys() == {"anchor_positions", "offset_scales", "covariance_mlp", "free", "free_births"}
+        assert got.keys() == set(NAMES.values())
         for name, numbers in got.items():
             assert numbers == frame["fields"][name]["values"], (frame["index"], name)
