@@ -65,7 +65,11 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
     for name in rig.training:
         open_scene = scene_of(state, distance_input=scene.distance_input)
         structured, visible = open_scene.structured(rig[name], backend)
+        used[visible] |= structured.raw_opacities > 0
         image = draw(open_scene.dressed(structured), rig[name], backend).image
+        count += image.numel()
+        if not image.requires_grad:  # It shows nothing.
+            continue
         signs = (torch.randint(0, 2, image.shape, generator=generator) * 2 - 1).to(image)
         found = torch.autograd.grad((image * signs).sum(), [state[field] for field in MEASURED], allow_unused=True)
         for field, gradient in zip(MEASURED, found, strict=True):
@@ -73,8 +77,6 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
                 squares[field] += gradient.square()
                 if field == "anchor_features":
                     products += gradient.double().T @ gradient.double()
-        used[visible] |= structured.raw_opacities > 0
-        count += image.numel()
     for value in (*squares.values(), products):
         value /= max(count, 1)
     return Sensitivity(squares, products, used)
