@@ -198,7 +198,7 @@ def delta_bytes(rate_weight: float) -> int:
 
 
 def test_a_higher_price_makes_fewer_bytes() -> None:
-    sizes = [delta_bytes(weight) for weight in (0.0, 1e-2, 1.0)]
+    sizes = [delta_bytes(weight) for weight in (0.0, 1e-3, 1.0)]
     assert sizes[2] < sizes[1] < sizes[0]
 
 

@@ -2,6 +2,7 @@
 """Every command on a tiny stream of the bundled clip, and what they say when something is wrong."""
 
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -96,6 +97,7 @@ def test_inspect_lists_header_and_packets(stream: Path, tmp_path: Path, capsys: 
     assert header["complete"]
     assert header["config"]["initial"]["iterations"] == 3
     assert header["cameras"]["cam00"]["held_out"]
+    assert header["fields"]["base_scales"]["bytes"] == 4 * math.prod(header["fields"]["base_scales"]["shape"]) + 12
     assert header["metadata"] == {"capture": "clip", "preset": "tiny", "start": 0, "scale": 0.25}
     assert [packet["kind"] for packet in content["packets"]] == ["key", "delta", "delta"]
     assert set(content["packets"][0]) == {"kind", "index", "pts_seconds", "offset", "bytes", "fields"}

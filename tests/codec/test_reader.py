@@ -46,6 +46,9 @@ def test_bytes_are_all_accounted_for() -> None:
     index = 8 + 4 * 13 + 4 + 16
     assert reader.header_bytes + sum(info.bytes for info in reader.packets) + index == reader.total_bytes == len(data)
     assert all(info.bytes == sum(info.field_bytes.values()) + 12 + 8 + 4 for info in reader.packets)
+    (described,) = struct.unpack_from("<I", data, 12 + 8)
+    assert reader.header_field_bytes.keys() == reader.header.static.keys()
+    assert reader.header_bytes == 12 + 8 + 4 + described + sum(reader.header_field_bytes.values()) + 4
 
 
 def test_a_stream_cut_at_any_byte_plays_up_to_the_cut() -> None:

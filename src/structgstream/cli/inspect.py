@@ -69,9 +69,9 @@ def described(reader: "StreamReader") -> dict[str, Any]:
         }
         for name, camera in header.rig.cameras.items()
     }
-    static = {
-        name: {"shape": list(tensor.shape), "bytes": tensor.numel() * tensor.element_size()}
-        for name, tensor in header.static.items()
+    fields = {
+        name: {"shape": list(tensor.shape), "bytes": reader.header_field_bytes[name]}
+        for name, tensor in {**header.static, **header.reference}.items()
     }
     packets = [
         {
@@ -95,7 +95,7 @@ def described(reader: "StreamReader") -> dict[str, Any]:
             "total_bytes": reader.total_bytes,
             "similarity": {"center": list(header.similarity.center), "scale": header.similarity.scale},
             "dynamic": sorted(header.dynamic),
-            "static": static,
+            "fields": fields,
             "distance_input": header.distance_input,
             "cameras": cameras,
             "config": dict(header.config),
@@ -118,7 +118,8 @@ def _facts(content: dict[str, Any]) -> Table:
     table.add_row("frames", f"{len(packets)} at {header['fps']:g} a second, {seconds:.2f} s")
     table.add_row(*plain("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}"))
     table.add_row("size", f"{human_bytes(header['total_bytes'])}, header {human_bytes(header['header_bytes'])}")
-    table.add_row("static", ", ".join(f"{n} {human_bytes(f['bytes'])}" for n, f in header["static"].items()) or "-")
+    fields = ", ".join(f"{name} {human_bytes(field['bytes'])}" for name, field in header["fields"].items())
+    table.add_row("in the header", fields or "-")
     table.add_row("dynamic", ", ".join(header["dynamic"]))
     table.add_row("state", "complete" if header["complete"] else f"not finished: {header['cut_reason']}")
     return table

@@ -13,7 +13,7 @@ from torch import Tensor
 from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.blocks import coded_block, mixed_blocks, packed_block
+from structgstream.codec.blocks import blocks_in, coded_block, mixed_blocks, packed_block
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.shapes import check_shapes
 from structgstream.codec.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
@@ -96,6 +96,13 @@ def unpacked_header(payload: bytes) -> StreamHeader:
         where="The init record",
     )
     return header
+
+
+def field_bytes_of(payload: bytes) -> dict[FieldName, int]:
+    """What each field takes in an init record's payload, which must be one that :func:`unpacked_header` reads."""
+    (length,) = LENGTH.unpack_from(payload)
+    blocks = blocks_in(payload, LENGTH.size + length, where="The init record")
+    return {block.name: block.end - block.start for block in blocks}
 
 
 def _complete(names: Set[FieldName]) -> bool:

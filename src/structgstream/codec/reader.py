@@ -17,7 +17,7 @@ from typing import overload
 
 from structgstream.codec.blocks import blocks_in
 from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
-from structgstream.codec.header import unpacked_header
+from structgstream.codec.header import field_bytes_of, unpacked_header
 from structgstream.codec.index import indexed_offsets
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.records import (
@@ -114,6 +114,8 @@ class StreamReader:
 
     Attributes:
         header: what the init record says.
+        header_bytes: where the first packet begins.
+        header_field_bytes: of these, what each field takes.
         packets: every whole packet before the first cut or damage, in order.
         complete: whether the index was written, so that the run that made the stream had come to its end.
         cut_reason: what stopped reading otherwise.
@@ -136,6 +138,7 @@ class StreamReader:
             raise StreamError(f"{name} begins with a record of type {init.type}; an init record was expected.")
         self.header = unpacked_header(init.payload)
         self.header_bytes = end = init.end
+        self.header_field_bytes = field_bytes_of(init.payload)
         offsets = indexed_offsets(data, end) if by_index else None
         if offsets is not None:
             self.packets.offsets = offsets
