@@ -71,7 +71,8 @@ def described(reader: "StreamReader") -> dict[str, Any]:
     }
     fields = {
         name: {"shape": list(tensor.shape), "bytes": reader.header_field_bytes[name]}
-        for name, tensor in {**header.static, **header.reference}.items()
+        for part in (header.static, header.reference)
+        for name, tensor in part.items()
     }
     packets = [
         {
