@@ -161,8 +161,8 @@ def measured_fps(tracks: Mapping[str, VideoTrack]) -> float | None:
             continue
         if track.stamps[-1] == track.stamps[0]:
             raise CaptureError(
-                f"The {len(track.stamps)} frames of the video {track.path} all have the same time stamp, so they cannot "
-                "be matched with other cameras; write it again with the time of each frame."
+                f"The {len(track.stamps)} frames of the video {track.path} all have the same time stamp, so they "
+                "cannot be matched with other cameras; write it again with the time of each frame."
             )
         steps = np.diff(track.stamps)
         frames = np.rint(steps / max(float(np.median(steps)), 1.0)).sum()
