@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
-from structgstream.data.video import VideoSource, measured_fps, scan_videos, synchronised
+from structgstream.data.video import VideoSource, VideoTrack, measured_fps, scan_videos, synchronised
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 
 RIG = small_rig(3)
@@ -105,6 +105,13 @@ def test_no_frames_in_common(tmp_path: Path) -> None:
     rewrite(tmp_path, "cam01", [20, 21, 22])
     with pytest.raises(CaptureError, match=r"no frames in common: .*'cam01' starts with the instant 0\.667 s"):
         read(tmp_path)
+
+
+def test_frames_of_one_time_are_refused() -> None:
+    """As some tools write them; the rate would be infinite."""
+    track = VideoTrack(Path("cam00.mp4"), (7, 7, 7), 1 / 30, 64, 48)
+    with pytest.raises(CaptureError, match="The 3 frames of the video cam00.mp4 all have the same time stamp"):
+        measured_fps({"cam00": track})
 
 
 def test_rate_is_measured_from_the_time_stamps(tmp_path: Path) -> None:

@@ -111,6 +111,15 @@ def test_methods_side_by_side_in_the_order_of_the_titles() -> None:
     ]
 
 
+def test_every_tenth_frame_has_no_temporal_scores() -> None:
+    scores = {"e_warp": 1e-3, "flicker": 1.5}
+    found = [outcome("a", mean=scores), outcome("b", mean=scores, capture={"every": 10})]
+    sheet = comparison_sheet(found, titles={"a": "A", "b": "B"}, scores=COMPARED)
+    assert column(sheet, "E_warp, 1e-3") == {"A": "1.000", "B": "-"}
+    assert column(sheet, "flicker, 1/255") == {"A": "1.500", "B": "-"}
+    assert column(sheet, "PSNR, dB") == {"A": "30.00", "B": "30.00"}
+
+
 def test_a_score_is_written_in_its_unit_with_its_digits() -> None:
     assert written(Spread(1.2345e6, 0.0, 1), "online_bytes") == "1.23"
     assert written(Spread(1.2345e6, 0.04e6, 3), "online_bytes") == "1.23 ± 0.04"

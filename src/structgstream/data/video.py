@@ -150,11 +150,20 @@ def synchronised(
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack]) -> float | None:
-    """Frames a second by time stamp: robust to missing frames, exact for usual rates, None for one frame."""
+    """Frames a second by time stamp: robust to missing frames, exact for usual rates, None for one frame.
+
+    Raises:
+        CaptureError: the frames of a video all have one time.
+    """
     rates = []
     for track in tracks.values():
         if len(track.stamps) < 2:
             continue
+        if track.stamps[-1] == track.stamps[0]:
+            raise CaptureError(
+                f"The {len(track.stamps)} frames of the video {track.path} all have the same time stamp, so they "
+                "cannot be matched with other cameras; write it again with the time of each frame."
+            )
         steps = np.diff(track.stamps)
         frames = np.rint(steps / max(float(np.median(steps)), 1.0)).sum()
         rates.append(float(frames) / ((track.stamps[-1] - track.stamps[0]) * track.tick_seconds))

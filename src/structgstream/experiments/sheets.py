@@ -48,6 +48,8 @@ SCORES: Mapping[str, Score] = {
     "online_cpu_seconds": Score("core-s a frame", 1, better=-1),
     "first_cpu_seconds": Score("frame 0, core-s", 0, better=-1),
 }
+TEMPORAL = frozenset({"drift_db_per_frame", "e_warp", "t_lpips", "temporal_flip", "flicker"})
+"""Scores of one frame after another; of every tenth frame they would be of something else."""
 PAPER_SCORES: Mapping[str, str] = {"online_free_bytes": "free_bytes"}
 """Where the paper's figure has another key than ours."""
 
@@ -92,11 +94,18 @@ def ablation_sheet(table: AblationTable, results: Iterable[Result], *, titles: M
 
 
 def comparison_sheet(results: Iterable[Result], *, titles: Mapping[str, str], scores: Sequence[str]) -> Sheet:
-    """Methods side by side: mean over seeds and spread of each score that at least one of them has."""
+    """Methods side by side: mean over seeds and spread of each score that at least one of them has.
+
+    Methods that were run on some frames only have no temporal scores.
+    """
     found = summaries(results)
     shown = [name for name in scores if any(summary.score(name) is not None for summary in found.values())]
     keys = [key for key in titles if key in found]
-    rows = [[titles[key], str(len(found[key].results)), *(_cell(found[key], name) for name in shown)] for key in keys]
+    rows = []
+    for key in keys:
+        thinned = any(result.identity["capture"]["every"] > 1 for result in found[key].results.values())
+        cells = ["-" if thinned and name in TEMPORAL else _cell(found[key], name) for name in shown]
+        rows.append([titles[key], str(len(found[key].results)), *cells])
     return Sheet("Methods", ["method", "seeds", *(SCORES[name].title for name in shown)], rows)
 
 
