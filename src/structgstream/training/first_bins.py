@@ -147,14 +147,13 @@ def first_bins(
         voxel_size: the grid of the anchors.
         steps: of what changes later: what the frames after this one round to.
     """
-    config, state = config.resolved(), state_of(scene)
+    plain, state = config.resolved(), state_of(scene)
     used = sensitivity.used[..., None].expand_as(state["anchor_offsets"])
     counted = {"anchor_offsets": used}
     numbers = sum(
         int((worth > 0).logical_and(counted.get(name, worth > 0)).sum()) for name, worth in sensitivity.fields.items()
     )
     # A step has the error of its square over twelve; all numbers have the same.
-    plain = config.resolved()
     most = plain.first_noise_levels / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
     found: dict[FieldName, float] = {"anchor_positions": float32(voxel_size)}
     state["anchor_positions"] = rounded(state["anchor_positions"], found["anchor_positions"])
