@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from torch import Tensor
-
 from structgstream.beginning import begun, frame_seed, initial_points_of
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink
@@ -24,7 +22,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, on_device
 from structgstream.similarity import normalising_similarity
 from structgstream.training.initial import fit_first_frame
-from structgstream.training.online import fit_next_frame
+from structgstream.training.online import fit_next_frame, remembers
 from structgstream.training.result import FitResult, StepListener
 
 
@@ -62,12 +60,6 @@ class _Past:
     scene: Scene | None = None
     older: Scene | None = None
     frame: MultiViewFrame | None = None
-
-    @property
-    def last_motion(self) -> Tensor | None:
-        if self.scene is None or self.older is None:
-            return None
-        return self.scene.anchors.positions - self.older.anchors.positions
 
 
 class Session:
@@ -145,7 +137,7 @@ class Session:
                 controller.add(info.bytes, info.kind)
             for packet in self._resumed.group(start - 1) if start else ():
                 past.scene = encoder.follow(packet)
-            if online.motion_prior and start > 1:
+            if remembers(online) and start > 1:
                 past.older = self._resumed.scene(start - 2)
         if start >= len(self._source):
             return
@@ -183,7 +175,7 @@ class Session:
             scene = encoded.reconstruction
             past = _Past(
                 scene,
-                older=past.scene if online.motion_prior else None,
+                older=past.scene if remembers(online) else None,
                 frame=frame if online.motion.enabled else None,
             )
             coded = time.perf_counter()
@@ -242,8 +234,9 @@ class Session:
                 seed=seed,
                 on_step=self._on_step,
             )
+        device = self._backend.device
         return fit_next_frame(
-            on_device(past.scene, self._backend.device),
+            on_device(past.scene, device),
             frame,
             self._rig,
             config=pressed(self._config.online, pressure),
@@ -251,6 +244,6 @@ class Session:
             seed=seed,
             before=past.frame,
             steps=steps,
-            last_motion=past.last_motion,
+            older=None if past.older is None else on_device(past.older, device),
             on_step=self._on_step,
         )

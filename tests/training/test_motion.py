@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import torch
 
+from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.scene.scene import Scene
+from structgstream.training.motion import MotionConfig, changed_since, moving_parts
 from structgstream.training.views import training_views
 from worlds import moving_world
 
@@ -49,3 +51,37 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
         shown = found.shown[view.index]
         assert 0 < shown.sum() < drawn.sum()  # Some are hidden behind others.
         assert not shown[~drawn].any()
+
+
+def test_what_moved_before_moves_more_easily() -> None:
+    strict = replace(CONFIG, least_share=0.9, moved_ease=0.2)
+    views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
+
+    def found(older: Scene | None) -> torch.Tensor:
+        return moving_parts(
+            WORLD.scene, views, earlier, config=strict, backend=reference_backend(), older=older
+        ).anchors
+
+    shift = torch.zeros_like(WORLD.scene.anchors.positions)
+    shift[:20] = 0.01
+    anchors = replace(WORLD.scene.anchors, positions=WORLD.scene.anchors.positions - shift)
+    moved, first = found(replace(WORLD.scene, anchors=anchors)), found(None)
+    assert torch.equal(found(WORLD.scene), first), "nothing moved before"
+    assert moved[:20].sum() > first[:20].sum()
+    assert torch.equal(moved[20:], first[20:])
+
+
+def test_what_changed_is_told_by_row_and_by_birth() -> None:
+    older = random_scene(6, free=4)
+    births = torch.tensor([1, 4, 6, 9])
+    older = replace(older, free=replace(older.free, births=births))
+    assert not changed_since(older, older).any()
+    scales = older.anchors.log_base_scales.clone()
+    scales[3, 2] += 0.1
+    # One died, one is new, one has another colour.
+    free = older.free.select(torch.tensor([0, 2, 3]))
+    colors = free.colors.clone()
+    colors[2] += 0.1
+    free = replace(free, colors=colors).append(replace(free.select(torch.tensor([0])), births=torch.tensor([12])))
+    scene = replace(older, anchors=replace(older.anchors, log_base_scales=scales), free=free)
+    assert changed_since(older, scene).nonzero()[:, 0].tolist() == [3, 6 + 2, 6 + 3]

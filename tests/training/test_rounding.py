@@ -72,7 +72,7 @@ def test_every_field_follows_the_quality() -> None:
     plain, resolved = RoundingConfig(quality=1.0), RoundingConfig(quality=1.0).resolved()
     assert resolved.quality == 0.0
     assert resolved.resolved() == resolved
-    others = {field.name for field in fields(plain)} - {"quality", "rate_weight"}
+    others = {field.name for field in fields(plain)} - {"quality", "rate_weight", "free_priced"}
     assert all(getattr(resolved, name) == getattr(plain, name) / 2 for name in others)
 
 
@@ -91,7 +91,7 @@ def test_a_pixel_is_as_large_as_it_is_seen() -> None:
 def test_leaving_a_bin_has_a_price() -> None:
     parameters = Parameters.of(random_scene(10), trained=parameters_of_fields({"anchor_positions", "offset_scales"}))
     steps = {"anchor_positions": 0.5, "offset_scales": 0.25, "covariance_mlp": 0.1}
-    rate = Rate.of(parameters, steps, weight=0.5)  # type: ignore[arg-type]
+    rate = Rate.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
     assert rate is not None
     assert rate.price(parameters.values).item() == 0.0
     values = dict(parameters.values)
@@ -105,7 +105,24 @@ def test_leaving_a_bin_has_a_price() -> None:
     assert (gradient > 0).all(), "it pulls back"
 
 
+def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
+    scene = random_scene(10, free=6)
+    parameters = Parameters.of(scene, trained=parameters_of_fields({"free"}))
+    steps: dict = {"free_means": 0.5, "free_colors": 0.1}
+    assert Rate.of(parameters, steps, weight=1.0, free=False) is None
+    rate = Rate.of(parameters, steps, weight=1.0, free=True)
+    assert rate is not None
+    keep = torch.tensor([True, False, True, True, False, True])
+    rate, old = rate.kept(keep), parameters.values["free_means"]
+    values: dict = {name: value.detach()[keep] for name, value in parameters.values.items() if name in steps}
+    values["free_means"] = torch.cat([values["free_means"], old[:3].detach() + 7.0])
+    values["free_colors"] = torch.cat([values["free_colors"], values["free_colors"][:3]])
+    assert rate.price(values).item() == 0.0
+    values["free_means"][2, 1] += 1.5  # Two bits for one of ten anchors.
+    assert rate.price(values).item() == pytest.approx(2.0 / 10, rel=1e-4)
+
+
 @pytest.mark.parametrize(("steps", "weight"), [({}, 1.0), ({"covariance_mlp": 0.1}, 1.0), ({"base_scales": 0.1}, 0.0)])
 def test_no_price_where_nothing_is_paid(steps: dict, weight: float) -> None:
     parameters = Parameters.of(random_scene(3), trained=parameters_of_fields({"anchor_positions"}))
-    assert Rate.of(parameters, steps, weight=weight) is None
+    assert Rate.of(parameters, steps, weight=weight, free=True) is None

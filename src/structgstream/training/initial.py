@@ -10,6 +10,7 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.training.densify import Densifier
+from structgstream.training.disturbance import DisturbanceConfig, disturbance_at
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, Rate, constant
@@ -60,6 +61,7 @@ class InitialConfig:
     coarse_scale: float = 0.5
     schedule_iterations: int = 30_000
     """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
+    disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
@@ -148,6 +150,7 @@ def fit_first_frame(
             voxel_size=config.voxel_size,
             track_screen=collects,
             watch=watch,
+            disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
         )
         gradients, screen_gradient = gradients_of(loss, parameters, watch)
         if iteration > config.iterations - len(views):

@@ -34,6 +34,9 @@ class MotionConfig:
     """... and so large a part of what it covers."""
     least_views: int = 2
     """Votes that let an anchor, or a free Gaussian, move: one picture cannot tell motion from noise."""
+    moved_ease: float = 1.0
+    """What the last frame changed needs only so many times the pixels and the share: what moves comes to rest in more
+    than a frame, and what is at the edge of a change does not stutter. 1: no memory."""
     picture_scale: float = 0.25
     """Who covers what is found on pictures of this size."""
     margin_pixels: int = 8
@@ -63,12 +66,47 @@ class Moving:
     shown: dict[int, Tensor]
 
 
+def changed_since(older: Scene, scene: Scene) -> Tensor:
+    """Mask ``[M + F]``, anchors before free Gaussians, of what ``scene`` has otherwise than ``older`` or not at all."""
+
+    def differs(name: str, now: object, then: object) -> Tensor:
+        changed = getattr(now, name) != getattr(then, name)
+        return changed if changed.dim() == 1 else changed.any(1)
+
+    rows = ("positions", "log_offset_scales", "log_base_scales", "appearance")
+    anchors = torch.stack([differs(name, scene.anchors, older.anchors) for name in rows]).any(0)
+    free = torch.ones_like(scene.free.births, dtype=torch.bool)
+    was = torch.isin(scene.free.births, older.free.births)
+    now, then = scene.free.select(was), older.free.select(torch.isin(older.free.births, scene.free.births))
+    columns = ("means", "log_scales", "quats", "logit_opacities", "colors")
+    free[was] = torch.stack([differs(name, now, then) for name in columns]).any(0)
+    return torch.cat([anchors, free])
+
+
 def moving_parts(
-    scene: Scene, views: Sequence[View], before: Sequence[View], *, config: MotionConfig, backend: Backend
+    scene: Scene,
+    views: Sequence[View],
+    before: Sequence[View],
+    *,
+    config: MotionConfig,
+    backend: Backend,
+    older: Scene | None = None,
 ) -> Moving:
-    """What may move between the pictures ``before`` and those of ``views`` (same cameras, same order)."""
+    """What may move between the pictures ``before`` and those of ``views`` (same cameras, same order).
+
+    Args:
+        scene: as it was in the pictures ``before``.
+        views: of the frame.
+        before: of the frame before.
+        config: what counts as moving.
+        backend: what computes.
+        older: the scene a frame earlier, for ``moved_ease``; None for none.
+    """
     k, anchors, free = scene.anchors.offsets_per_anchor, len(scene.anchors), len(scene.free)
     votes = torch.zeros(anchors + free, device=scene.anchors.positions.device)
+    ease = torch.ones_like(votes)
+    if older is not None:
+        ease[changed_since(older, scene)] = config.moved_ease
     shown: dict[int, Tensor] = {}
     with torch.no_grad():
         for view, last in zip(views, before, strict=True):
@@ -79,7 +117,7 @@ def moving_parts(
             # The K Gaussians of an anchor vote together: it moves as one.
             structured, single = weights[: anchors * k].reshape(anchors, k, 2), weights[anchors * k :]
             total, part = torch.cat([structured.sum(1), single]).unbind(1)
-            votes += (part > config.least_pixels) & (part > config.least_share * total)
+            votes += (part > config.least_pixels * ease) & (part > config.least_share * ease * total)
             shown[view.index] = weights[:, 0] > config.least_pixels
     enough = votes >= config.least_views
     return Moving(enough[:anchors], enough[anchors:], shown)

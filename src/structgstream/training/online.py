@@ -20,29 +20,23 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, without_waiting
 from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.focus import Focus
-from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
-    FREE_ROWS,
     ParameterName,
     Parameters,
     detached,
     parameters_of_fields,
 )
 from structgstream.training.partition import Partition, focuses
-from structgstream.training.patching import (
-    PatchingConfig,
-    children_of,
-    gaussians_by_id,
-    parents_of,
-    surviving,
-)
+from structgstream.training.patching import PatchingConfig
+from structgstream.training.population import patched
 from structgstream.training.result import FitResult, Step, StepListener
 from structgstream.training.rounding import Rate, RoundingConfig
+from structgstream.training.settling import Settling
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import LastPass, gradients_of, view_loss
 from structgstream.training.stopwatch import Stopwatch
@@ -87,6 +81,9 @@ class OnlineConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     motion_prior: float = 0.0
     """Anchors that move begin a frame this share of their last step further on (the paper: 0, where they are)."""
+    least_gain: float = 0.0
+    """A frame ends, and patching comes, early when its views gain less than this share of their loss from one look to
+    the next (the paper: 0, never)."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
 
 
@@ -124,7 +121,7 @@ def fit_next_frame(
     seed: int,
     before: MultiViewFrame | None = None,
     steps: Mapping[str, float] | None = None,
-    last_motion: Tensor | None = None,
+    older: Scene | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult:
     """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
@@ -137,7 +134,7 @@ def fit_next_frame(
         backend: what computes.
         seed: all randomness comes from it, so a frame can be repeated alone.
         steps: of what is sent rounded (Note [Bins]); what it names is drawn rounded and comes back so.
-        last_motion: ``[M, 3]`` the anchors' last step, scene units, for ``config.motion_prior``; None for none.
+        older: the decoded scene two frames before, for what has a memory (:func:`remembers`); None for none.
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
@@ -150,11 +147,14 @@ def fit_next_frame(
     def fitted(stepping: Backend) -> FitResult:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
         fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
-        ahead = None if last_motion is None else config.motion_prior * last_motion.to(scene.anchors.positions)
+        ahead = None
+        if older is not None and config.motion_prior:
+            ahead = config.motion_prior * (scene.anchors.positions - older.anchors.positions)
         if earlier is None:
             return fit.run(scene, views, ahead=ahead)
         with watch.stage("find motion"):
-            which = moving_parts(scene, views, earlier, config=config.motion, backend=backend)
+            motion = config.motion
+            which = moving_parts(scene, views, earlier, config=motion, backend=backend, older=older)
             partition = Partition.of(scene, which)
         ahead = None if ahead is None else ahead[which.anchors]
         result = fit.run(partition.moving, views, partition=partition, ahead=ahead)
@@ -168,6 +168,11 @@ def fit_next_frame(
         capacity=max(1 << 18, 8 * _slots(scene)),
         device=backend.device,
     )
+
+
+def remembers(config: OnlineConfig) -> bool:
+    """Whether a frame is fitted after the two before it, instead of one."""
+    return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
 
 
 def _is_full(motion: MotionConfig, frame_index: int) -> bool:
@@ -205,15 +210,18 @@ class _Fit:
         trained = parameters_of_fields(dynamic)
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(scene, trained=trained, steps=steps)
-        rate = Rate.of(parameters, steps, weight=config.rounding.resolved().rate_weight)
+        rounding = config.rounding.resolved()
+        rate = Rate.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
         if ahead is not None and "anchor_positions" in trained:  # What a step costs is counted from the last frame.
             parameters.values["anchor_positions"].data += ahead
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
+        settling = Settling(config.least_gain, len(seen))
         tells_every = 1 if self.backend.device.type == "cpu" else 10  # Asking a GPU for the loss waits for it.
-        spawned = pruned = 0
-        for iteration in range(1, iterations + 1):
+        spawned = pruned = iteration = 0
+        while iteration < iterations and not (iteration > patch_at and settling.settled):
+            iteration += 1
             view = next(order)
             loss = view_loss(
                 parameters.scene(scene),
@@ -225,10 +233,13 @@ class _Fit:
                 watch=watch,
                 focus=None if places is None else places[view.index],
             )
+            settling.add(view.index, loss.total)
+            if iteration < patch_at and settling.settled:
+                patch_at = iteration
             if rate is not None:
                 loss = replace(loss, total=loss.total + rate.price(parameters.values))
             gradients, screen_gradient = gradients_of(loss, parameters, watch)
-            if iteration > iterations - len(seen):
+            if config.least_gain or iteration > iterations - len(seen):
                 last_pass.add(loss, view)
             with watch.stage("optimise"):
                 adam.step(parameters, gradients, online_rates(config, (iteration - 1) / iterations))
@@ -237,7 +248,7 @@ class _Fit:
             if iteration == patch_at and "free" in config.dynamic:
                 with watch.stage("patch"), torch.no_grad():
                     others = [other for other in seen if other.index != view.index]
-                    spawned, pruned = _patch(
+                    survivors, spawned = patched(
                         parameters,
                         adam,
                         scene=scene,
@@ -249,12 +260,15 @@ class _Fit:
                         backend=self.backend,
                         generator=self.generator,
                     )
+                    pruned = int((~survivors).sum())
+                    rate = None if rate is None else rate.kept(survivors)
+                settling.begin_again()
             if self.on_step is not None and iteration % tells_every == 0:
                 free = parameters.values["free_means"].shape[0] + still_free
                 self.on_step(Step(iteration, iterations, float(loss.total.detach()), len(scene.anchors), free))
         return FitResult(
             scene=detached(parameters.scene(scene)),
-            iterations=iterations,
+            iterations=iteration,
             train_psnr=last_pass.psnr,
             moving=len(scene.anchors),
             spawned=spawned,
@@ -271,48 +285,6 @@ class _Fit:
 def _slots(scene: Scene) -> int:
     """Number of ids in a scene (Note [Ids])."""
     return len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
-
-
-def _patch(
-    parameters: Parameters,
-    adam: Adam,
-    *,
-    scene: Scene,
-    statistics: GradientStatistics,
-    views: list[View],
-    frame_index: int,
-    room: int,
-    config: PatchingConfig,
-    backend: Backend,
-    generator: torch.Generator,
-) -> tuple[int, int]:
-    """Prune and spawn free Gaussians; returns how many were added and removed."""
-    current = parameters.scene(scene)
-    keep = surviving(current.free, config)
-    ids = parents_of(
-        statistics.mean(),
-        statistics.count,
-        room=room - int(keep.sum()),
-        config=config,
-        generator=generator,
-    )
-    parents = gaussians_by_id(current, views, ids, backend)
-    children = children_of(parents, frame_index=frame_index, config=config, generator=generator)
-    added = _free_rows(children)
-    parameters.births = torch.cat([parameters.births[keep], children.births])
-    parameters.replace_rows(FREE_ROWS, keep=keep, added=added)
-    adam.replace_rows(FREE_ROWS, keep=keep, added=len(children))
-    return len(children), int((~keep).sum())
-
-
-def _free_rows(free: FreeGaussians) -> dict[ParameterName, Tensor]:
-    return {
-        "free_means": free.means,
-        "free_log_scales": free.log_scales,
-        "free_quats": free.quats,
-        "free_logit_opacities": free.logit_opacities,
-        "free_colors": free.colors,
-    }
 
 
 def without_patching(config: OnlineConfig) -> OnlineConfig:

@@ -9,7 +9,7 @@ bins is exact and nothing drifts.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from structgstream.training.parameters import ParameterName, Parameters
 
 ANCHOR_FIELDS: "tuple[ParameterName, ...]" = ("anchor_positions", "offset_scales", "base_scales", "appearance")
+FREE_FIELDS: "tuple[ParameterName, ...]" = (
+    "free_means",
+    "free_log_scales",
+    "free_quats",
+    "free_logit_opacities",
+    "free_colors",
+)
 
 
 class _Rounded(torch.autograd.Function):
@@ -59,14 +66,18 @@ class RoundingConfig:
     """Of the weights of MLPs in frame 0."""
     rate_weight: float = 1e-4
     """Weight in the loss of the bits of a moving anchor."""
+    free_priced: bool = False
+    """Whether a bit of a free Gaussian that was there before costs as much."""
     quality: float = 0.0
     """One knob over all of the above: 1 more makes every step half as large, and a bit a quarter as dear."""
 
     def resolved(self) -> "RoundingConfig":
         """The same, with the quality put into the other fields and itself 0."""
-        finer = {field.name: getattr(self, field.name) * 2.0**-self.quality for field in fields(self)}
+        kept = ("rate_weight", "free_priced", "quality")
+        steps = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in kept}
+        finer = {name: step * 2.0**-self.quality for name, step in steps.items()}
         # Errors grow with the square of a step.
-        return RoundingConfig(**finer | {"rate_weight": self.rate_weight * 4.0**-self.quality, "quality": 0.0})
+        return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
 
     def steps(self, pixel: float) -> dict[str, float]:
         """The step of everything that can change, by name; ``pixel`` is what one covers, in units of the scene."""
@@ -114,24 +125,38 @@ class Rate:
         weight: of the mean number of bits of an anchor in the loss.
         before: the last frame's values by name.
         steps: the steps by name.
+        rows: anchors that may move: what bits are counted by.
     """
 
     weight: float
     before: "Mapping[ParameterName, Tensor]"
     steps: "Mapping[ParameterName, float]"
+    rows: int
 
     @classmethod
-    def of(cls, parameters: "Parameters", steps: "Mapping[ParameterName, float]", *, weight: float) -> "Rate | None":
-        """The price of leaving what ``parameters`` are now; None for nothing."""
-        paid: dict[ParameterName, float] = {name: steps[name] for name in ANCHOR_FIELDS if name in steps}
+    def of(
+        cls, parameters: "Parameters", steps: "Mapping[ParameterName, float]", *, weight: float, free: bool
+    ) -> "Rate | None":
+        """The price of leaving what ``parameters`` are now; None for nothing.
+
+        With ``free`` a free Gaussian's bit costs what an anchor's does, else nothing.
+        """
+        names = (*ANCHOR_FIELDS, *FREE_FIELDS) if free else ANCHOR_FIELDS
+        paid: dict[ParameterName, float] = {name: steps[name] for name in names if name in steps}
         if not paid or weight <= 0.0:
             return None
-        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid)
+        rows = len(parameters.values["anchor_positions"])
+        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
+
+    def kept(self, keep: Tensor) -> "Rate":
+        """The price after free Gaussians without the mask ``keep`` have died; what is born behind them has none."""
+        before = {name: value[keep] if name in FREE_FIELDS else value for name, value in self.before.items()}
+        return replace(self, before=before)
 
     def price(self, values: "Mapping[ParameterName, Tensor]") -> Tensor:
-        """log2(1 + distance in bins), summed over an anchor, a mean over anchors, weighted."""
+        """log2(1 + distance in bins), summed, divided by the number of anchors, weighted."""
         bits = [
-            torch.log2(1.0 + (values[name] - self.before[name]).abs() / step).sum() / max(len(self.before[name]), 1)
+            torch.log2(1.0 + (values[name][: len(self.before[name])] - self.before[name]).abs() / step).sum()
             for name, step in self.steps.items()
         ]
-        return self.weight * torch.stack(bits).sum()
+        return self.weight / max(self.rows, 1) * torch.stack(bits).sum()

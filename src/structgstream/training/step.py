@@ -2,11 +2,13 @@
 """One view's loss: what both kinds of frame do in every iteration."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import pixels_of_tiles
@@ -57,11 +59,16 @@ def view_loss(
     track_screen: bool,
     watch: Stopwatch,
     focus: Focus | None = None,
+    disturbed: Callable[[Gaussians], Gaussians] | None = None,
 ) -> ViewLoss:
-    """Render ``view`` and compare it with its picture (paper, equations for L and L_init), or what ``focus`` names."""
+    """Render ``view`` and compare it with its picture (paper, equations for L and L_init), or what ``focus`` names.
+
+    What is drawn is ``disturbed``, if that is given.
+    """
     with watch.stage("generate"):
         structured, visible = scene.structured(view.camera, backend, tiles=None if focus is None else focus.tiles)
         gaussians = scene.dressed(structured)
+        gaussians = gaussians if disturbed is None else disturbed(gaussians)
     with watch.stage("rasterise"):
         rendering = draw(gaussians, view.camera, backend, track_screen=track_screen, focus=focus)
     with watch.stage("loss"):
@@ -106,22 +113,24 @@ class LastPass:
     """Mean loss terms and PSNR over the last pass through the cameras. Numbers are read when they are asked for."""
 
     def __init__(self) -> None:
-        self._terms: dict[str, list[Tensor]] = {}
-        self._squared_errors: list[Tensor] = []
+        self._terms: dict[int, dict[str, Tensor]] = {}
+        self._squared_errors: dict[int, Tensor] = {}
 
     def add(self, loss: ViewLoss, view: View) -> None:
-        """Note one view's result."""
-        self._squared_errors.append(loss.squared_error(view))
-        for name, value in loss.terms.items():
-            self._terms.setdefault(name, []).append(value.detach())
+        """Note one view's result, in place of what was noted of it before."""
+        self._squared_errors[view.index] = loss.squared_error(view)
+        self._terms[view.index] = {name: value.detach() for name, value in loss.terms.items()}
 
     @property
     def psnr(self) -> float:
         """Mean over views of the PSNR in dB, NaN before any view."""
-        values = [-10.0 * math.log10(max(float(error), 1e-10)) for error in self._squared_errors]
+        values = [-10.0 * math.log10(max(float(error), 1e-10)) for error in self._squared_errors.values()]
         return sum(values) / len(values) if values else math.nan
 
     @property
     def terms(self) -> dict[str, float]:
         """Mean of each loss term."""
-        return {name: float(torch.stack(values).mean()) for name, values in self._terms.items()}
+        by_name = {
+            name: [terms[name] for terms in self._terms.values()] for name in next(iter(self._terms.values()), ())
+        }
+        return {name: float(torch.stack(values).mean()) for name, values in by_name.items()}

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""In the middle of a frame: free Gaussians die and are born, in the tensors that are being fitted."""
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.backend import Backend
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.training.optim import Adam
+from structgstream.training.parameters import FREE_ROWS, ParameterName, Parameters
+from structgstream.training.patching import (
+    PatchingConfig,
+    children_of,
+    gaussians_by_id,
+    parents_of,
+    surviving,
+)
+from structgstream.training.statistics import GradientStatistics
+from structgstream.training.views import View
+
+
+def patched(
+    parameters: Parameters,
+    adam: Adam,
+    *,
+    scene: Scene,
+    statistics: GradientStatistics,
+    views: list[View],
+    frame_index: int,
+    room: int,
+    config: PatchingConfig,
+    backend: Backend,
+    generator: torch.Generator,
+) -> tuple[Tensor, int]:
+    """Prunes and spawns free Gaussians, in ``parameters`` and their moments.
+
+    Args:
+        parameters: of the frame.
+        adam: holds their moments.
+        scene: the template of ``parameters``.
+        statistics: view-space gradients by id.
+        views: which pictures children may take their looks from, the first that shows a parent.
+        frame_index: of the frame, for births.
+        room: how many free Gaussians there may be.
+        config: the rule.
+        backend: what computes.
+        generator: of what is random.
+
+    Returns:
+        Mask of those that survive, and how many were born.
+    """
+    current = parameters.scene(scene)
+    keep = surviving(current.free, config)
+    ids = parents_of(
+        statistics.mean(),
+        statistics.count,
+        room=room - int(keep.sum()),
+        config=config,
+        generator=generator,
+    )
+    parents = gaussians_by_id(current, views, ids, backend)
+    children = children_of(parents, frame_index=frame_index, config=config, generator=generator)
+    added = _free_rows(children)
+    parameters.births = torch.cat([parameters.births[keep], children.births])
+    parameters.replace_rows(FREE_ROWS, keep=keep, added=added)
+    adam.replace_rows(FREE_ROWS, keep=keep, added=len(children))
+    return keep, len(children)
+
+
+def _free_rows(free: FreeGaussians) -> dict[ParameterName, Tensor]:
+    return {
+        "free_means": free.means,
+        "free_log_scales": free.log_scales,
+        "free_quats": free.quats,
+        "free_logit_opacities": free.logit_opacities,
+        "free_colors": free.colors,
+    }

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Disturbances of frame 0."""
+
+import pytest
+import torch
+
+from structgstream.gaussians import Gaussians
+from structgstream.training.disturbance import Disturbance, DisturbanceConfig, disturbance_at
+
+COUNT = 20_000
+
+
+def gaussians() -> Gaussians:
+    return Gaussians(
+        means=torch.ones(COUNT, 3),
+        quats=torch.ones(COUNT, 4),
+        scales=torch.full((COUNT, 3), 0.5).requires_grad_(),
+        opacities=torch.full((COUNT,), 0.3).requires_grad_(),
+        colors=torch.ones(COUNT, 3),
+        ids=torch.arange(COUNT),
+    )
+
+
+def disturbed(config: DisturbanceConfig, *, strength: float = 1.0, seed: int = 0) -> Gaussians:
+    return Disturbance(config, torch.Generator().manual_seed(seed), strength=strength)(gaussians())
+
+
+@pytest.mark.parametrize("strength", [1.0, 0.5])
+def test_a_share_is_left_out_and_the_mean_stays(strength: float) -> None:
+    found = disturbed(DisturbanceConfig(dropped_share=0.4), strength=strength)
+    gone = found.opacities == 0
+    assert gone.float().mean().item() == pytest.approx(0.4 * strength, abs=0.01)
+    assert found.opacities.mean().item() == pytest.approx(0.3, abs=0.01)
+    assert torch.equal(found.means, gaussians().means)
+    (gradient,) = torch.autograd.grad(found.opacities.sum(), [found.opacities])
+    assert gradient.sum() == COUNT
+
+
+def test_opacities_stay_below_one() -> None:
+    whole = gaussians()
+    config = DisturbanceConfig(dropped_share=0.9)
+    found = Disturbance(config, torch.Generator(), strength=1.0)(whole)
+    assert found.opacities.max() < 1.0
+
+
+@pytest.mark.parametrize("strength", [1.0, 0.5])
+def test_means_are_shifted_by_their_extent(strength: float) -> None:
+    found = disturbed(DisturbanceConfig(noise_scales=0.2), strength=strength)
+    shift = found.means - 1.0
+    assert shift.mean().item() == pytest.approx(0.0, abs=0.01)
+    assert shift.std().item() == pytest.approx(0.2 * strength * 0.5, rel=0.05)
+    assert torch.equal(found.opacities, gaussians().opacities)
+    assert not shift.requires_grad, "noise is no reason to shrink"
+
+
+def test_the_seed_decides() -> None:
+    config = DisturbanceConfig(dropped_share=0.2, noise_scales=0.2)
+    one, same, other = (disturbed(config, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one.means, same.means)
+    assert torch.equal(one.opacities, same.opacities)
+    assert not torch.equal(one.means, other.means)
+
+
+def test_it_fades_and_ends() -> None:
+    config = DisturbanceConfig(dropped_share=0.4, until_share=0.5)
+    shares = []
+    for iteration in (1, 25, 49):
+        found = disturbance_at(iteration, 100, config, torch.Generator().manual_seed(0))
+        assert found is not None
+        shares.append((found(gaussians()).opacities == 0).float().mean().item())
+    assert shares == pytest.approx([0.4 * 0.98, 0.4 * 0.5, 0.4 * 0.02], abs=0.01)
+    assert disturbance_at(50, 100, config, torch.Generator()) is None
+    assert disturbance_at(1, 100, DisturbanceConfig(), torch.Generator()) is None
