@@ -7,8 +7,10 @@ import torch
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
+from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.motion import MotionConfig, changed_since, moving_parts
+from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
 from worlds import moving_world
 
@@ -85,3 +87,24 @@ def test_what_changed_is_told_by_row_and_by_birth() -> None:
     free = replace(free, colors=colors).append(replace(free.select(torch.tensor([0])), births=torch.tensor([12])))
     scene = replace(older, anchors=replace(older.anchors, log_base_scales=scales), free=free)
     assert changed_since(older, scene).nonzero()[:, 0].tolist() == [3, 6 + 2, 6 + 3]
+
+
+def test_free_gaussians_that_no_view_shows_are_gone() -> None:
+    places = torch.tensor([[0.0, 0.0, -0.8], [0.0, 0.0, -50.0], [0.1, 0.0, -0.8]])  # The second is behind all cameras.
+    free = FreeGaussians(
+        means=places,
+        log_scales=torch.full((3, 3), 0.1).log(),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(3, 4),
+        logit_opacities=torch.tensor([2.0, 2.0, -9.0]),  # The third is too faint.
+        colors=torch.full((3, 3), 0.5),
+        births=torch.tensor([1, 2, 3]),
+    )
+    scene = replace(WORLD.scene, free=free)
+    views = training_views(WORLD.frames[0], WORLD.rig, CPU)
+    config = replace(CONFIG, unseen_pixels=0.1)
+    found = moving_parts(scene, views, views, config=config, backend=reference_backend())
+    assert found.unseen.tolist() == [False, True, True]
+    part = Partition.of(scene, found)
+    assert part.together(part.moving).free.births.tolist() == [1]
+    kept = moving_parts(scene, views, views, config=CONFIG, backend=reference_backend())
+    assert not kept.unseen.any()

@@ -37,6 +37,8 @@ class MotionConfig:
     moved_ease: float = 1.0
     """What the last frame changed needs only so many times the pixels and the share: what moves comes to rest in more
     than a frame, and what is at the edge of a change does not stutter. 1: no memory."""
+    unseen_pixels: float = 0.0
+    """Free Gaussians that cover less than this in every view, counted by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
     """Who covers what is found on pictures of this size."""
     margin_pixels: int = 8
@@ -58,11 +60,13 @@ class Moving:
     Args:
         anchors: mask ``[M]``.
         free: mask ``[F]``.
+        unseen: mask ``[F]``, apart from ``free``: what no view shows.
         shown: for each view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
     """
 
     anchors: Tensor
     free: Tensor
+    unseen: Tensor
     shown: dict[int, Tensor]
 
 
@@ -107,6 +111,7 @@ def moving_parts(
     ease = torch.ones_like(votes)
     if older is not None:
         ease[changed_since(older, scene)] = config.moved_ease
+    most = torch.zeros(free, device=votes.device)
     shown: dict[int, Tensor] = {}
     with torch.no_grad():
         for view, last in zip(views, before, strict=True):
@@ -118,9 +123,10 @@ def moving_parts(
             structured, single = weights[: anchors * k].reshape(anchors, k, 2), weights[anchors * k :]
             total, part = torch.cat([structured.sum(1), single]).unbind(1)
             votes += (part > config.least_pixels * ease) & (part > config.least_share * ease * total)
+            most = torch.maximum(most, single[:, 0])
             shown[view.index] = weights[:, 0] > config.least_pixels
-    enough = votes >= config.least_views
-    return Moving(enough[:anchors], enough[anchors:], shown)
+    enough, unseen = votes >= config.least_views, most < config.unseen_pixels
+    return Moving(enough[:anchors], enough[anchors:] & ~unseen, unseen, shown)
 
 
 def _weights(scene: Scene, camera: Camera, changed: Tensor, config: MotionConfig, backend: Backend) -> Tensor:

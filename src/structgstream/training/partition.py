@@ -30,7 +30,7 @@ class Partition:
         whole: as it was.
         which: what the moving part holds.
         moving: that part.
-        still: the rest.
+        still: the rest, but for free Gaussians that are not seen.
     """
 
     whole: Scene
@@ -46,7 +46,7 @@ class Partition:
             return replace(scene, anchors=scene.anchors.select(anchors), free=scene.free.select(free))
 
         moving = part(which.anchors, which.free)
-        return cls(scene, which, moving, part(~which.anchors, ~which.free))
+        return cls(scene, which, moving, part(~which.anchors, ~(which.free | which.unseen)))
 
     def together(self, moved: Scene) -> Scene:
         """The whole scene, its moving part replaced by ``moved``; what stood still keeps its bits.
