@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from outcomes import outcome
-from structgstream.evaluation.plots import COLOURS
+from structgstream.evaluation.figure import COLOURS
 from structgstream.experiments.figures import busiest, write_comparison, write_curves, write_details
 from structgstream.experiments.results import Result
 

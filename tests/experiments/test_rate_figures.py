@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from outcomes import outcome
-from structgstream.evaluation.plots import COLOURS, INK
+from structgstream.evaluation.figure import COLOURS, INK
 from structgstream.experiments.rate_figures import write_rates
 from structgstream.experiments.results import Result
 from test_figures import coloured, pixels_of

@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from structgstream.errors import MissingExtraError
+from structgstream.evaluation.figure import COLOURS, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.evaluation.report import FrameScores, Report
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, which all common kinds of colour vision tell apart.
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#222222")
 DISTANCES = (("flip", "FLIP"), ("lpips_alex", "LPIPS, AlexNet"), ("lpips_vgg", "LPIPS, VGG16"))
 FLICKER = (("flicker", "rendering"), ("truth_flicker", "truth"))
-INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
 
 def write_plots(path: Path, report: Report, *, title: str) -> None:
@@ -29,11 +26,6 @@ def write_plots(path: Path, report: Report, *, title: str) -> None:
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
     panels: list[Callable[[Axes, Report], None]] = [_quality]
     for panel, lines in ((_distances, DISTANCES), (_flicker, FLICKER)):
         if any(_known(report, key) for key, _ in lines):
@@ -41,21 +33,16 @@ def write_plots(path: Path, report: Report, *, title: str) -> None:
     panels += [_bytes, _counts]
     if any(_stages(frame) for frame in report.frames):
         panels.append(_seconds)
-    figure = Figure(figsize=(10, 2.6 * len(panels) + 0.6), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = figure_of(10.0, 2.6 * len(panels) + 0.6)
     figure.suptitle(title, fontsize=11, fontweight="bold", color=INK)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, panel in zip(axes, panels, strict=True):
         panel(axis, report)
-        axis.grid(axis="y", color=FAINT, linewidth=0.8)
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(labelsize=8)
+        without_frame(axis)
         axis.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
     axes[-1].set_xlabel("frame", fontsize=9)
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _quality(axis: "Axes", report: Report) -> None:

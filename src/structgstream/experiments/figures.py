@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import MissingExtraError
-from structgstream.evaluation.plots import COLOURS, FAINT, INK
+from structgstream.evaluation.figure import COLOURS, INK, figure_of, save_figure, without_frame
 from structgstream.experiments.results import Result
 from structgstream.experiments.sheets import SCORES
 from structgstream.experiments.summary import Summary, summaries
@@ -17,7 +16,6 @@ from structgstream.experiments.variants import FULL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Picture = NDArray[np.uint8]
 CROP_SHARE = 4  # a detail is a quarter of the picture across
@@ -130,33 +128,3 @@ def _curve(axis: "Axes", summary: Summary, name: str, *, label: str, colour: str
     axis.plot(index, mean, color=colour, linewidth=width, label=label)
     if deviation.any():
         axis.fill_between(index, mean - deviation, mean + deviation, color=colour, alpha=0.12, linewidth=0)
-
-
-def figure_of(width: float, height: float) -> "Figure":
-    """An empty figure, in inches.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
-    figure = Figure(figsize=(width, height), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def without_frame(axis: "Axes") -> None:
-    """Lines where values are read off, and no more."""
-    axis.grid(axis="y", color=FAINT, linewidth=0.8)
-    axis.set_axisbelow(True)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=8)
-
-
-def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a PNG, and the folder where there is none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)

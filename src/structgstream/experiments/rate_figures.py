@@ -5,8 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from structgstream.evaluation.plots import COLOURS, INK
-from structgstream.experiments.figures import figure_of, save_figure, without_frame
+from structgstream.evaluation.figure import COLOURS, INK, figure_of, save_figure, without_frame
 from structgstream.experiments.rate_distortion import JUDGED, OTHERS, QUALITIES, quality_key
 from structgstream.experiments.results import Result
 from structgstream.experiments.sheets import SCORES

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An empty figure, axes without ornament, and the file: what all plots of the package share."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from structgstream.errors import MissingExtraError, StorageError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, which all common kinds of colour vision tell apart.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#222222")
+INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
+
+
+def figure_of(width: float, height: float) -> "Figure":
+    """An empty figure, in inches.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtraError("matplotlib", "report") from None
+    figure = Figure(figsize=(width, height), dpi=110, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def without_frame(axis: "Axes") -> None:
+    """Lines where values are read off, and no more."""
+    axis.grid(axis="y", color=FAINT, linewidth=0.8)
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.tick_params(labelsize=8)
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Writes a picture, and the folder where there is none.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path)
+    except OSError as error:
+        raise StorageError(f"The picture {path} cannot be written ({error.strerror}).") from None
