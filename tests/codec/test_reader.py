@@ -80,7 +80,11 @@ def test_what_comes_before_damage_plays(damaged: int) -> None:
     reader = StreamReader(bytes(data))
     assert len(reader) == damaged - 1
     assert not reader.complete
-    assert reader.cut_reason == f"the record at byte {record.offset} of {len(data)} is damaged"
+    again = f"frame {damaged} can be shown again" if damaged < 4 else "none after it can be shown"
+    assert reader.cut_reason == (
+        f"the record at byte {record.offset} of {len(data)} is damaged; 1 of 4 frames are lost, "
+        f"the first is {damaged - 1}, {again}"
+    )
 
 
 def test_damage_after_opening_is_noticed() -> None:

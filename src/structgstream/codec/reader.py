@@ -8,7 +8,9 @@ is asked for: what a packet is, from the heads of its record and fields; a scene
 verified then. With the ``raw`` codec every packet stands alone, so any frame is as near as any other.
 """
 
+import math
 from array import array
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ from types import TracebackType
 from typing import overload
 
 from structgstream.codec.blocks import blocks_in
+from structgstream.codec.damage import Damage, Search, next_index
 from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
 from structgstream.codec.header import field_bytes_of, unpacked_header
 from structgstream.codec.index import indexed_offsets
@@ -42,6 +45,8 @@ _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
 
 
 NOTHING = -2  # no frame follows it
+LOST = 2**64 - 1
+"""In the place of the offset of a packet that is not there."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,12 @@ class PacketInfo:
 
 
 class Packets(Sequence[PacketInfo]):
-    """The packets of a stream in order. Only their offsets are in memory; asking for one reads its heads.
+    """The packets of a stream in order, up to the first that is lost. Only their offsets are in memory; asking for one
+    reads its heads.
+
+    Attributes:
+        offsets: of all packets, also those after what is lost, which has :data:`LOST`.
+        whole: how many there are before the first that is lost.
 
     Raises:
         StreamError: on asking for a packet that was damaged after the stream was opened.
@@ -67,9 +77,10 @@ class Packets(Sequence[PacketInfo]):
         self._data = data
         self._name = name
         self.offsets: array[int] = array("Q")
+        self.whole = 0
 
     def __len__(self) -> int:
-        return len(self.offsets)
+        return self.whole
 
     @overload
     def __getitem__(self, index: int) -> PacketInfo: ...
@@ -80,7 +91,10 @@ class Packets(Sequence[PacketInfo]):
     def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        index = range(len(self))[index]
+        return self.at(range(len(self))[index])
+
+    def at(self, index: int) -> PacketInfo:
+        """The packet of a frame that is not lost."""
         offset = self.offsets[index]
         head = head_at(self._data, offset)
         if head is None or head[0] not in _KINDS or head[1] < FRAME.size:
@@ -103,9 +117,11 @@ class Packets(Sequence[PacketInfo]):
 class StreamReader:
     """A stream in memory or in a file; memory does not grow with its length (Note [Nothing is kept]).
 
-    Every record's checksum is verified once, on opening, one record at a time; what comes after damage is not read.
-    With ``by_index`` the index tells where packets are, if it agrees with their records' heads, and a checksum is
-    verified when its record is read; without a good index that is the same as without the argument.
+    Every record's checksum is verified once, on opening, one record at a time. Where one is damaged, the stream goes on
+    at the next whole packet: :meth:`scene` gives every frame of :attr:`runs`, while :attr:`packets`, the length and
+    :meth:`scenes` end before the first frame that is lost, so that no frame is taken for another. With ``by_index``
+    the index tells where packets are, if it agrees with their records' heads, and a checksum is verified when its
+    record is read; without a good index that is the same as without the argument.
 
     Args:
         data: the bytes, or an open file, which the reader then closes.
@@ -116,9 +132,11 @@ class StreamReader:
         header: what the init record says.
         header_bytes: where the first packet begins.
         header_field_bytes: of these, what each field takes.
-        packets: every whole packet before the first cut or damage, in order.
-        complete: whether the index was written, so that the run that made the stream had come to its end.
-        cut_reason: what stopped reading otherwise.
+        packets: every whole packet before the first that is lost, in order.
+        runs: the frames that can be shown, all that follow each other as one range.
+        damage: the damaged records that others follow, and what each costs.
+        complete: whether the stream is whole: the index was written, so that the run that made it had come to its end.
+        cut_reason: what it is otherwise.
 
     Raises:
         StreamError: not a stream, another major version, no whole init record, or records that contradict each other.
@@ -131,6 +149,8 @@ class StreamReader:
         self.total_bytes = len(data)
         self.complete = False
         self.packets = Packets(data, name)
+        self.runs: list[range] = []
+        self.damage: list[Damage] = []
         init = record_at(data, PREFIX.size)
         if init is None:
             raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
@@ -142,23 +162,63 @@ class StreamReader:
         offsets = indexed_offsets(data, end) if by_index else None
         if offsets is not None:
             self.packets.offsets = offsets
+            self.packets.whole = len(offsets)
+            self.runs = [range(len(offsets))]
             self.complete = True
         else:
             end = self._scan(end)
-        self.cut_reason = None if self.complete else why_stopped(data, end)
+        self.cut_reason = None if self.complete else self._reason(end)
         self._decoder = SceneDecoder(self.header)
         self._decoded = NOTHING
 
     def _scan(self, end: int) -> int:
         """Verify every record from byte ``end`` on; returns where the last whole one ends."""
-        pts_seconds = 0.0
-        for record in scanned(self._data, end):
-            end = record.end
-            if record.type == RecordType.INDEX:
-                self.complete = True
+        search, seconds = Search(self._data), -math.inf
+        offsets = self.packets.offsets
+        found: list[tuple[int, int]] = []  # damaged records and the frames that should have been there
+        ended = False
+        while not ended:
+            for record in scanned(self._data, end):
+                end = record.end
+                if ended := record.type == RecordType.INDEX:
+                    break
+                seconds = self._add(record, seconds)
+            following = None if ended else search.next(end, expected=len(offsets), after_seconds=seconds)
+            if following is None:
                 break
-            pts_seconds = self._add(record, pts_seconds)
+            found.append((end, len(offsets)))
+            offsets.extend([LOST] * (next_index(following) - len(offsets)))
+            end = following.offset
+        self.complete = ended and not found
+        self.damage = [Damage(offset, range(frame, self._shown_from(frame))) for offset, frame in found]
+        self.packets.whole = next((damage.frames.start for damage in self.damage if damage.frames), len(offsets))
         return end
+
+    def _run(self, index: int) -> int:
+        """Which of :attr:`runs` is the first that does not end before ``index``."""
+        return bisect_right(self.runs, index, key=lambda run: run.stop)
+
+    def _shown_from(self, index: int) -> int:
+        """The first frame from ``index`` on that can be shown, or the number of frames."""
+        place = self._run(index)
+        return max(self.runs[place].start, index) if place < len(self.runs) else len(self.packets.offsets)
+
+    def _reason(self, end: int) -> str:
+        """Why the stream, read up to byte ``end``, is not whole."""
+        if not self.damage:
+            return why_stopped(self._data, end)
+        reason = f"the record at byte {self.damage[0].offset} of {self.total_bytes} is damaged"
+        if len(self.damage) > 1:
+            reason += f", and {len(self.damage) - 1} more"
+        lost = len(self.packets.offsets) - sum(map(len, self.runs))
+        if not lost:
+            return f"{reason}; no frame is lost"
+        first = len(self.packets)
+        shown = self._shown_from(first)
+        again = (
+            f"frame {shown} can be shown again" if shown < len(self.packets.offsets) else "none after it can be shown"
+        )
+        return f"{reason}; {lost} of {len(self.packets.offsets)} frames are lost, the first is {first}, {again}"
 
     def _add(self, record: Record, before_seconds: float) -> float:
         """Note a packet's place; returns when it is presented, or the time of the one before for another record."""
@@ -167,13 +227,18 @@ class StreamReader:
         if record.type not in _KINDS:
             return before_seconds
         packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
-        if packet.index != len(self.packets):
-            raise StreamError(f"{self._name} has packet {packet.index} where packet {len(self.packets)} belongs.")
+        offsets = self.packets.offsets
+        if packet.index != len(offsets):
+            raise StreamError(f"{self._name} has packet {packet.index} where packet {len(offsets)} belongs.")
         if packet.index == 0 and packet.kind is not PacketKind.KEY:
             raise StreamError(f"{self._name} begins with a delta packet; the first must be a key packet.")
         if packet.index and packet.pts_seconds <= before_seconds:
             raise StreamError(f"In {self._name} packet {packet.index} is not presented after the one before it.")
-        self.packets.offsets.append(record.offset)
+        offsets.append(record.offset)
+        if self.runs and self.runs[-1].stop == packet.index:
+            self.runs[-1] = range(self.runs[-1].start, packet.index + 1)
+        elif packet.kind is PacketKind.KEY or self.header.codec == "raw":
+            self.runs.append(range(packet.index, packet.index + 1))
         return packet.pts_seconds
 
     def __len__(self) -> int:
@@ -198,9 +263,9 @@ class StreamReader:
         Raises:
             StreamError: there is no such frame, or it has been damaged.
         """
-        if not 0 <= index < len(self):
-            have = f"frames 0 to {len(self) - 1}" if self.packets else "no whole frame"
-            raise StreamError(f"{self._name} has {have}; there is no frame {index}.")
+        place = self._run(index)
+        if place == len(self.runs) or index not in self.runs[place]:
+            raise self._missing(index)
         follows = index == self._decoded + 1
         self._decoded = NOTHING  # Until a packet has been decoded.
         scene: Scene | None = None
@@ -210,6 +275,17 @@ class StreamReader:
         self._decoded = index
         return scene
 
+    def _missing(self, index: int) -> StreamError:
+        for damage in self.damage:
+            if index in damage.frames:
+                return StreamError(
+                    f"Frame {index} of {self._name} is lost: the record at byte {damage.offset}, where frame "
+                    f"{damage.frames.start} should be, is damaged."
+                )
+        frames = len(self.packets.offsets)
+        have = f"frames 0 to {frames - 1}" if frames else "no whole frame"
+        return StreamError(f"{self._name} has {have}; there is no frame {index}.")
+
     def group(self, index: int) -> Iterator[Packet]:
         """The packets that frame ``index`` needs, from a key packet to its own; with ``raw`` its own alone.
 
@@ -217,7 +293,7 @@ class StreamReader:
             StreamError: one has been damaged.
         """
         first = index
-        while self.header.codec != "raw" and self.packets[first].kind is not PacketKind.KEY:
+        while self.header.codec != "raw" and self.packets.at(first).kind is not PacketKind.KEY:
             first -= 1
         for number in range(first, index + 1):
             yield self._packet(number)
@@ -232,7 +308,7 @@ class StreamReader:
         return packet
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
-        """Every frame from ``start`` on, one at a time."""
+        """Every frame from ``start`` on, one at a time, up to the first that is lost."""
         for index in range(*slice(start, None).indices(len(self))):
             scene = self.scene(index)
             yield self.packets[index], scene
@@ -255,14 +331,6 @@ def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
     return StreamReader(data, name=str(path), by_index=by_index)
 
 
-def record_after_damage(data: Stored, offset: int) -> bool:
-    """Whether a whole record follows a damaged one at ``offset``: no crash leaves that, only a medium that forgets."""
-    if offset + RECORD.size > len(data) or record_at(data, offset) is not None:
-        return False
-    length = RECORD.unpack(data[offset : offset + RECORD.size])[3]
-    return record_at(data, offset + RECORD.size + length + CHECKSUM.size) is not None
-
-
 def readable_part(data: Stored, *, name: str) -> int | None:
     """Where the last whole packet ends, the index and what follows left out; None when the init record was cut.
 
@@ -273,13 +341,16 @@ def readable_part(data: Stored, *, name: str) -> int | None:
     if prefix().startswith(bytes(data[: PREFIX.size + 1])):
         return None  # Cut within the prefix, or empty.
     check_prefix(data, name)
-    end = PREFIX.size
+    end, frames, complete = PREFIX.size, 0, False
     for record in scanned(data):
-        if record.type == RecordType.INDEX:
+        if complete := record.type == RecordType.INDEX:
             break
         end = record.end
+        frames += record.type in _KINDS
     if end > PREFIX.size:
-        if record_after_damage(data, end):
+        # No crash leaves whole frames after a damaged one, only a medium that forgets.
+        search = Search(data)
+        if not complete and search.next(end, expected=frames, after_seconds=-math.inf) is not None:
             raise StreamError(
                 f"Cannot continue {name}: {why_stopped(data, end)}, and whole frames follow it that continuing would "
                 f"throw away. Keep a copy, then cut the file to {end} bytes and use --resume to fit them anew."
