@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a stream's bytes go: by packet, by field, by kind of packet, and in the header."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from structgstream.codec.packets import PacketKind
+from structgstream.codec.reader import StreamReader
+from structgstream.scene.state import FieldName
+
+REST = "the rest"
+"""What belongs to no field: heads of records, checksums, and in a header all that is said in words."""
+FIRST = "first packet"
+NOTHING = 0.01  # of the header: a first packet below that has no news
+Parts = dict[str, dict[str, float]]
+"""Bytes by field, and :data:`REST`, of named parts of a stream."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One packet: ``kind`` is ``key`` or ``delta``; ``sizes`` are bytes by field and add up, with the rest, to all."""
+
+    index: int
+    kind: str
+    pts_seconds: float
+    offset: int
+    bytes: int
+    sizes: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Packets of one kind taken together: how many, and their mean bytes, of all and by field."""
+
+    count: int
+    bytes: float
+    sizes: Mapping[str, float]
+
+
+def rows_of(reader: StreamReader) -> list[Row]:
+    """Every packet of a stream."""
+    return [
+        Row(info.index, PacketKind(info.kind).name.lower(), info.pts_seconds, info.offset, info.bytes, sizes)
+        for info in reader.packets
+        for sizes in [with_rest(info.field_bytes, info.bytes)]
+    ]
+
+
+def with_rest(sizes: Mapping[FieldName, int], whole: int) -> dict[str, int]:
+    """Bytes by field, and what of ``whole`` belongs to none."""
+    return {**sizes, REST: whole - sum(sizes.values())}
+
+
+def fields_of(sizes: Iterable[Mapping[str, float]]) -> list[str]:
+    """The fields that occur, largest sum first, the rest last."""
+    sums: dict[str, float] = {}
+    for one in sizes:
+        for name, size in one.items():
+            sums[name] = sums.get(name, 0) + size
+    return sorted(sums, key=lambda name: (name == REST, -sums[name]))
+
+
+def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
+    """The first packet, and means of the kinds of packets that follow it.
+
+    The first is no key packet as others are: with the codec ``compact`` all that it could say is in the header.
+    """
+    chosen = {
+        FIRST: rows[:1],
+        "key packets": [row for row in rows[1:] if row.kind == "key"],
+        "delta packets": [row for row in rows[1:] if row.kind == "delta"],
+    }
+    return {name: mean_of(some) for name, some in chosen.items() if some}
+
+
+def mean_of(rows: Sequence[Row]) -> Group:
+    """The mean of packets, of which there is at least one."""
+    names = fields_of(row.sizes for row in rows)
+    sizes = {name: sum(row.sizes.get(name, 0) for row in rows) / len(rows) for name in names}
+    return Group(len(rows), sum(row.bytes for row in rows) / len(rows), sizes)
+
+
+def parts_of(reader: StreamReader, rows: Sequence[Row]) -> Parts:
+    """Bytes by field of the header and, on average, of each kind of packet; a first one without news is left out."""
+    parts: Parts = {"header": dict(with_rest(reader.header_field_bytes, reader.header_bytes))}
+    for name, group in groups_of(rows).items():
+        if name != FIRST or group.bytes > NOTHING * reader.header_bytes:
+            parts[name] = dict(group.sizes)
+    return parts

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a stream's bytes go, as a picture: each packet by field, and what header, key and delta packets consist of."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.evaluation.byte_count import REST, Parts, Row
+from structgstream.evaluation.figure import COLOURS, INK, OTHER, figure_of, save_figure, without_frame
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
+SMALL = 0.01  # of every part: fields that take less are put together
+TOWERING = 3.0  # times the largest delta packet: a key packet above that is drawn cut, with its size over it
+GAPS = 150  # with more packets than this, bars touch
+NUMBERS = 25  # with more cut packets than this, their sizes are left out
+TOLD = 0.06  # of a part: a smaller share has no number
+
+
+def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str) -> None:
+    """Bars over the frames, stacked by field, above what each part of the stream consists of.
+
+    Args:
+        path: the picture; its suffix is a format that matplotlib writes.
+        rows: all packets of the stream, at least one.
+        parts: bytes by field of parts of it; the last ones choose the order of the fields.
+        title: a line above.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        StorageError: the file cannot be written.
+    """
+    colours = colours_of(parts)
+    across = 0.34 * len(parts) + 0.3
+    figure = figure_of(10.0, 4.4 + across)
+    top, bottom = figure.subplots(2, 1, height_ratios=(3.6, across))
+    keys = _packets(top, rows, colours)
+    top.set_title(title, fontsize=11, fontweight="bold", color=INK, loc="left", pad=10)
+    _shares(bottom, parts, colours)
+    figure.legend(handles=[*_named(colours), keys], fontsize=8, frameon=False, loc="outside right upper")
+    save_figure(figure, path)
+
+
+def colours_of(parts: Parts) -> dict[str, str]:
+    """A colour for each field that is worth one: those of the last part first, the largest of a part first."""
+    colours: dict[str, str] = {}
+    for sizes in reversed(parts.values()):
+        whole = sum(sizes.values())
+        for field, size in sorted(sizes.items(), key=lambda item: -item[1]):
+            if field != REST and size >= SMALL * whole and field not in colours and len(colours) < len(COLOURS):
+                colours[field] = COLOURS[len(colours)]
+    return {**colours, REST: OTHER}
+
+
+def _packets(axis: "Axes", rows: Sequence[Row], colours: Mapping[str, str]) -> "Artist":
+    """Draws the packets; returns the mark of key packets, for a legend."""
+    index = np.array([row.index for row in rows])
+    total = np.array([row.bytes for row in rows]) / 1000
+    key = np.array([row.kind == "key" for row in rows])
+    top = float(total.max())
+    if key.any() and not key.all() and top > TOWERING * total[~key].max():
+        top = 1.3 * float(total[~key].max())
+    cut = total > top
+    shown = np.minimum(total, top)
+    base: NDArray[np.float64] = np.zeros(len(rows))
+    # Bars that touch have an edge of their own colour, or white hairs would show between them.
+    width, edge = (0.85, 0.0) if len(rows) <= GAPS else (1.0, 0.3)
+    for field, colour in colours.items():
+        share = np.array([row.sizes.get(field, 0) / row.bytes for row in rows])
+        height = shown - base if field == REST else shown * share
+        axis.bar(index, height, bottom=base, width=width, color=colour, edgecolor=colour, linewidth=edge)
+        base = base + height
+    axis.hlines([0.93 * top] * int(cut.sum()), index[cut] - 0.6, index[cut] + 0.6, color="white", linewidth=2.5)
+    for number, size in zip(index[cut], total[cut]):
+        if cut.sum() <= NUMBERS:
+            axis.annotate(
+                f"{size:,.0f}", (number, 1.04 * top), xytext=(6, 0), textcoords="offset points",
+                fontsize=8, color=INK, va="center",
+            )  # fmt: skip
+    (keys,) = axis.plot(
+        index[key], shown[key] + 0.04 * top, "v", color=INK, markersize=5.5,
+        label="key packet, cut (kB)" if cut.any() else "key packet",
+    )  # fmt: skip
+    axis.set_ylim(0, 1.1 * top)
+    axis.set_xlim(index[0] - 0.7, index[-1] + 0.7)
+    axis.locator_params(axis="x", integer=True)
+    axis.set_ylabel("kB a packet", fontsize=9)
+    axis.set_xlabel("frame", fontsize=9)
+    without_frame(axis)
+    return keys
+
+
+def _shares(axis: "Axes", parts: Parts, colours: Mapping[str, str]) -> None:
+    """A bar across for each part, all of one length."""
+    for row, sizes in enumerate(parts.values()):
+        whole, base = sum(sizes.values()), 0.0
+        for field, colour in colours.items():
+            share = 1.0 - base if field == REST else sizes.get(field, 0.0) / whole
+            axis.barh(row, share, left=base, height=0.72, color=colour)
+            if share >= TOLD:
+                ink = INK if _bright(colour) else "white"
+                axis.text(base + share / 2, row, f"{share:.0%}", fontsize=8, color=ink, ha="center", va="center")
+            base += share
+    labels = [f"{name}\n{sum(sizes.values()) / 1000:,.1f} kB" for name, sizes in parts.items()]
+    axis.set_yticks(range(len(parts)), labels)
+    axis.invert_yaxis()
+    axis.set_xlim(0, 1)
+    axis.set_xticks([])
+    axis.spines[:].set_visible(False)
+    axis.tick_params(labelsize=8, length=0)
+
+
+def _named(colours: Mapping[str, str]) -> "list[Artist]":
+    from matplotlib.patches import Patch
+
+    return [Patch(color=colour, label=field.replace("_", " ")) for field, colour in colours.items()]
+
+
+def _bright(colour: str) -> bool:
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return 0.299 * red + 0.587 * green + 0.114 * blue > 140
