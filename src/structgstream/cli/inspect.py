@@ -2,32 +2,42 @@
 """``structgstream inspect``."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
+from structgstream.cli.app import UsageError
 from structgstream.cli.options import JsonPath, StreamFile, parsed
-from structgstream.cli.progress import human_bytes
-from structgstream.cli.tables import SHOWN_FRAMES, columns, grid, plain
+from structgstream.cli.stream_tables import facts, header_table, packet_table, rate
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
+    from structgstream.evaluation.byte_count import Row
+
+PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
 class Inspect:
-    """Shows what a stream file holds: header, packets, bytes by field, whether it is whole.
+    """Shows what a stream file holds: header and packets, bytes by field, whether it is whole.
+
+    Example: structgstream inspect ball.sgs --plot ball-bytes.png
 
     Example: structgstream inspect ball.sgs --json ball-inspect.json
     """
 
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH.png", help_behavior_hint="")] = None
+    """Draw the bytes of every packet by field, and what header, key and delta packets consist of."""
     json: JsonPath = None
     """Write all of it to this file, with the keys "header" and "packets"."""
+    all_packets: bool = False
+    """List every packet. Otherwise a long stream is listed in even steps."""
     config: bool = False
     """Print the resolved configuration of the run."""
 
@@ -35,27 +45,50 @@ class Inspect:
 def main(arguments: list[str]) -> None:
     """Reads the file and prints."""
     options = parsed(Inspect, "inspect", arguments=arguments)
+    plot = options.plot
+    if plot is not None and plot.suffix.lower() not in PICTURES:
+        raise UsageError(f"{plot} is no name for a picture; its ending must be one of {', '.join(PICTURES)}.")
     from structgstream.codec.reader import open_stream
+    from structgstream.evaluation.byte_count import rows_of
     from structgstream.evaluation.report import write_json
 
-    content = described(open_stream(options.stream))
-    if options.json is not None:
-        write_json(options.json, content)
+    with open_stream(options.stream) as reader:
+        rows = rows_of(reader)
+        content = described(reader, rows)
+        if options.json is not None:
+            write_json(options.json, content)
+        if plot is not None:
+            drawn(plot, reader, rows, name=options.stream.name)
     console = Console()
-    header = content["header"]
     if options.config:
-        console.print_json(json.dumps(header["config"]))
+        console.print_json(json.dumps(content["header"]["config"]))
         return
-    console.print(_facts(content))
-    console.print()
-    console.print(_packets(content["packets"]))
+    packets = packet_table(rows, every=options.all_packets)
+    for part in (facts(content["header"], rows), header_table(content["header"]), packets):
+        console.print(part)
+        console.print()
+    if plot is not None:
+        console.print(f"Wrote {plot}", highlight=False, markup=False, soft_wrap=True)
 
 
-def described(reader: "StreamReader") -> dict[str, Any]:
-    """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``,
-    ...).
+def drawn(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:
+    """Writes the picture.
+
+    Raises:
+        UsageError: there is nothing to draw.
     """
-    from structgstream.codec.packets import PacketKind
+    if not rows:
+        raise UsageError("the stream has no whole frame, so there is nothing to draw.")
+    from structgstream.evaluation.byte_count import parts_of
+    from structgstream.evaluation.byte_plot import write_byte_plot
+
+    frames = "1 frame" if len(rows) == 1 else f"{len(rows)} frames"
+    write_byte_plot(path, rows, parts_of(reader, rows), title=f"{name}: {frames}, {rate(rows, reader.header.fps)}")
+
+
+def described(reader: "StreamReader", rows: "Sequence[Row]") -> dict[str, Any]:
+    """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``, ...)."""
+    from structgstream.evaluation.byte_count import REST
 
     header = reader.header
     cameras = {
@@ -76,14 +109,14 @@ def described(reader: "StreamReader") -> dict[str, Any]:
     }
     packets = [
         {
-            "kind": PacketKind(info.kind).name.lower(),
-            "index": info.index,
-            "pts_seconds": info.pts_seconds,
-            "offset": info.offset,
-            "bytes": info.bytes,
-            "fields": dict(info.field_bytes),
+            "kind": row.kind,
+            "index": row.index,
+            "pts_seconds": row.pts_seconds,
+            "offset": row.offset,
+            "bytes": row.bytes,
+            "fields": {name: size for name, size in row.sizes.items() if name != REST},
         }
-        for info in reader.packets
+        for row in rows
     ]
     return {
         "header": {
@@ -104,40 +137,3 @@ def described(reader: "StreamReader") -> dict[str, Any]:
         },
         "packets": packets,
     }
-
-
-def _facts(content: dict[str, Any]) -> Table:
-    header, packets = content["header"], content["packets"]
-    cameras = header["cameras"]
-    held_out = [name for name, camera in cameras.items() if camera["held_out"]]
-    sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
-    seconds = len(packets) / header["fps"]
-    table = grid()
-    for name, value in header["metadata"].items():
-        table.add_row(*plain(name, str(value)))
-    table.add_row("codec", header["codec"])
-    table.add_row("frames", f"{len(packets)} at {header['fps']:g} a second, {seconds:.2f} s")
-    table.add_row(*plain("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}"))
-    table.add_row("size", f"{human_bytes(header['total_bytes'])}, header {human_bytes(header['header_bytes'])}")
-    fields = ", ".join(f"{name} {human_bytes(field['bytes'])}" for name, field in header["fields"].items())
-    table.add_row("in the header", fields or "-")
-    table.add_row("dynamic", ", ".join(header["dynamic"]))
-    table.add_row("state", "complete" if header["complete"] else f"not finished: {header['cut_reason']}")
-    return table
-
-
-def _packets(packets: list[dict[str, Any]]) -> Table:
-    table = columns()
-    table.title = "packets, kB"
-    names = sorted({name for packet in packets for name in packet["fields"]})
-    table.add_column("packet", justify="right")
-    table.add_column("kind")
-    for name in ("seconds", "all", *(name.replace("_", " ") for name in names)):
-        # Field names break between words, never inside one.
-        table.add_column(name, justify="right", min_width=max(len(word) for word in name.split()))
-    step = max(-(-len(packets) // SHOWN_FRAMES), 1)
-    for packet in packets[::step]:
-        sizes = [packet["bytes"], *(packet["fields"].get(name, 0) for name in names)]
-        row = (str(packet["index"]), packet["kind"], f"{packet['pts_seconds']:.3f}")
-        table.add_row(*row, *(f"{size / 1000:.1f}" for size in sizes))
-    return table

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a stream file holds, as tables for a terminal."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table
+
+from structgstream.cli.progress import human_bytes
+from structgstream.cli.tables import SHOWN_FRAMES, columns, grid, plain
+
+if TYPE_CHECKING:
+    from structgstream.evaluation.byte_count import Row
+
+SMALL_BYTES = 100_000  # when all packets are below, their bytes are told one by one
+SHORT = {"anchor_positions": "positions", "covariance_mlp": "cov. mlp", "the rest": "rest"}  # 80 characters a line
+
+
+def facts(header: Mapping[str, Any], rows: "Sequence[Row]") -> Table:
+    """What the stream is: where it comes from, its length, size and rate, and whether it is whole."""
+    cameras = header["cameras"]
+    held_out = [name for name, camera in cameras.items() if camera["held_out"]]
+    sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
+    table = grid()
+    for name, value in header["metadata"].items():
+        table.add_row(*plain(name, str(value)))
+    table.add_row("codec", header["codec"])
+    table.add_row("frames", f"{len(rows)} at {header['fps']:g} a second, {len(rows) / header['fps']:.2f} s")
+    table.add_row(*plain("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}"))
+    table.add_row("size", f"{human_bytes(header['total_bytes'])}, header {human_bytes(header['header_bytes'])}")
+    if rows:
+        table.add_row("rate", rate(rows, header["fps"]))
+    table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
+    table.add_row("state", "complete" if header["complete"] else f"not finished: {header['cut_reason']}")
+    return table
+
+
+def rate(rows: "Sequence[Row]", fps: float) -> str:
+    """What all packets together need of a line, in words; there is at least one."""
+    mean = sum(row.bytes for row in rows) / len(rows)
+    return f"{8e-6 * mean * fps:.2f} Mbit/s without the header"
+
+
+def header_table(header: Mapping[str, Any]) -> Table:
+    """What the init record carries, the largest first."""
+    table = columns()
+    table.title = "header"
+    table.add_column("field")
+    for name in ("shape", "bytes", "share", "bits a value"):
+        table.add_column(name, justify="right")
+    whole = header["header_bytes"]
+    rest = whole
+    for name, field in sorted(header["fields"].items(), key=lambda item: -item[1]["bytes"]):
+        size, values = field["bytes"], math.prod(field["shape"])
+        shape = " x ".join(f"{length}" for length in field["shape"])
+        bits = f"{8 * size / values:.2f}" if values else "-"
+        table.add_row(name.replace("_", " "), shape, f"{size:,}", f"{size / whole:.1%}", bits)
+        rest -= size
+    table.add_row("the rest", "", f"{rest:,}", f"{rest / whole:.1%}", "")
+    return table
+
+
+def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
+    """A line for each packet, or for :data:`SHOWN_FRAMES` of them, and below them means; the largest field first."""
+    from structgstream.evaluation.byte_count import FIRST, fields_of, groups_of
+
+    names = fields_of(row.sizes for row in rows)
+    small = max((row.bytes for row in rows), default=0) < SMALL_BYTES
+    step = 1 if every else max(-(-len(rows) // SHOWN_FRAMES), 1)
+
+    def cells(whole: float, sizes: Mapping[str, float]) -> list[str]:
+        numbers = [whole, *(sizes.get(name, 0) for name in names)]
+        return [f"{number:,.0f}" if small else f"{number / 1000:,.1f}" for number in numbers]
+
+    lines = [[str(row.index), row.kind, *cells(row.bytes, row.sizes)] for row in rows[::step]]
+    groups = groups_of(rows)
+    means = [
+        ["mean", name.split()[0], *cells(groups[name].bytes, groups[name].sizes)] for name in groups if name != FIRST
+    ]
+    table = columns()
+    table.padding = 0
+    table.title = "packets, bytes" if small else "packets, kB"
+    if step > 1:
+        table.title += f"; 1 in {step} is listed (--all-packets: every one)"
+    titles = [SHORT.get(name, name.replace("_", " ")) for name in names]
+    for title in ("frame", "kind", "all", *titles):
+        # A word a line: titles break between words, never inside one.
+        table.add_column(title.replace(" ", "\n"), justify="left" if title == "kind" else "right", no_wrap=True)
+    for line in lines:
+        table.add_row(*line)
+    table.add_section()
+    for line in means:
+        table.add_row(*line)
+    return table
