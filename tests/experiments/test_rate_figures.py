@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from drawn import coloured, pixels_of
 from outcomes import outcome
 from structgstream.evaluation.figure import COLOURS, INK
 from structgstream.experiments.rate_figures import write_rates
 from structgstream.experiments.results import Result
-from test_figures import coloured, pixels_of
 
 
 def curve() -> list[Result]:

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``inspect``: bytes by field of header and packets, listed and drawn."""
+
+from pathlib import Path
+
+import pytest
+
+from drawn import pixels_of
+from rigs import random_scene
+from streams import compact_header, header_for, moved, write_stream
+from structgstream.cli import main
+from structgstream.codec.reader import open_stream
+from structgstream.codec.sinks import FileSink
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.state import PAPER_DYNAMIC, FieldName
+
+FRAMES = 31
+
+
+@pytest.fixture(scope="module")
+def streams(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One of codec ``compact`` with everything in motion, and one of codec ``raw``; a key packet at every third."""
+    folder = tmp_path_factory.mktemp("inspect")
+    scene = with_appearance(random_scene(40, free=3, seed=2), 3)
+    scenes = [moved(scene, i) for i in range(FRAMES)]
+    dynamic: frozenset[FieldName] = frozenset({*PAPER_DYNAMIC, "base_scales", "appearance"})
+    headers = {"compact": compact_header(scene, dynamic=dynamic), "raw": header_for(scene)}
+    for codec, header in headers.items():
+        write_stream(FileSink(folder / f"{codec}.sgs"), scenes, header=header)
+    return {codec: folder / f"{codec}.sgs" for codec in headers}
+
+
+def shown(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> list[list[str]]:
+    """What ``inspect`` prints, as the words of each line."""
+    capsys.readouterr()
+    assert main(["inspect", *arguments]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80 or "--plot" in arguments
+    assert "…" not in text
+    return [line.split() for line in text.splitlines()]
+
+
+def numbers(words: list[str]) -> list[int]:
+    return [int(word.replace(",", "")) for word in words]
+
+
+@pytest.mark.parametrize("codec", ["compact", "raw"])
+def test_every_number_of_the_table_is_whole_on_80_characters(
+    streams: dict[str, Path], codec: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = shown([str(streams[codec]), "--all-packets"], capsys)
+    packets = [line for line in lines if len(line) > 2 and line[0].isdigit() and line[1] in ("key", "delta")]
+    infos = open_stream(streams[codec]).packets
+    assert [line[0] for line in packets] == [str(i) for i in range(FRAMES)]
+    for line, info in zip(packets, infos, strict=True):
+        whole, *fields = numbers(line[2:])
+        assert whole == info.bytes == sum(fields)
+        assert sorted(fields) == sorted([*info.field_bytes.values(), info.bytes - sum(info.field_bytes.values())])
+    means = {line[1]: numbers(line[2:])[0] for line in lines if line[:1] == ["mean"]}
+    deltas = [info.bytes for i, info in enumerate(infos) if i % 3]
+    keys = [info.bytes for i, info in enumerate(infos) if i % 3 == 0 < i]
+    assert means == {"key": round(sum(keys) / len(keys)), "delta": round(sum(deltas) / len(deltas))}
+
+
+def test_the_header_by_field(streams: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    reader = open_stream(streams["compact"])
+    lines = [" ".join(line) for line in shown([str(streams["compact"])], capsys)]
+    size = reader.header_field_bytes["anchor_features"]
+    share, bits = size / reader.header_bytes, 8 * size / (40 * 32)
+    assert f"anchor features 40 x 32 {size:,} {share:.1%} {bits:.2f}" in lines
+    rest = reader.header_bytes - sum(reader.header_field_bytes.values())
+    assert f"the rest {rest:,} {rest / reader.header_bytes:.1%}" in lines
+    mean = sum(info.bytes for info in reader.packets) / FRAMES
+    assert f"rate {mean * 8 * 30 / 1e6:.2f} Mbit/s without the header" in lines
+
+
+def test_a_long_stream_is_listed_in_even_steps(streams: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    lines = shown([str(streams["raw"])], capsys)
+    listed = [int(line[0]) for line in lines if len(line) > 2 and line[1] in ("key", "delta") and line[0] != "mean"]
+    assert listed == [*range(0, FRAMES, 2)]
+    assert any("1 in 2 is listed" in " ".join(line) for line in lines)
+
+
+def test_a_picture_of_the_bytes(streams: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "new" / "bytes.png"
+    lines = shown([str(streams["compact"]), "--plot", str(picture)], capsys)
+    assert ["Wrote", str(picture)] in lines
+    assert pixels_of(picture).shape[1] > 1000
+    assert main(["inspect", str(streams["raw"]), "--plot", str(tmp_path / "x.svg")]) == 0
+    assert "<svg" in (tmp_path / "x.svg").read_text()
+
+
+def test_pictures_that_cannot_be(streams: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(streams["raw"]), "--plot", str(tmp_path / "x.gifx")]) == 2
+    assert "must be one of .png" in capsys.readouterr().err
+    empty = tmp_path / "empty.sgs"
+    reader = open_stream(streams["raw"])
+    empty.write_bytes(streams["raw"].read_bytes()[: reader.header_bytes])
+    assert main(["inspect", str(empty), "--plot", str(tmp_path / "x.png")]) == 2
+    assert "no whole frame" in capsys.readouterr().err
+    assert main(["inspect", str(empty)]) == 0
+    (tmp_path / "file").write_text("")
+    assert main(["inspect", str(streams["raw"]), "--plot", str(tmp_path / "file" / "x.png")]) == 1
+    assert "cannot be written" in capsys.readouterr().err
