@@ -36,6 +36,12 @@ export class ByteQueue {
     return bytes;
   }
 
+  /** Lets the next `count` bytes go, which must be there. */
+  skip(count: number): void {
+    this.start += count;
+    if (this.start === this.end) this.clear();
+  }
+
   clear(): void {
     this.buffer = new Uint8Array(0);
     this.start = this.end = 0;

@@ -43,19 +43,25 @@ export function packetOf(payload: Uint8Array, isKey: boolean): Packet {
 }
 
 /**
- * Refuses a packet that cannot come after `before`, or first when there is none.
+ * Refuses a packet that cannot come next.
  *
+ * @param expected the frame that it must be
+ * @param afterSeconds when the last one is presented
  * @param name what messages call the stream
  */
-export function checkFollows(facts: Omit<Packet, "payload">, before: typeof facts | undefined, name: string): void {
-  const expected = before ? before.index + 1 : 0;
+export function checkFollows(
+  facts: Omit<Packet, "payload">,
+  expected: number,
+  afterSeconds: number,
+  name: string,
+): void {
   if (facts.index !== expected) {
     throw new StreamError(`${name} has packet ${facts.index} where packet ${expected} belongs.`);
   }
-  if (!before && !facts.isKey) {
+  if (!expected && !facts.isKey) {
     throw new StreamError(`${name} begins with a delta packet; the first must be a key packet.`);
   }
-  if (before && facts.ptsSeconds <= before.ptsSeconds) {
+  if (facts.ptsSeconds <= afterSeconds) {
     throw new StreamError(`In ${name} packet ${facts.index} is not presented after the one before it.`);
   }
 }

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 
+export type { Damage } from "./damage.js";
 export { type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 export { StreamError } from "./errors.js";
 export { FIELD_NAMES, type FieldName, type Fields, type Tensor } from "./fields.js";

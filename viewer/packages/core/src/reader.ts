@@ -7,6 +7,7 @@
  */
 
 import { ByteQueue } from "./byteQueue.js";
+import { type Damage, Search, type Standing } from "./damage.js";
 import { checkFollows, type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 import { StreamError } from "./errors.js";
 import { type StreamHeader, unpackedHeader } from "./header.js";
@@ -33,14 +34,22 @@ export interface PacketInfo {
 
 /**
  * Where reading stands: more bytes may come; the index has come, so that the run that made the stream had come to its
- * end; or a record was damaged, and what follows it is not used.
+ * end; or a record was damaged, and nothing after it can be used.
  */
 export type ReaderState = "reading" | "complete" | "damaged";
 
 export class StreamReader {
   private readonly queue = new ByteQueue();
+  private readonly search = new Search();
+  // By frame, and so are `infos`: undefined for what is lost, and payloads for what was let go of.
   private readonly payloads: (Uint8Array | undefined)[] = [];
-  private readonly infos: PacketInfo[] = [];
+  private readonly infos: (PacketInfo | undefined)[] = [];
+  private readonly shown: boolean[] = [];
+  private readonly whole: PacketInfo[] = [];
+  private readonly damaged: Standing[] = [];
+  private searching: Standing | undefined;
+  private afterSeconds = Number.NEGATIVE_INFINITY;
+  private kept = 0;
   private offset = 0;
   private found: StreamHeader | undefined;
   private decoder: SceneDecoder | undefined;
@@ -56,9 +65,17 @@ export class StreamReader {
     return this.found;
   }
 
-  /** Every whole packet so far, in order. */
+  /** Every whole packet so far, in order; where others are lost, their indices have gaps. */
   get packets(): readonly PacketInfo[] {
-    return this.infos;
+    return this.whole;
+  }
+
+  /** Damaged records that others follow, and the frames that each costs as far as is known. */
+  get damage(): readonly Damage[] {
+    return this.damaged.map(({ offset, expected }) => {
+      const shown = this.shown.indexOf(true, expected);
+      return { offset, first: expected, end: shown < 0 ? this.infos.length : shown };
+    });
   }
 
   get state(): ReaderState {
@@ -91,7 +108,17 @@ export class StreamReader {
    */
   finish(): void {
     if (this.failure) throw this.failure;
-    if (this.found) return;
+    if (this.found) {
+      try {
+        this.goOn();
+      } catch (error) {
+        if (error instanceof StreamError) this.failure = error;
+        throw error;
+      } finally {
+        this.queue.clear();
+      }
+      return;
+    }
     if (this.offset === 0) checkPrefix(this.queue.peek(PREFIX_BYTES), this.name);
     const end = this.offset + this.queue.length;
     throw new StreamError(`Nothing of ${this.name} can be shown: it is cut at byte ${end}, within the init record.`);
@@ -100,13 +127,10 @@ export class StreamReader {
   /**
    * The scene of one frame. The next frame after the last is decoded from it; any other from its key packet on.
    *
-   * @throws StreamError there is no such frame, it was forgotten, or it is damaged
+   * @throws StreamError there is no such frame, it was forgotten, or it is lost or damaged
    */
   frame(index: number): Frame {
-    if (!this.decoder || !this.infos[index]) {
-      const have = this.infos.length ? `frames 0 to ${this.infos.length - 1}` : "no whole frame";
-      throw new StreamError(`${this.name} has ${have}; there is no frame ${index}.`);
-    }
+    if (!this.decoder || !this.shown[index]) throw this.missing(index);
     const first = this.decoded === index - 1 ? index : this.groupStart(index);
     this.decoded = undefined; // until a packet has been decoded
     for (let i = first; i < index; i++) this.decoder.decode(this.packet(i));
@@ -125,13 +149,24 @@ export class StreamReader {
   /** Lets go of the packets that no frame from `index` on needs. */
   forget(index: number): void {
     const end = this.groupStart(Math.min(index, this.infos.length - 1));
-    for (let i = end - 1; i >= 0 && this.payloads[i]; i--) this.payloads[i] = undefined;
+    for (; this.kept < end; this.kept++) this.payloads[this.kept] = undefined;
+  }
+
+  private missing(index: number): StreamError {
+    for (const { offset, first, end } of this.damage) {
+      if (index < first || index >= end) continue;
+      return new StreamError(
+        `Frame ${index} of ${this.name} is lost: the record at byte ${offset}, where frame ${first} should be, is damaged.`,
+      );
+    }
+    const have = this.infos.length ? `frames 0 to ${this.infos.length - 1}` : "no whole frame";
+    return new StreamError(`${this.name} has ${have}; there is no frame ${index}.`);
   }
 
   private packet(index: number): Packet {
-    const payload = this.payloads[index];
-    if (!payload) throw new StreamError(`Frame ${index} of ${this.name} has been let go of.`);
-    return { ...this.infos[index]!, payload };
+    const [info, payload] = [this.infos[index], this.payloads[index]];
+    if (!info || !payload) throw new StreamError(`Frame ${index} of ${this.name} has been let go of.`);
+    return { ...info, payload };
   }
 
   private advance(): void {
@@ -142,22 +177,66 @@ export class StreamReader {
       this.queue.take(PREFIX_BYTES);
       this.offset = PREFIX_BYTES;
     }
-    while (this.standing === "reading" && this.queue.length >= HEAD_BYTES + CHECKSUM_BYTES) {
+    while (this.standing === "reading") {
+      if (this.searching && !this.searched(this.searching, true)) break;
+      if (this.queue.length < HEAD_BYTES + CHECKSUM_BYTES) break;
       const size = recordBytes(this.queue.peek(HEAD_BYTES));
-      if (size > this.queue.length) return;
-      const record = recordIn(this.queue.take(size), this.offset);
-      if (record) this.add(record, size);
-      else this.stop();
-      this.offset += size;
+      if (size > this.queue.length) break;
+      const record = recordIn(this.queue.peek(size), this.offset);
+      if (record) {
+        // Its payload is kept, and nothing else of the queue.
+        this.add({ ...record, payload: record.payload.slice() }, size);
+        this.skip(size);
+      } else this.stop();
     }
     if (this.standing !== "reading") this.queue.clear();
   }
 
+  /** What has come is all there is: what follows a record that is not whole is looked for in it. */
+  private goOn(): void {
+    while (this.standing === "reading") {
+      const cut = this.searching === undefined;
+      if (cut && this.queue.length === 0) return;
+      if (cut) this.stop();
+      const { searching } = this;
+      if (!searching || !this.searched(searching, false)) {
+        // A record that nothing follows has been cut when its end is not there.
+        if (!cut && this.standing === "reading") this.standing = "damaged";
+        return;
+      }
+      this.advance();
+    }
+  }
+
+  /** Whether reading can go on; if not, what need not be looked at again has been let go of. */
+  private searched(damaged: Standing, more: boolean): boolean {
+    const found = this.search.next(this.queue.peek(this.queue.length), this.offset, damaged, more);
+    if (found === undefined) this.standing = "damaged";
+    if (typeof found === "number") this.skip(Math.min(found, this.queue.length));
+    if (typeof found !== "object") return false;
+    this.skip(found.at);
+    this.damaged.push(damaged);
+    while (this.infos.length < found.next) {
+      this.infos.push(undefined);
+      this.payloads.push(undefined);
+      this.shown.push(false);
+    }
+    this.searching = undefined;
+    return true;
+  }
+
+  private skip(count: number): void {
+    this.queue.skip(count);
+    this.offset += count;
+  }
+
+  /** The record that begins here is not whole. */
   private stop(): void {
     if (!this.found) {
       throw new StreamError(`Nothing of ${this.name} can be shown: its init record is damaged.`);
     }
-    this.standing = "damaged";
+    this.searching = { offset: this.offset, expected: this.infos.length, afterSeconds: this.afterSeconds };
+    this.skip(1);
   }
 
   private add(record: StreamRecord, bytes: number): void {
@@ -178,9 +257,14 @@ export class StreamReader {
   }
 
   private addPacket({ payload, ...facts }: Packet, offset: number, bytes: number): void {
-    checkFollows(facts, this.infos.at(-1), this.name);
-    this.infos.push({ ...facts, offset, bytes });
+    const { index, isKey } = facts;
+    checkFollows(facts, this.infos.length, this.afterSeconds, this.name);
+    const info = { ...facts, offset, bytes };
+    this.infos.push(info);
+    this.whole.push(info);
     this.payloads.push(payload);
+    this.shown.push(isKey || this.found?.codec === "raw" || this.shown[index - 1] === true);
+    this.afterSeconds = facts.ptsSeconds;
   }
 }
 

@@ -59,15 +59,6 @@ describe.each([
     expectSameReaders(readStream(joined(stream, new Uint8Array(1000))), whole);
   });
 
-  test("a damaged packet ends the stream; what came before it stands", () => {
-    const damaged = stream.slice();
-    damaged[whole.packets[2]!.offset + 30]! ^= 1;
-    const reader = readStream(damaged);
-    expect([reader.state, reader.packets.length]).toEqual(["damaged", 2]);
-    expect(reader.frame(1).index).toBe(1);
-    expect(() => reader.frame(2)).toThrow("The stream has frames 0 to 1; there is no frame 2.");
-  });
-
   test("records that contradict each other", () => {
     const [prefix, init, first, second] = piecesOf(stream) as [Uint8Array, Uint8Array, Uint8Array, Uint8Array];
     const stream_ =
