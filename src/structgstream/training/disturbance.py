@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps a fit from learning its few cameras by heart: in every iteration the scene is a little different.
+"""What keeps frame 0 from learning its few cameras by heart: in every iteration the scene is a little different.
 
 Cameras of a ring see a surface from few sides. Gaussians that only look right together from exactly there are found
 out when some are missing and none is quite where it was.
@@ -15,7 +15,7 @@ from structgstream.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class DisturbanceConfig:
-    """How much a scene is disturbed while it is fitted."""
+    """How much a scene is disturbed while frame 0 is fitted."""
 
     dropped_share: float = 0.0
     """So many of the Gaussians are left out of an iteration, and the rest made as much more opaque (paper: 0)."""

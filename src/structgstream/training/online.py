@@ -22,7 +22,6 @@ from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
-from structgstream.training.disturbance import DisturbanceConfig, disturbance_at
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
 from structgstream.training.optim import Adam
@@ -77,7 +76,6 @@ class OnlineConfig:
     appearance_rank: int = 8
     """Directions in which the features of an anchor may change, if ``appearance`` is dynamic."""
     losses: LossWeights = field(default_factory=LossWeights)
-    disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
@@ -235,7 +233,6 @@ class _Fit:
                 track_screen=patching.spawn != "off" and patching.collect_from < iteration <= patch_at,
                 watch=watch,
                 focus=None if places is None else places[view.index],
-                disturbed=disturbance_at(iteration, iterations, config.disturbance, self.generator),
             )
             settling.add(view.index, loss.total)
             if iteration < patch_at and settling.settled:
