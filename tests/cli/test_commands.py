@@ -9,11 +9,12 @@ import sys
 from pathlib import Path
 
 import av
-import cv2
 import pytest
 
+from drawn import pixels_of
 from structgstream.cli import main, reconstruct, render
 from structgstream.cli.progress import Lines
+from structgstream.codec.reader import open_stream
 from structgstream.data.clip import bundled_clip_path
 from structgstream.session import FrameReport
 
@@ -145,7 +146,7 @@ def test_render_beside_the_truth(stream: Path, tmp_path: Path) -> None:
     out = tmp_path / "side.png"
     arguments = ["render", str(stream), CLIP, "--compare", "--frame", "2", "-o", str(out), "--device", "reference"]
     assert main(arguments) == 0
-    assert cv2.imread(str(out)).shape == (60, 3 * 80 + 8, 3)
+    assert pixels_of(out).shape == (60, 3 * 80 + 8, 3)
 
 
 @pytest.mark.parametrize(
@@ -177,6 +178,16 @@ def test_demo_leaves_everything_to_look_at(
     text = capsys.readouterr().out
     assert "Held-out PSNR" in text
     assert all(name.split("/")[-1] in text for name in made - {"clip.log.jsonl"})
+
+
+def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
+    base = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--scale", "0.25", "--frames", "1", *QUICK]
+    assert main([*base, "--codec", "compact", "--quality", "1.5", "--mbits", "0.5"]) == 0
+    header = open_stream(tmp_path / "s.sgs").header
+    rounding = header.config["online"]["rounding"]
+    assert rounding["quality"] == 1.5
+    assert header.steps["free_log_scales"] == pytest.approx(rounding["free_log_scale_step"] / 2**1.5)
+    assert header.config["rate"] == {"target_mbits": 0.5, "window_seconds": 1.0}
 
 
 def test_an_existing_stream_is_not_replaced_by_accident(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,6 +235,18 @@ def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
         (["--preset", "tiny", "--held-out", "cam77"], 1, "cam77"),
         (["--preset", "tiny", "--scale", "3"], 1, "(0, 1]"),
         (["--preset", "tiny", "--start", "12"], 1, "12 frames"),
+        (["--quality", "1"], 2, "--quality is for streams with the codec compact; the preset 'rig'"),
+        (
+            ["--preset", "motion", "--mbits", "5"],
+            2,
+            "--mbits is for streams with the codec compact; the preset 'motion'",
+        ),
+        (["--preset", "compact", "--codec", "raw", "--mbits", "5"], 2, "Add --preset compact"),
+        (["--preset", "compact", "--quality", "90"], 2, "--quality 90 is not one of -6 to 6"),
+        (["--preset", "compact", "--quality", "nan"], 2, "--quality nan is not one of"),
+        (["--preset", "compact", "--mbits", "0"], 2, "--mbits 0 is no rate"),
+        (["--preset", "compact", "--mbits", "inf"], 2, "--mbits inf is no rate"),
+        (["--preset", "compact", "--mbits", "5M"], 2, "5M"),
     ],
 )
 def test_wrong_options_are_told_before_anything_is_written(

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream reconstruct``."""
 
+import math
 import os
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
 
+MOST_QUALITY = 6.0  # steps 64 times as small, or as large
+
 
 @dataclass(frozen=True)
 class Reconstruct:
@@ -40,6 +43,8 @@ class Reconstruct:
     Example: structgstream reconstruct basketball -o ball.sgs --frames 20 --held-out 0 10 15 30
 
     Example: structgstream reconstruct basketball -o ball.sgs --preset fast --scale 0.5 --online.iterations 40
+
+    Example: structgstream reconstruct basketball -o ball.sgs --preset compact --mbits 5
     """
 
     scene: tyro.conf.Positional[Folder]
@@ -47,8 +52,13 @@ class Reconstruct:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """rig (default: any rig), motion (fits only what moves), fast (a try in minutes), paper-n3dv, paper-meetroom,
-    paper-immersive, tiny (tests)."""
+    """rig (default: any rig), compact (small packets), motion (fits only what moves), fast (a try in minutes),
+    paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
+    quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
+    """With --preset compact: 0 is its own quality, 1 makes every step half as large, -1 twice as large."""
+    mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
+    """With --preset compact: keep to R Mbit/s over every second, the header left aside. Default: constant quality,
+    whatever it costs."""
     device: Device = "auto"
     """What computes; auto takes the first of cuda, cpu, reference that is there."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
@@ -70,6 +80,7 @@ def main(arguments: list[str]) -> None:
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolved_config(options.preset, rest, command="reconstruct", seed=options.seed)
+    config = with_budget(config, preset=preset, quality=options.quality, mbits=options.mbits)
     check_output(options.output, may_exist=options.resume or options.overwrite)
     from structgstream.kernels.backend import select_backend
 
@@ -151,6 +162,35 @@ def reconstructed(
         kept = f"{output} has {done} of {len(source)} frames; go on with the same command and --resume."
         raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None
     return peaks
+
+
+def with_budget(config: "StreamConfig", *, preset: str, quality: float | None, mbits: float | None) -> "StreamConfig":
+    """``config`` with the options ``--quality`` and ``--mbits``, which are short for fields of it.
+
+    Raises:
+        UsageError: the stream's codec has neither, or the value is out of range.
+    """
+    if quality is None and mbits is None:
+        return config
+    if config.codec != "compact":
+        option = "--mbits" if quality is None else "--quality"
+        raise UsageError(
+            f"{option} is for streams with the codec compact; the preset {preset!r} makes one with the codec "
+            f"{config.codec}. Add --preset compact."
+        )
+    if quality is not None:
+        if not abs(quality) <= MOST_QUALITY:
+            raise UsageError(
+                f"--quality {quality:g} is not one of {-MOST_QUALITY:g} to {MOST_QUALITY:g}: 0 is the preset's own, "
+                "and 1 more makes every step half as large."
+            )
+        rounding = replace(config.online.rounding, quality=quality)
+        config = replace(config, online=replace(config.online, rounding=rounding))
+    if mbits is not None:
+        if not 0 < mbits < math.inf:
+            raise UsageError(f"--mbits {mbits:g} is no rate; it is in megabits a second, such as --mbits 5.")
+        config = replace(config, rate=replace(config.rate, target_mbits=mbits))
+    return config
 
 
 def check_output(output: Path, *, may_exist: bool) -> None:
