@@ -14,6 +14,7 @@ from streams import small_scene
 from structgstream.codec.coder import Encoder, Tables, varint
 from structgstream.codec.static_fields import (
     AS_THEY_ARE,
+    FREE_NUMBERS,
     MOST_ANCHORS,
     MOST_COLUMNS,
     MOST_WEIGHTS,
@@ -182,17 +183,32 @@ def test_more_numbers_than_allowed_are_refused() -> None:
                 decoded_fields({**coded, name: varint(most) + rest}, STEPS)
 
 
-def test_fields_of_more_numbers_than_fit_into_memory() -> None:
-    """A section whose symbols take no bits: 2^18 + 1 anchors in a few bytes, and 256 columns for each."""
-    anchors = 2**18 + 1
+def test_few_bytes_do_not_make_many_numbers() -> None:
+    """A section whose symbols take no bits has any number of anchors in a few bytes, and 256 columns for each."""
+
+    def positions(anchors: int) -> bytes:
+        return encoded_fields({"anchor_positions": torch.zeros(anchors, 3)}, STEPS)["anchor_positions"]
+
+    most = FREE_NUMBERS // 3
+    assert len(positions(most)) < 60
+    assert decoded_fields({"anchor_positions": positions(most)}, STEPS)["anchor_positions"].shape == (most, 3)
+    with pytest.raises(StreamError, match="numbers that cost nothing; at most .* Take smaller steps"):
+        positions(most + 2000)
+    message = "The init record has more than 64 numbers a byte; it is damaged"
+    with pytest.raises(StreamError, match=message):
+        decoded_fields({"anchor_positions": varint(most + 2000) + positions(most)[3:]}, STEPS)
+    anchors = FREE_NUMBERS // 256
     encoder = Encoder(Tables())
-    positions = torch.zeros(anchors, 3)
-    coded = encoded_fields({"anchor_positions": positions}, STEPS)
-    assert len(coded["anchor_positions"]) < 60
     encoder.number("anchor_features.columns", 256)
-    many: dict[FieldName, bytes] = {**coded, "anchor_features": encoder.fields["anchor_features"]}
-    with pytest.raises(StreamError, match="has 67109120 numbers of anchor_features; at most 67108864"):
+    many: dict[FieldName, bytes] = {
+        "anchor_positions": positions(anchors),
+        "anchor_features": encoder.fields["anchor_features"],
+    }
+    with pytest.raises(StreamError, match=message):
         decoded_fields(many, STEPS)
+    # As many more as bytes are there.
+    with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_features"):
+        decoded_fields({**many, "color_mlp": bytes(256)}, STEPS)
 
 
 def test_offsets_and_directions_that_do_not_fit() -> None:

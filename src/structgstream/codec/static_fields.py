@@ -9,7 +9,7 @@ coarse rows where that does not show. A decoder needs no more for it than a shif
 """
 
 import math
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 
 import numpy as np
 import torch
@@ -25,8 +25,9 @@ from structgstream.scene.state import STATE_TABLE, FieldName
 
 MOST_ANCHORS = 2**22
 MOST_WEIGHTS = 2**20
-MOST_NUMBERS = 2**26
-"""Of one field: a symbol can take less than a bit, so bytes do not bound what is decoded from them."""
+FREE_NUMBERS, NUMBERS_A_BYTE = 2**20, 64
+"""Numbers that the coded fields may have together, whatever their bytes, and how many more with each byte: a symbol can
+take next to nothing, so a few bytes could stand for gigabytes. What is fitted has 5 to 9 numbers a byte."""
 MOST_COLUMNS: Mapping[FieldName, int] = {
     "offset_scales": 3,
     "base_scales": 3,
@@ -40,6 +41,22 @@ SHIFTS = 8
 _SIZES = 5  # classes of what the two columns before hold: 0, 1, 2 to 3, 4 to 7, 8 and more
 _HALF = 30  # bits of a key's lower part
 _WHERE = "The init record"
+
+
+class _Budget:
+    """How many numbers are still allowed."""
+
+    def __init__(self, left: int) -> None:
+        self._left = left
+
+    def take(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            raise StreamError(f"{_WHERE} has more than {NUMBERS_A_BYTE} numbers a byte; it is damaged.")
+
+
+def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
+    return FREE_NUMBERS + NUMBERS_A_BYTE * sum(map(len, coded))
 
 
 def on_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
@@ -62,7 +79,8 @@ def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName,
         steps: of those that are coded.
 
     Raises:
-        StreamError: there is no step for one, a value is not that of a bin, or there are more numbers than allowed.
+        StreamError: there is no step for one, a value is not that of a bin, or there are more numbers than allowed,
+            also for the bytes that they take.
     """
     bins: dict[FieldName, Bins] = {}
     for name in _coded_names(fields.keys()):
@@ -73,7 +91,12 @@ def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName,
             raise StreamError(f"The header's {name} are no multiples of their step {steps[name]:g}; round them first.")
         bins[name] = found
     encoder = Encoder(Tables())
-    _coded(encoder, bins, bins.keys())
+    numbers = sum(found.size for found in bins.values())
+    _coded(encoder, bins, bins.keys(), _Budget(numbers))
+    if numbers > (most := _most_numbers(encoder.fields.values())):
+        raise StreamError(
+            f"The header has {numbers} numbers that cost nothing; at most {most} are allowed. Take smaller steps."
+        )
     return {name: encoder.fields[name] for name in bins}
 
 
@@ -91,7 +114,7 @@ def decoded_fields(
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
     decoder = Decoder(Tables(), coded, where=_WHERE)
-    bins = _coded(decoder, None, coded.keys())
+    bins = _coded(decoder, None, coded.keys(), _Budget(_most_numbers(coded.values())))
     decoder.end()
     return {name: values_of(found, steps[name]) for name, found in bins.items()}
 
@@ -100,20 +123,22 @@ def _coded_names(names: Set[FieldName]) -> list[FieldName]:
     return [row.name for row in STATE_TABLE if row.name in names and row.name not in AS_THEY_ARE]
 
 
-def _coded(coder: Coder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName]) -> dict[FieldName, Bins]:
+def _coded(
+    coder: Coder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], budget: _Budget
+) -> dict[FieldName, Bins]:
     """Codes the fields ``names``, the anchors' one after another and then the others."""
     given: Mapping[FieldName, Bins] = bins or {}
     found: dict[FieldName, Bins] = {}
-    positions = _coded_positions(coder, given.get("anchor_positions"))
+    positions = _coded_positions(coder, given.get("anchor_positions"), budget)
     found["anchor_positions"] = positions
     shifts = np.zeros(len(positions), np.int32)
     for name, most in MOST_COLUMNS.items():
         if name in names:
             shape = (len(positions), math.prod(given[name].shape[1:])) if name in given else None
             rows = None if shape is None else given[name].reshape(shape)
-            found[name], shifts = _coded_rows(coder, name, rows, shifts, most=most)
+            found[name], shifts = _coded_rows(coder, name, rows, shifts, most=most, budget=budget)
     for name in _coded_names(names - found.keys()):
-        found[name] = _coded_numbers(coder, name, given[name].ravel() if name in given else None)
+        found[name] = _coded_numbers(coder, name, given[name].ravel() if name in given else None, budget)
     return _shaped(found)
 
 
@@ -134,13 +159,14 @@ def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
     return found
 
 
-def _coded_positions(coder: Coder, bins: Bins | None) -> Bins:
+def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
     """Cells by how far each is from the one before along a Z-order curve.
 
     Note that rows need not be in this order; if they are not, signs are told too.
     """
     given = None if bins is None else len(bins)
     count = _bounded(coder.number("anchor_positions.rows", given), MOST_ANCHORS, "anchors")
+    budget.take(3 * count)
     if not count:
         return np.zeros((0, 3), np.int32)
     lowest = None if bins is None else bins.min(0)
@@ -180,12 +206,12 @@ def _coded_positions(coder: Coder, bins: Bins | None) -> Bins:
 
 
 def _coded_rows(
-    coder: Coder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, most: int
+    coder: Coder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, most: int, budget: _Budget
 ) -> tuple[Bins, NDArray[np.int32]]:
     """Rows ``[n, C]``, column by column, and their shifts, which are like those of another field."""
     given = None if bins is None else bins.shape[1]
     columns = _bounded(coder.number(f"{name}.columns", given), most, f"columns of {name}")
-    _bounded(columns * len(like), MOST_NUMBERS, f"numbers of {name}")
+    budget.take(columns * len(like))
     shifts = None if bins is None else _common_shifts(bins, like)
     shifts = coder.residuals(f"{name}.shift", shifts, like.astype(np.uint16), count=SHIFTS)
     if len(shifts) and not 0 <= int(shifts.min()) <= int(shifts.max()) < SHIFTS:
@@ -225,11 +251,12 @@ def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.where(together == 0, like, shifts).astype(np.int32)
 
 
-def _coded_numbers(coder: Coder, name: FieldName, bins: Bins | None) -> Bins:
+def _coded_numbers(coder: Coder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
     """Numbers ``[n]`` of any size."""
     count = _bounded(
         coder.number(f"{name}.count", None if bins is None else len(bins)), MOST_WEIGHTS, f"numbers of {name}"
     )
+    budget.take(count)
     values = None if bins is None else _zigzag(bins.astype(np.int64))
     values = coder.naturals(f"{name}.value", values, np.zeros(count, np.uint16), count=1)
     return _checked(np.where(values & 1, ~(values >> 1), values >> 1))

@@ -9,7 +9,8 @@ import { FIELD_NAMES, type FieldName, type Tensor } from "./fields.js";
 const WHERE = "The init record";
 export const MOST_ANCHORS = 2 ** 22;
 const MOST_WEIGHTS = 2 ** 20;
-const MOST_NUMBERS = 2 ** 26;
+const FREE_NUMBERS = 2 ** 20;
+const NUMBERS_A_BYTE = 64;
 const MOST_COLUMNS: readonly (readonly [FieldName, number])[] = [
   ["offset_scales", 3],
   ["base_scales", 3],
@@ -24,6 +25,16 @@ const SIZES = 5; // classes of what the two columns before hold: 0, 1, 2 to 3, 4
 const LARGEST_SYMBOL = 7;
 const HALF = 2 ** 30; // of a key, which has two halves of ten bits an axis
 const AXIS_BITS = 10;
+
+/** How many numbers are still allowed: a symbol can take next to nothing, so a few bytes could stand for gigabytes. */
+class Budget {
+  constructor(private left: number) {}
+
+  take(count: number): void {
+    this.left -= count;
+    if (this.left < 0) throw new StreamError(`${WHERE} has more than ${NUMBERS_A_BYTE} numbers a byte; it is damaged.`);
+  }
+}
 
 interface Bins {
   readonly shape: readonly number[];
@@ -44,7 +55,9 @@ export function decodedFields(
     if (!steps.has(name)) throw new StreamError(`The header states no step for ${name} in the init record.`);
   }
   const decoder = new Decoder(new Tables(), coded, WHERE);
-  const found = decodedBins(decoder, coded);
+  let bytes = 0;
+  for (const data of coded.values()) bytes += data.length;
+  const found = decodedBins(decoder, coded, new Budget(FREE_NUMBERS + NUMBERS_A_BYTE * bytes));
   decoder.end();
   const fields = new Map<FieldName, Tensor>();
   for (const [name, { shape, bins }] of found) {
@@ -54,14 +67,18 @@ export function decodedFields(
   return fields;
 }
 
-function decodedBins(decoder: Decoder, coded: ReadonlyMap<FieldName, Uint8Array>): Map<FieldName, Bins> {
-  const positions = decodedPositions(decoder);
+function decodedBins(
+  decoder: Decoder,
+  coded: ReadonlyMap<FieldName, Uint8Array>,
+  budget: Budget,
+): Map<FieldName, Bins> {
+  const positions = decodedPositions(decoder, budget);
   const rows = positions.length / 3;
   const found = new Map<FieldName, Bins>([["anchor_positions", { shape: [rows, 3], bins: positions }]]);
   let shifts: Int32Array = new Int32Array(rows);
   for (const [name, most] of MOST_COLUMNS) {
     if (!coded.has(name)) continue;
-    const { columns, ...field } = decodedRows(decoder, name, shifts, most);
+    const { columns, ...field } = decodedRows(decoder, name, shifts, most, budget);
     shifts = field.shifts;
     if (name === "anchor_offsets" && columns % 3) throw wrongCount(name, field.bins.length);
     const shape = name === "anchor_offsets" ? [rows, columns / 3, 3] : [rows, columns];
@@ -69,7 +86,7 @@ function decodedBins(decoder: Decoder, coded: ReadonlyMap<FieldName, Uint8Array>
   }
   for (const name of FIELD_NAMES) {
     if (!coded.has(name) || found.has(name)) continue;
-    const bins = decodedNumbers(decoder, name);
+    const bins = decodedNumbers(decoder, name, budget);
     let shape: readonly number[] = [bins.length];
     if (name === "appearance_basis") {
       const [appearance, features] = [found.get("appearance"), found.get("anchor_features")];
@@ -85,8 +102,9 @@ function decodedBins(decoder: Decoder, coded: ReadonlyMap<FieldName, Uint8Array>
 }
 
 /** Cells `[M, 3]` by how far each is from the one before along a Z-order curve. */
-function decodedPositions(decoder: Decoder): Int32Array {
+function decodedPositions(decoder: Decoder, budget: Budget): Int32Array {
   const rows = bounded(decoder.number("anchor_positions.rows"), MOST_ANCHORS, "anchors");
+  budget.take(3 * rows);
   if (!rows) return new Int32Array(0);
   const origin = [0, 1, 2].map(() => signedNumber(decoder, "anchor_positions.origin"));
   const descends = decoder.number("anchor_positions.descends") !== 0;
@@ -131,10 +149,11 @@ function decodedRows(
   name: FieldName,
   like: Int32Array,
   most: number,
+  budget: Budget,
 ): { columns: number; bins: Int32Array; shifts: Int32Array } {
   const rows = like.length;
   const columns = bounded(decoder.number(`${name}.columns`), most, `columns of ${name}`);
-  bounded(columns * rows, MOST_NUMBERS, `numbers of ${name}`);
+  budget.take(columns * rows);
   const shifts = decoder.residuals(`${name}.shift`, Uint8Array.from(like), SHIFTS);
   for (const shift of shifts) {
     if (shift < 0 || shift >= SHIFTS) {
@@ -182,8 +201,9 @@ function decodedValues(decoder: Decoder, name: FieldName, contexts: Uint8Array):
 }
 
 /** Numbers `[n]` of any size. */
-function decodedNumbers(decoder: Decoder, name: FieldName): Int32Array {
+function decodedNumbers(decoder: Decoder, name: FieldName, budget: Budget): Int32Array {
   const count = bounded(decoder.number(`${name}.count`), MOST_WEIGHTS, `numbers of ${name}`);
+  budget.take(count);
   const values = decoder.naturals(`${name}.value`, new Uint8Array(count), 1);
   return values.map((value) => checkedBin(signed(value)));
 }

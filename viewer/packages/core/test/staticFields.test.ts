@@ -64,3 +64,12 @@ test("fields that need others", () => {
   expect(() => decodedFields(new Map(coded).set("camera_color", varint(1)), steps)).toThrow("it has no coding");
   expect(() => decodedFields(coded, new Map())).toThrow("states no step for");
 });
+
+test("few bytes do not make many numbers", () => {
+  const many = (rows: number) => replaced("anchor_positions", joined(varint(rows), new Uint8Array(20)));
+  const bytes = [...coded.values()].reduce((sum, data) => sum + data.length, 0);
+  const others = bytes - coded.get("anchor_positions")!.length;
+  const most = Math.floor((2 ** 20 + 64 * (others + 23)) / 3);
+  expect(many(most)).toThrow("anchor_positions.far, ends within a number");
+  expect(many(most + 1)).toThrow("The init record has more than 64 numbers a byte; it is damaged.");
+});
