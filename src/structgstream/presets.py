@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from structgstream.data.points import PointsConfig
 from structgstream.rate_control import RateConfig
+from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.losses import LossWeights
@@ -13,6 +14,7 @@ from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.optim import Rate
 from structgstream.training.patching import PatchingConfig
+from structgstream.training.rounding import RoundingConfig
 
 
 @dataclass(frozen=True)
@@ -81,13 +83,18 @@ MOTION = replace(
 
 COMPACT = replace(
     MOTION,
+    initial=replace(MOTION.initial, disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5)),
     codec="compact",
     online=replace(
         MOTION.online,
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),
+        motion=replace(MOTION.online.motion, unseen_pixels=0.1),
+        motion_prior=0.7,
+        rounding=RoundingConfig(free_priced=True),
     ),
 )
-"""As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks."""
+"""As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks. Frame 0
+is disturbed while it is fitted, so that it does not learn its cameras by heart."""
 
 FAST = replace(
     RIG,

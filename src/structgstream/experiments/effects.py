@@ -2,7 +2,7 @@
 """What each part of the compact stream is worth: the whole, and the whole with one switch thrown at a time."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from structgstream.errors import ConfigError
 from structgstream.experiments.results import Result
@@ -11,11 +11,19 @@ from structgstream.experiments.summary import Summary, summaries
 from structgstream.experiments.variants import FULL, Variant
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
+from structgstream.training.disturbance import DisturbanceConfig
+from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
+from structgstream.training.rounding import RoundingConfig
 
 EFFECTS_TABLE = "effects"
 WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
+BETTER_FIRST = "paper-better-first"
+"""Key of paper mode on the frame 0 that the compact stream begins with."""
+DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{field.name}" for field in fields(DisturbanceConfig))
+EASED, LEAST_GAIN, OTHER_RANK = 0.5, 0.02, 8
+"""What is tried where the whole has it not."""
 REFRESH_FRAMES = 5
 """MLPs can change only in frames in which everything may move; this often, where one is trained."""
 
@@ -44,28 +52,45 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     require_compact(full)
     rows = [Variant(FULL, "paper mode", paper), Variant(WHOLE, "compact, with everything", full)]
 
+    def row(key: str, title: str, config: StreamConfig, *changes: str) -> None:
+        rows.append(Variant(key, title, config, frozenset(changes)))
+
     def online(key: str, title: str, config: OnlineConfig, *changes: str) -> None:
-        paths = frozenset(f"online.{change}" for change in changes)
-        rows.append(Variant(f"{WHOLE}-{key}", title, replace(full, online=config), paths))
+        row(f"{WHOLE}-{key}", title, replace(full, online=config), *(f"online.{change}" for change in changes))
 
     def dynamic(key: str, title: str, fields: frozenset[FieldName]) -> None:
         online(key, title, replace(whole, dynamic=fields), "dynamic")
 
+    def priced(key: str, title: str, rounding: RoundingConfig, change: str) -> None:
+        online(key, title, replace(whole, rounding=rounding), f"rounding.{change}")
+
+    def gated(key: str, title: str, motion: MotionConfig, change: str) -> None:
+        online(key, title, replace(whole, motion=motion), f"motion.{change}")
+
     whole = full.online
     motion, rounding, patching = whole.motion, whole.rounding, whole.patching
-    online("without-gate", "w/o change gate", replace(whole, motion=replace(motion, enabled=False)), "motion.enabled")
-    unpriced = replace(whole, rounding=replace(rounding, rate_weight=0.0))
-    online("without-rate", "w/o rate penalty", unpriced, "rounding.rate_weight")
+    rows.append(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
+    calm = replace(full.initial, disturbance=DisturbanceConfig())
+    row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
+    gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
+    eased = EASED if motion.moved_ease == 1.0 else 1.0
+    title = "the gate remembers what moved" if eased != 1.0 else "the gate remembers nothing"
+    gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
+    priced("without-rate", "w/o rate penalty", replace(rounding, rate_weight=0.0), "rate_weight")
     dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
-    for rank in (4, 16):
-        ranked = replace(whole, appearance_rank=rank)
-        online(f"rank-{rank}", f"appearance in {rank} directions", ranked, "appearance_rank")
+    rank = OTHER_RANK
+    online(f"rank-{rank}", f"appearance in {rank} directions", replace(whole, appearance_rank=rank), "appearance_rank")
     dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
     prior = 0.0 if whole.motion_prior else 1.0
     title = "motion prior: the last step again" if prior else "w/o motion prior"
     online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
+    gain = 0.0 if whole.least_gain else LEAST_GAIN
+    title = "a frame ends when it has settled" if gain else "all iterations in every frame"
+    online("settling", title, replace(whole, least_gain=gain), "least_gain")
     spawnless = replace(whole, patching=replace(patching, spawn="off"))
     online("without-free", "w/o free 3DGs", spawnless, "patching.spawn")
+    priced("free-unpriced", "bits of free 3DGs cost nothing", replace(rounding, free_priced=False), "free_priced")
+    gated("unseen-kept", "unseen free 3DGs are kept", replace(motion, unseen_pixels=0.0), "unseen_pixels")
     refreshed = replace(
         whole,
         dynamic=whole.dynamic.union(["covariance_mlp"]),

@@ -73,7 +73,7 @@ class OnlineConfig:
     iterations: int = 100
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
     """Rows of the state table that change after frame 0; the paper's ablations edit it."""
-    appearance_rank: int = 8
+    appearance_rank: int = 4
     """Directions in which the features of an anchor may change, if ``appearance`` is dynamic."""
     losses: LossWeights = field(default_factory=LossWeights)
     rates: OnlineRates = field(default_factory=OnlineRates)

@@ -52,7 +52,7 @@ class RoundingConfig:
     position_pixels: float = 0.25
     """Step of positions, as seen by a typical camera at a typical distance: less cannot be seen."""
     log_scale_step: float = 0.02
-    appearance_step: float = 0.1
+    appearance_step: float = 0.25
     """In standard deviations of the features along a direction of the basis."""
     weight_step: float = 0.002
     """Of the weights of MLPs."""
