@@ -118,6 +118,18 @@ def test_a_description_that_unpacks_to_too_much_is_not_unpacked() -> None:
         unpacked_header(struct.pack("<I", len(unstated)) + unstated)
 
 
+def test_a_description_that_no_reader_would_unpack_is_not_written() -> None:
+    long = replace(header_for(small_scene(1)), metadata={"note": "a" * MAX_JSON_BYTES})
+    with pytest.raises(StreamError, match=f"at most {MAX_JSON_BYTES} are allowed; leave out metadata or cameras"):
+        packed_header(long)
+
+
+@pytest.mark.parametrize("value", ["yes", 1, None])
+def test_cameras_are_held_out_or_not(value: object) -> None:
+    with pytest.raises(StreamError, match="held_out"):
+        unpacked_header(edited(lambda d: d["cameras"][0].update(held_out=value)))
+
+
 @pytest.mark.parametrize(
     "payload", [b"", b"\x01\x00\x00", struct.pack("<I", 5) + b"1234", struct.pack("<I", 2**32 - 1)]
 )

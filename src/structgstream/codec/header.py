@@ -21,7 +21,7 @@ from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import REQUIRED, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
 
-MAX_JSON_BYTES = 16 * 2**20
+MAX_JSON_BYTES = 2**20
 MAX_IMAGE_SIDE = 65_535
 LENGTH = struct.Struct("<I")
 _ZSTD_LEVEL = 19
@@ -32,7 +32,7 @@ def packed_header(header: StreamHeader) -> bytes:
     """The payload of an init record.
 
     Raises:
-        StreamError: with codec ``compact``, a field is not made of bins.
+        StreamError: the description is too long, or, with codec ``compact``, a field is not made of bins.
     """
     description = {
         "cameras": [
@@ -58,6 +58,11 @@ def packed_header(header: StreamHeader) -> bytes:
         **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
     }
     text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
+    if len(text) > MAX_JSON_BYTES:
+        raise StreamError(
+            f"The header's description has {len(text)} bytes, at most {MAX_JSON_BYTES} are allowed; "
+            "leave out metadata or cameras."
+        )
     packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encoded_fields(fields, header.init_steps) if header.codec == "compact" else {}
@@ -140,6 +145,8 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
     cameras = {entry["name"]: _camera(entry) for entry in description["cameras"]}
     if len(cameras) != len(description["cameras"]) or not all(isinstance(name, str) for name in cameras):
         raise ValueError("camera names must be texts, each used once")
+    if not all(isinstance(entry["held_out"], bool) for entry in description["cameras"]):
+        raise TypeError("held_out must be true or false")
     dynamic: frozenset[FieldName] = frozenset(description["dynamic"])
     x, y, z = (_number(value) for value in description["similarity"]["center"])
     plain = [description["config"], description["metadata"]]

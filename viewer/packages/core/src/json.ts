@@ -5,7 +5,7 @@ import { decompress } from "fzstd";
 import { StreamError } from "./errors.js";
 import { viewOf } from "./records.js";
 
-const MAX_JSON_BYTES = 16 * 2 ** 20;
+const MAX_JSON_BYTES = 2 ** 20;
 const ZSTD_MAGIC = 0xfd2fb528;
 
 /**
