@@ -38,3 +38,15 @@ def test_features_are_f_v_and_the_appearance() -> None:
     z = torch.randn(len(dressed.anchors), 2, generator=torch.Generator().manual_seed(0))
     moved = replace(dressed, anchors=replace(dressed.anchors, appearance=z))
     torch.testing.assert_close(moved.features, dressed.anchors.features + z @ dressed.appearance_basis)
+
+
+def test_baked_it_looks_the_same() -> None:
+    dressed = with_appearance(random_scene(free=3), 4)
+    appearance = torch.randn(dressed.anchors.appearance.shape, generator=torch.Generator().manual_seed(0))
+    changed = replace(dressed, anchors=replace(dressed.anchors, appearance=appearance))
+    baked = changed.baked()
+    assert torch.equal(baked.features, changed.features)
+    assert baked.appearance_basis.shape == (0, changed.anchors.features.shape[1])
+    assert baked.anchors.appearance.shape == (len(changed.anchors), 0)
+    plain = random_scene()
+    assert plain.baked() is plain

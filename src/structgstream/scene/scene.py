@@ -43,6 +43,18 @@ class Scene:
             return anchors.features
         return anchors.features + anchors.appearance @ self.appearance_basis
 
+    def baked(self) -> "Scene":
+        """The same looks, with the appearance in the features: for many looks at a scene that stays as it is."""
+        anchors = self.anchors
+        if not len(self.appearance_basis):
+            return self
+        none = anchors.appearance[:, :0].contiguous()
+        return replace(
+            self,
+            anchors=replace(anchors, features=self.features, appearance=none),
+            appearance_basis=self.appearance_basis[:0],
+        )
+
     def structured(
         self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None
     ) -> tuple[StructuredGaussians, Tensor]:

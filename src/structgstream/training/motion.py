@@ -114,6 +114,7 @@ def moving_parts(
     most = torch.zeros(free, device=votes.device)
     shown: dict[int, Tensor] = {}
     with torch.no_grad():
+        scene = scene.baked()
         for view, last in zip(views, before, strict=True):
             changed = backend.changed_pixels(
                 last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels

@@ -63,12 +63,12 @@ class Partition:
 
 def focuses(partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend) -> dict[int, Focus]:
     """By index, the views that the moving part shows in, and where."""
-    which, moving = partition.which, partition.moving
+    which, moving, still = partition.which, partition.moving.baked(), partition.still.baked()
     k = moving.anchors.offsets_per_anchor
     rows = torch.cat([which.anchors.repeat_interleave(k), which.free])  # of the whole scene's Gaussians
     with torch.no_grad():
         found = {
-            view.index: _focus(partition.still, moving, which.shown[view.index][rows], view.camera, config, backend)
+            view.index: _focus(still, moving, which.shown[view.index][rows], view.camera, config, backend)
             for view in views
         }
     return {index: focus for index, focus in found.items() if focus is not None}
