@@ -10,7 +10,7 @@ import torch
 from plyfile import PlyData
 
 from rigs import random_scene
-from streams import header_for, write_stream
+from streams import compact_header, header_for, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
@@ -100,7 +100,7 @@ def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
         (["-o", "x.ply", "--frame", "3"], "frames 0 to 2; there is no frame 3"),
         (["-o", "x.ply", "--frame", "-1"], "no frame -1"),
         (["-o", "x", "--frames", "1", "7"], "no range from 1 to 7"),
-        (["-o", "x", "--frames", "2", "1"], "no range from 2 to 1"),
+        (["-o", "x", "--frames", "2", "1"], "2 comes after 1"),
         (["-o", "x.ply", "--frame", "0", "--frames", "0", "1"], "give one of them"),
         (["-o", "x.ply", "--frame", "0", "--format", "spz"], "asks for .ply, and --format for spz"),
         (["-o", "x.splat", "--frame", "0", "--sh-degree", "1"], "one colour"),
@@ -120,6 +120,30 @@ def test_wrong_requests(
     assert not list(tmp_path.iterdir())
 
 
+def test_of_a_damaged_stream_what_can_be_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = frames_of_a_scene(anchors=8, free=2) * 3
+    header = compact_header(scenes[0])
+    whole = tmp_path / "whole.sgs"
+    write_stream(FileSink(whole), scenes, header=header)
+    data = bytearray(whole.read_bytes())
+    data[open_stream(whole).packets[4].offset + 30] ^= 1  # Frame 6 is the next key packet.
+    damaged = tmp_path / "damaged.sgs"
+    damaged.write_bytes(data)
+    common = ["export", str(damaged), "--device", "reference", "-o"]
+    assert main([*common, str(tmp_path / "all")]) == 0
+    assert "2 of 9 frames are lost, the first is 4" in capsys.readouterr().out
+    assert sorted(entry.stem for entry in (tmp_path / "all").iterdir()) == [
+        f"frame_{i:06d}" for i in (0, 1, 2, 3, 6, 7, 8)
+    ]
+    assert main([*common, str(tmp_path / "some"), "--frames", "6", "7"]) == 0
+    assert len(list((tmp_path / "some").iterdir())) == 2
+    for frames in (("--frames", "3", "6"), ("--frames", "4", "5")):
+        error = error_of([str(damaged), "-o", str(tmp_path / "none"), *frames], capsys, status=2)
+        assert "the stream has frames 0 to 3 and 6 to 8; there is no range from" in error
+    assert "is damaged" in error_of([str(damaged), "-o", str(tmp_path / "x.ply"), "--frame", "4"], capsys, status=1)
+    assert main([*common, str(tmp_path / "x.ply"), "--frame", "8"]) == 0
+
+
 def test_problems_of_the_stream_and_of_the_disk(
     stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,5 +154,5 @@ def test_problems_of_the_stream_and_of_the_disk(
     assert "no such" in error_of([str(tmp_path / "none.sgs")], capsys, status=1).lower()
     (tmp_path / "file").write_text("")
     inside = ["-o", str(tmp_path / "file" / "x.ply"), "--frame", "0"]
-    assert "cannot be written" in error_of([str(stream), *inside], capsys, status=1)
+    assert f"cannot be written ({tmp_path / 'file'} is a file)" in error_of([str(stream), *inside], capsys, status=1)
     assert {entry.name for entry in tmp_path.iterdir()} == {"empty.sgs", "file"}

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``inspect``: bytes by field of header and packets, listed and drawn."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -103,3 +104,22 @@ def test_pictures_that_cannot_be(streams: dict[str, Path], tmp_path: Path, capsy
     (tmp_path / "file").write_text("")
     assert main(["inspect", str(streams["raw"]), "--plot", str(tmp_path / "file" / "x.png")]) == 1
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_damage_is_told_and_what_follows_it_is_listed(
+    streams: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray(streams["compact"].read_bytes())
+    lost = open_stream(streams["compact"]).packets[4]
+    data[lost.offset + 30] ^= 1  # Frame 6 is the next key packet.
+    damaged = tmp_path / "damaged.sgs"
+    damaged.write_bytes(data)
+    lines = shown([str(damaged), "--all-packets", "--json", str(tmp_path / "i.json")], capsys)
+    listed = [int(line[0]) for line in lines if len(line) > 2 and line[1] in ("key", "delta") and line[0] != "mean"]
+    assert listed == [0, 1, 2, 3, *range(6, FRAMES)]
+    state = " ".join(" ".join(line) for line in lines)
+    assert f"damaged: the record at byte {lost.offset} of" in state
+    assert "2 of 31 frames are lost" in state
+    content = json.loads((tmp_path / "i.json").read_text())
+    assert content["header"]["damage"] == [{"offset": lost.offset, "first": 4, "end": 6}]
+    assert [packet["index"] for packet in content["packets"]] == listed

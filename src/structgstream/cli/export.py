@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream export``."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +16,6 @@ from structgstream.export.formats import FORMATS, Format
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
-    from structgstream.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -82,8 +80,8 @@ def main(arguments: list[str]) -> None:
     )
     with bar:
         task = bar.add_task("frames", total=len(numbers))
-        for number, scene in scenes_of(reader, numbers):
-            plain = baked(on_device(scene, backend.device), cameras, backend, baking=baking)
+        for number in numbers:
+            plain = baked(on_device(reader.scene(number), backend.device), cameras, backend, baking=baking)
             path = output if single else output / f"frame_{number:06d}.{format}"
             plain = plain.in_capture_units(reader.header.similarity)
             written += write_gaussians(path, plain, format=format)
@@ -91,7 +89,10 @@ def main(arguments: list[str]) -> None:
             bar.advance(task)
     what = "1 frame" if len(numbers) == 1 else f"{len(numbers)} frames"
     text = f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(written)}"
-    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+    console = Console()
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    if reader.damage:
+        console.print(f"The stream is damaged: {reader.cut_reason}.", highlight=False, markup=False, soft_wrap=True)
 
 
 def destination(options: Export) -> tuple[Path, Format]:
@@ -138,25 +139,21 @@ def checked_degree(degree: int | None, format: Format) -> int | None:
     return degree
 
 
-def chosen_frames(reader: "StreamReader", options: Export) -> range:
+def chosen_frames(reader: "StreamReader", options: Export) -> list[int]:
     """Numbers of the frames to write.
 
     Raises:
-        UsageError: there is no such frame.
+        UsageError: there is no such frame, or it is lost.
     """
-    have = len(reader.packets)
-    first, last = (options.frame, options.frame) if options.frame is not None else options.frames or (0, have - 1)
-    if not have:
+    if not reader.runs:
         raise UsageError("the stream has no whole frame.")
-    if not 0 <= first <= last < have:
+    if options.frame is None and options.frames is None:
+        return [index for run in reader.runs for index in run]
+    first, last = options.frames or (options.frame or 0, options.frame or 0)
+    if first > last:
+        raise UsageError(f"--frames names the first frame, then the last; {first} comes after {last}.")
+    if not any(first in run and last in run for run in reader.runs):
         asked = f"frame {first}" if first == last else f"range from {first} to {last}"
-        raise UsageError(f"the stream has frames 0 to {have - 1}; there is no {asked}.")
-    return range(first, last + 1)
-
-
-def scenes_of(reader: "StreamReader", numbers: range) -> "Iterator[tuple[int, Scene]]":
-    """The decoded scenes of these frames, with their numbers."""
-    if len(numbers) == 1:
-        yield numbers[0], reader.scene(numbers[0])
-        return
-    yield from zip(numbers, (scene for _, scene in reader.scenes(numbers.start)))
+        have = " and ".join(f"{run.start} to {run.stop - 1}" for run in reader.runs)
+        raise UsageError(f"the stream has frames {have}; there is no {asked}.")
+    return list(range(first, last + 1))

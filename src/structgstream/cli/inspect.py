@@ -125,6 +125,9 @@ def described(reader: "StreamReader", rows: "Sequence[Row]") -> dict[str, Any]:
             "frames": len(packets),
             "complete": reader.complete,
             "cut_reason": reader.cut_reason,
+            "damage": [
+                {"offset": one.offset, "first": one.frames.start, "end": one.frames.stop} for one in reader.damage
+            ],
             "header_bytes": reader.header_bytes,
             "total_bytes": reader.total_bytes,
             "similarity": {"center": list(header.similarity.center), "scale": header.similarity.scale},

@@ -32,7 +32,8 @@ def facts(header: Mapping[str, Any], rows: "Sequence[Row]") -> Table:
     if rows:
         table.add_row("rate", rate(rows, header["fps"]))
     table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
-    table.add_row("state", "complete" if header["complete"] else f"not finished: {header['cut_reason']}")
+    state = "damaged" if header["damage"] else "not finished"
+    table.add_row("state", "complete" if header["complete"] else f"{state}: {header['cut_reason']}")
     return table
 
 

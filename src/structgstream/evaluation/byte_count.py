@@ -38,11 +38,18 @@ class Group:
 
 
 def rows_of(reader: StreamReader) -> list[Row]:
-    """Every packet of a stream."""
+    """The packet of every frame that can be shown."""
+    infos = (reader.packets.at(index) for run in reader.runs for index in run)
     return [
-        Row(info.index, PacketKind(info.kind).name.lower(), info.pts_seconds, info.offset, info.bytes, sizes)
-        for info in reader.packets
-        for sizes in [with_rest(info.field_bytes, info.bytes)]
+        Row(
+            info.index,
+            PacketKind(info.kind).name.lower(),
+            info.pts_seconds,
+            info.offset,
+            info.bytes,
+            with_rest(info.field_bytes, info.bytes),
+        )
+        for info in infos
     ]
 
 
@@ -66,9 +73,9 @@ def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
     The first is no key packet as others are: with the codec ``compact`` all that it could say is in the header.
     """
     chosen = {
-        FIRST: rows[:1],
-        "key packets": [row for row in rows[1:] if row.kind == "key"],
-        "delta packets": [row for row in rows[1:] if row.kind == "delta"],
+        FIRST: [row for row in rows if row.index == 0],
+        "key packets": [row for row in rows if row.kind == "key" and row.index > 0],
+        "delta packets": [row for row in rows if row.kind == "delta"],
     }
     return {name: mean_of(some) for name, some in chosen.items() if some}
 

@@ -50,5 +50,6 @@ def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) ->
             partial.unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
+        reason = f"{path.parent} is a file" if path.parent.is_file() else error.strerror
+        raise StorageError(f"{path} cannot be written ({reason}).") from None
     return len(data)
