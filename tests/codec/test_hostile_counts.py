@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every count of a compact stream made as large as it can be: refused, and before memory is taken for it."""
+
+import tracemalloc
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from streams import compact_header, small_scene
+from structgstream.codec import coder, rans
+from structgstream.codec.blocks import BLOCK, blocks_in, mixed_blocks
+from structgstream.codec.coder import Decoder, varint
+from structgstream.codec.compact import CODABLE, CompactDecoder, CompactEncoder
+from structgstream.codec.header import LENGTH, packed_header, unpacked_header
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.static_fields import decoded_fields
+from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.state import FieldName, state_of
+
+Fields = Mapping[FieldName, bytes]
+HUGE = (2**20, 2**32 - 1)
+MOST_BYTES = 48 * 2**20
+"""What a decoder may take for a file of a few kilobytes: 2^20 numbers, in all that they are on the way."""
+VALUES = ("origin", "descends", "middle")
+"""Numbers that are no counts: as large as these is as good as any."""
+
+
+class Count(NamedTuple):
+    """A varint of a field's bytes, from byte ``start`` to before ``end``."""
+
+    field: FieldName
+    start: int
+    end: int
+
+
+def header_with_all() -> tuple[StreamHeader, Fields]:
+    """A header, and the first packet's fields, that have everything that can be there."""
+    first = with_appearance(small_scene(2, free=3), 1)
+    header = compact_header(first, dynamic=CODABLE)
+    return header, CompactEncoder(header).encode(state_of(first), kind=PacketKind.KEY, index=0)
+
+
+def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]:
+    """Where decoding reads counts: numbers, and those in the heads of sections."""
+    found: set[Count] = set()
+    number, section_bytes, read = Decoder.number, coder.section_bytes, rans._read_varint
+    sections: list[tuple[FieldName, int]] = []
+
+    def logged_number(self: Decoder, name: str, value: int | None) -> int:
+        field: FieldName = next(known for known in fields if known == name.partition(".")[0])
+        start = len(fields[field]) - len(self._left[field])
+        result = number(self, name, value)
+        if not name.endswith(VALUES):
+            found.add(Count(field, start, len(fields[field]) - len(self._left[field])))
+        return result
+
+    def logged_section(data: memoryview, *, where: str) -> int:
+        field: FieldName = next(known for known in fields if fields[known].endswith(bytes(data)))
+        sections.append((field, len(fields[field]) - len(data)))
+        return section_bytes(data, where=where)
+
+    def logged_read(data: memoryview, start: int, *, where: str) -> tuple[int, int]:
+        value, end = read(data, start, where=where)
+        field, base = sections[-1]
+        found.add(Count(field, base + start, base + end))
+        return value, end
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Decoder, "number", logged_number)
+        patch.setattr(coder, "section_bytes", logged_section)
+        patch.setattr(rans, "_read_varint", logged_read)
+        decode(fields)
+    return sorted(found)
+
+
+def enlarged(fields: Fields, counts: list[Count]) -> Iterator[tuple[Count, int, Fields]]:
+    for count in counts:
+        data = fields[count.field]
+        for value in (*HUGE, 2**35 - 1):
+            yield count, value, {**fields, count.field: data[: count.start] + varint(value) + data[count.end :]}
+
+
+def check_all_refused(fields: Fields, counts: list[Count], decode: Callable[[Fields], object]) -> None:
+    tracemalloc.start()
+    try:
+        for count, value, changed in enlarged(fields, counts):
+            tracemalloc.reset_peak()
+            with pytest.raises(StreamError):
+                print(count, value, decode(changed))
+            assert tracemalloc.get_traced_memory()[1] < MOST_BYTES, (count, value)
+    finally:
+        tracemalloc.stop()
+
+
+def test_counts_in_packets() -> None:
+    header, fields = header_with_all()
+
+    def decode(given: Fields) -> object:
+        return CompactDecoder(header).decode(given, kind=PacketKind.KEY, index=0)
+
+    counts = counts_of(fields, decode)
+    assert len(counts) > 80
+    assert {count.field for count in counts} == CODABLE
+    check_all_refused(fields, counts, decode)
+
+
+def test_counts_in_the_init_record() -> None:
+    header, _ = header_with_all()
+    payload = packed_header(header)
+    (length,) = LENGTH.unpack_from(payload)
+    coded = mixed_blocks(payload, LENGTH.size + length, where="")[1]
+    fields: Fields = {name: bytes(data) for name, data in coded.items()}
+
+    def decode(given: Fields) -> object:
+        return decoded_fields(given, header.init_steps)
+
+    counts = counts_of(fields, decode)
+    assert len(counts) > 80
+    assert {count.field for count in counts} == fields.keys()
+    check_all_refused(fields, counts, decode)
+
+
+def test_sizes_in_blocks() -> None:
+    payload = packed_header(header_with_all()[0])
+    (length,) = LENGTH.unpack_from(payload)
+    tracemalloc.start()
+    for block in blocks_in(payload, LENGTH.size + length, where=""):
+        for place in range(block.start + BLOCK.size, block.data, 4):
+            for value in HUGE:
+                tracemalloc.reset_peak()
+                with pytest.raises(StreamError, match="The init record"):
+                    unpacked_header(payload[:place] + value.to_bytes(4, "little") + payload[place + 4 :])
+                assert tracemalloc.get_traced_memory()[1] < MOST_BYTES
+    tracemalloc.stop()
+
+
+def test_as_many_free_gaussians_as_a_scene_may_have_take_bounded_memory() -> None:
+    """They stand for the most that a few hundred bytes of a packet can."""
+    first = small_scene(1)
+    header = compact_header(first)
+    state = dict(state_of(first))
+    state["free"], state["free_births"] = torch.zeros(2**18, 14), torch.arange(2**18)
+    fields = CompactEncoder(header).encode(state, kind=PacketKind.KEY, index=0)
+    assert sum(map(len, fields.values())) < 400
+    tracemalloc.start()
+    found = CompactDecoder(header).decode(fields, kind=PacketKind.KEY, index=0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.array_equal(found["free_births"].numpy(), np.arange(2**18))
+    assert peak < 300 * 2**20
