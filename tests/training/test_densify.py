@@ -16,7 +16,7 @@ def prepared():
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
     densifier = Densifier.of(scene, config=CONFIG, voxel_size=0.01)
     adam = Adam(reference_backend())
-    gradients = {name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS}
+    gradients = {name: torch.ones_like(row) for name, row in parameters.values.items() if name in ANCHOR_ROWS}
     adam.step(parameters, gradients, dict.fromkeys(ANCHOR_ROWS, 1e-9))
     return scene, parameters, densifier, adam
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each term beside the paper's equation in plain NumPy."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -35,7 +37,7 @@ def test_volume_of_nothing_is_zero_and_differentiable() -> None:
 
 
 @pytest.mark.parametrize("reading", ["scaled", "raw", "norm"])
-def test_offset_distance_counts_what_is_beyond_two_voxels(reading: str) -> None:
+def test_offset_distance_counts_what_is_beyond_two_voxels(reading: Literal["scaled", "raw", "norm"]) -> None:
     anchors = random_scene().anchors
     offsets = anchors.offsets.double().numpy()
     scaled = offsets * np.exp(anchors.log_offset_scales.double().numpy())[:, None]

@@ -22,7 +22,7 @@ WHOLE = "compact"
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode on the frame 0 that the compact stream begins with."""
 DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{field.name}" for field in fields(DisturbanceConfig))
-EASED, LEAST_GAIN, OTHER_RANK = 0.5, 0.02, 8
+EASED, LEAST_GAIN, OTHER_RANK = 0.5, 0.1, 8
 """What is tried where the whole has it not."""
 REFRESH_FRAMES = 5
 """MLPs can change only in frames in which everything may move; this often, where one is trained."""

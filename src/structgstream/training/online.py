@@ -82,8 +82,8 @@ class OnlineConfig:
     motion_prior: float = 0.0
     """Anchors that move begin a frame this share of their last step further on (the paper: 0, where they are)."""
     least_gain: float = 0.0
-    """A frame ends, and patching comes, early when its views gain less than this share of their loss from one look to
-    the next (the paper: 0, never)."""
+    """A frame ends, and patching comes, early when ``iterations`` at the present pace would lower its loss by less than
+    this share (the paper: 0, never)."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
 
 
@@ -218,7 +218,7 @@ class _Fit:
         adam = Adam(self.backend)
         statistics = GradientStatistics(_slots(scene), self.backend.device)
         last_pass = LastPass()
-        settling = Settling(config.least_gain, len(seen))
+        settling = Settling(config.least_gain * len(views) / max(1, config.iterations), len(seen))
         tells_every = 1 if self.backend.device.type == "cpu" else 10  # Asking a GPU for the loss waits for it.
         spawned = pruned = iteration = 0
         while iteration < iterations and not (iteration > patch_at and settling.settled):

@@ -64,18 +64,21 @@ class RoundingConfig:
     """Noise that rounding frame 0 may add to the pictures: root of the mean square, in 8-bit levels."""
     first_weight_step: float = 1 / 1024
     """Of the weights of MLPs in frame 0."""
-    rate_weight: float = 1e-4
+    rate_weight: float = 1.5e-4
     """Weight in the loss of the bits of a moving anchor."""
     free_priced: bool = False
     """Whether a bit of a free Gaussian that was there before costs as much."""
     quality: float = 0.0
-    """One knob over all of the above: 1 more makes every step half as large, and a bit a quarter as dear."""
+    """One knob over all of the above: 1 more makes every step half as large, and a bit a quarter as dear. Frame 0
+    follows by half of that."""
 
     def resolved(self) -> "RoundingConfig":
         """The same, with the quality put into the other fields and itself 0."""
         kept = ("rate_weight", "free_priced", "quality")
         steps = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in kept}
-        finer = {name: step * 2.0**-self.quality for name, step in steps.items()}
+        # What frame 0 loses every later frame lacks, and its bytes come once: it follows by half.
+        share = {name: 0.5 if name.startswith("first_") else 1.0 for name in steps}
+        finer = {name: step * 2.0 ** (-self.quality * share[name]) for name, step in steps.items()}
         # Errors grow with the square of a step.
         return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
 
