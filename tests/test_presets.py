@@ -4,7 +4,7 @@ from dataclasses import fields, is_dataclass
 
 import pytest
 
-from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PRESETS, to_json
+from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_MODE, PRESETS, to_json
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -16,12 +16,14 @@ def test_every_preset_is_plain_json(name: str) -> None:
 def test_the_named_defaults_exist() -> None:
     assert DEFAULT_PRESET in PRESETS
     assert DEMO_PRESET in PRESETS
+    assert PRESETS[PAPER_MODE].codec == "raw" != PRESETS[DEFAULT_PRESET].codec
 
 
 def frozen(value: object) -> bool:
     if not is_dataclass(value):
         return True
-    return type(value).__dataclass_params__.frozen and all(frozen(getattr(value, f.name)) for f in fields(value))
+    parameters = type(value).__dataclass_params__  # pyright: ignore[reportAttributeAccessIssue] -- of every dataclass
+    return parameters.frozen and all(frozen(getattr(value, f.name)) for f in fields(value))
 
 
 def test_configurations_are_values() -> None:

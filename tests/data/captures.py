@@ -27,7 +27,7 @@ def picture(camera: int, frame: int, *, width: int = WIDTH, height: int = HEIGHT
     bits[0] += np.array([150 * (camera >> bit & 1) for bit in range(8)], np.uint8)
     bits[1] += np.array([150 * (frame >> bit & 1) for bit in range(8)], np.uint8)
     grey = cv2.resize(bits, (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.repeat(grey[..., None], 3, axis=2)
+    return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
 
 
 def numbers(image: Picture) -> tuple[int, int]:

@@ -57,7 +57,7 @@ def distance_to_surface(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _hit(camera: Camera) -> tuple[NDArray[np.float64], ...]:
     """Depth, texture coordinates and number of the plane ``[H, W]`` that each pixel sees."""
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    pixels = np.stack([column.ravel(), row.ravel()], 1)
+    pixels = np.stack([column.ravel(), row.ravel()], 1).astype(np.float64)
     eye = camera.center.numpy()
     direction = back_project(camera, pixels, np.ones(len(pixels))) - eye
     with np.errstate(divide="ignore"):

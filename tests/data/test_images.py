@@ -2,11 +2,11 @@
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from captures import all_numbers, picture, small_rig, write_picture
+from drawn import pixels_of
 from structgstream.data.images import ImageSource, common_pictures
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 
@@ -49,7 +49,7 @@ def test_an_orientation_tag_does_not_turn_the_calibrated_pixels(source: ImageSou
     turned = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # TIFF: orientation 6
     exif = b"Exif\0\0" + turned
     path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
-    assert cv2.imread(str(path)).shape == (64, 48, 3)
+    assert pixels_of(path).shape == (64, 48, 3)
     assert next(source.frames()).images["cam00"].shape == (48, 64, 3)
 
 

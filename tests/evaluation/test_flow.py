@@ -13,7 +13,7 @@ from structgstream.evaluation.flow import agreeing, dis_flow, inside, sampled
 
 def textured(height: int = 96, width: int = 128) -> np.ndarray:
     noise = np.random.default_rng(3).integers(0, 256, (height, width, 3)).astype(np.uint8)
-    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), np.empty_like(noise), 0, 255, cv2.NORM_MINMAX)
 
 
 def constant(dx: float, dy: float, height: int = 6, width: int = 8) -> np.ndarray:

@@ -55,6 +55,7 @@ def seeded(trunk: Trunk) -> nn.Sequential:
     for module in net:
         if isinstance(module, nn.Conv2d):
             nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            assert module.bias is not None
             nn.init.normal_(module.bias, std=0.1)
     return net
 

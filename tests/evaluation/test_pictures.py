@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from drawn import pixels_of
 from structgstream.evaluation.pictures import contact_sheet, difference, sampled, side_by_side, thumbnail
 
 
@@ -43,7 +44,7 @@ def test_a_contact_sheet_shows_every_picture_pixel_for_pixel(tmp_path: Path) -> 
         for name in ("a", "b")
     }
     contact_sheet(tmp_path / "sheet.png", cells, title="a result")  # pyright: ignore[reportArgumentType]
-    sheet = cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1]
+    sheet = pixels_of(tmp_path / "sheet.png")
     for pictures in cells.values():
         for pair in pictures.values():
             for picture in pair:

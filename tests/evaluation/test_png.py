@@ -15,6 +15,7 @@ from structgstream.evaluation.png import png_bytes, write_png
 def test_a_decoder_gives_the_same_pixels(shape: tuple[int, int, int]) -> None:
     picture = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     decoded = cv2.imdecode(np.frombuffer(png_bytes(picture), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None
     np.testing.assert_array_equal(decoded[..., ::-1], picture)
 
 

@@ -5,9 +5,9 @@ import json
 from dataclasses import fields, replace
 from pathlib import Path
 
-import cv2
 import pytest
 
+from drawn import pixels_of
 from structgstream.errors import StorageError
 from structgstream.evaluation.plots import write_plots
 from structgstream.evaluation.report import (
@@ -122,6 +122,6 @@ def test_plots_have_a_panel_more_with_a_log(tmp_path: Path) -> None:
     )
     scored = [replace(frame, mean=replace(frame.mean, flip=0.1, flicker=0.5)) for frame in report.frames]
     write_plots(tmp_path / "scored.png", replace(report, frames=scored), title="a result")
-    heights = [cv2.imread(str(tmp_path / f"{name}.png")).shape[0] for name in ("with", "without", "scored")]
+    heights = [pixels_of(tmp_path / f"{name}.png").shape[0] for name in ("with", "without", "scored")]
     assert heights[2] > heights[0] > heights[1] > 500
     assert heights[2] - heights[0] == pytest.approx(2 * (heights[0] - heights[1]), abs=2)

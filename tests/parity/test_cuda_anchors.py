@@ -116,7 +116,8 @@ def test_pictures_and_their_gradients() -> None:
     for module in (cuda_anchors, reference_anchors):
         g = generate(module, values, visible(module, values), distance_input=True)
         attributes = [getattr(g, name) for name in ATTRIBUTES]
-        image = reference_raster.rasterize(*attributes, *matrices(values[0]), **CAMERA).image
+        viewmat, K = matrices(values[0])
+        image = reference_raster.rasterize(*attributes, viewmat=viewmat, K=K, **CAMERA).image
         loss = (image * weights).sum() + g.scales.prod(1).sum() / (g.opacities > 0).sum()
         pictures.append(image.detach())
         gradients.append(torch.autograd.grad(loss, [values[i] for i in trained]))
@@ -142,8 +143,10 @@ def test_nothing_waits_for_the_gpu() -> None:
     center = torch.zeros(3, device="cuda")
     torch.cuda.set_sync_debug_mode("error")
     try:
-        seen = cuda_anchors.visible_anchors(*values[:4], viewmat, K, **CAMERA)
-        g = cuda_anchors.generate_structured(*values[:5], mlps, center, seen, distance_input=True)
+        seen = cuda_anchors.visible_anchors(*values[:4], viewmat=viewmat, K=K, **CAMERA)
+        g = cuda_anchors.generate_structured(
+            *values[:5], mlps=mlps, camera_center=center, visible=seen, distance_input=True
+        )
         torch.autograd.grad(sum(getattr(g, name).sum() for name in ATTRIBUTES), values)  # type: ignore[arg-type]
     finally:
         torch.cuda.set_sync_debug_mode("default")

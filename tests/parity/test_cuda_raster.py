@@ -121,7 +121,7 @@ def run(rasterize: Rasterize, values: list[Tensor], **options) -> tuple[list[Ten
     viewmat = torch.eye(4).to(values[0])
     K = torch.tensor([[30.0, 0, 20.0], [0, 31.0, 17.0], [0, 0, 1]]).to(values[0])
     output = rasterize(
-        *leaves[:5], viewmat, K, width=WIDTH, height=HEIGHT, near=NEAR, screen_offsets=leaves[5], **options
+        *leaves[:5], viewmat=viewmat, K=K, width=WIDTH, height=HEIGHT, near=NEAR, screen_offsets=leaves[5], **options
     )
     generator = torch.Generator().manual_seed(3)
     v_image = torch.rand(HEIGHT, WIDTH, 3, generator=generator).to(values[0])
@@ -191,7 +191,14 @@ def test_with_a_budget_nothing_waits_for_the_gpu() -> None:
 
     def once() -> None:
         output = cuda.rasterize(
-            *leaves[:5], viewmat, K, width=WIDTH, height=HEIGHT, near=NEAR, screen_offsets=leaves[5], budget=budget
+            *leaves[:5],
+            viewmat=viewmat,
+            K=K,
+            width=WIDTH,
+            height=HEIGHT,
+            near=NEAR,
+            screen_offsets=leaves[5],
+            budget=budget,
         )
         torch.autograd.grad(output.image.sum(), leaves)
 

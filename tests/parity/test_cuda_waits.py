@@ -48,8 +48,12 @@ def test_seeing_and_dressing_anchors(tiled: bool) -> None:
     viewmat, K = torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 20], [0, 0, 1]])
     tiles = torch.rand(tiles_of(40, 40)) < 0.5 if tiled else None
     with NoWaiting():
-        seen = cuda_anchors.visible_anchors(*values[:4], viewmat, K, width=40, height=40, near=0.1, tiles=tiles)
-        g = cuda_anchors.generate_structured(*values, mlps, torch.zeros(3), seen, distance_input=True)
+        seen = cuda_anchors.visible_anchors(
+            *values[:4], viewmat=viewmat, K=K, width=40, height=40, near=0.1, tiles=tiles
+        )
+        g = cuda_anchors.generate_structured(
+            *values, mlps=mlps, camera_center=torch.zeros(3), visible=seen, distance_input=True
+        )
         total = g.means.sum() + g.quats.sum() + g.scales.sum() + g.opacities.sum() + g.colors.sum()
         torch.autograd.grad(total, [*values, *(weight for head in mlps for weight in head)])
 
@@ -72,7 +76,9 @@ def test_what_the_other_back_ends_do_is_caught() -> None:
     values, mlps = anchors()
     seen = torch.arange(30)
     with NoWaiting(), pytest.raises(RuntimeError, match="nonzero"):
-        reference_anchors.generate_structured(*values, mlps, torch.zeros(3), seen, distance_input=True)
+        reference_anchors.generate_structured(
+            *values, mlps=mlps, camera_center=torch.zeros(3), visible=seen, distance_input=True
+        )
     with NoWaiting(), pytest.raises(RuntimeError, match="index"):
         torch.ones(3)[torch.tensor([True, False, True])]
     with NoWaiting(), pytest.raises(RuntimeError, match="_local_scalar_dense"):

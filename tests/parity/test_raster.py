@@ -82,7 +82,7 @@ def safe_pixels(inputs: tuple[Tensor, ...]) -> Tensor:
             reference_raster.MIN_ALPHA = saved[0] * factor
             reference_raster.MAX_ALPHA = 1 - (1 - saved[1]) * factor
             reference_raster.MIN_TRANSMITTANCE = saved[2] * factor
-            pictures.append(reference(*values[:5], viewmat, K, width=WIDTH, height=HEIGHT, near=NEAR).image)
+            pictures.append(reference(*values[:5], viewmat=viewmat, K=K, width=WIDTH, height=HEIGHT, near=NEAR).image)
     finally:
         reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE = saved
     return ((pictures[0] - pictures[1]).abs().amax(-1) < 1e-7).double()
@@ -183,7 +183,7 @@ def test_the_state_is_freed_without_a_backward_pass() -> None:
     peaks = []
     for _ in range(3):
         for _ in range(40):
-            cpu_raster.rasterize(*inputs, viewmat, K, width=320, height=240, near=NEAR)
+            cpu_raster.rasterize(*inputs, viewmat=viewmat, K=K, width=320, height=240, near=NEAR)
         peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     assert peaks[2] - peaks[0] < 20_000  # kB; 80 states that leaked would hold more than 60,000
 
@@ -193,7 +193,7 @@ def test_another_precision_is_refused_with_a_way_out() -> None:
 
     viewmat, K = camera()
     with pytest.raises(BackendError, match="reference back-end"):
-        cpu_raster.rasterize(*gaussians(3)[:5], viewmat, K, width=8, height=8, near=NEAR)
+        cpu_raster.rasterize(*gaussians(3)[:5], viewmat=viewmat, K=K, width=8, height=8, near=NEAR)
 
 
 def some_tiles() -> Tensor:

@@ -48,7 +48,7 @@ def frame(i: int) -> Arrays:
         "single": rng.normal(size=(2, 2, 2)).astype(np.float32),
         "bytes": rng.integers(0, 256, size=5).astype(np.uint8),
         "ids": rng.integers(-9, 9, size=(i, 4)).astype(np.int64),
-        "scalar": np.float32(i).reshape(()),
+        "scalar": np.array(i, np.float32),
     }
 
 
@@ -61,7 +61,7 @@ def written(path: Path, frames: int = 3) -> bytes:
     return path.read_bytes()
 
 
-def read(data: bytes) -> PeerReader[list]:
+def read(data: bytes) -> PeerReader[Any]:
     return PeerReader(data, lambda _: Keeps())  # type: ignore[arg-type, return-value]
 
 

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from structgstream.codec.records import scanned
 from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.kernels.backend import reference_backend
 from structgstream.peers.container import is_peer_file
-from structgstream.peers.methods import METHODS, TINY_METHODS, open_peer
+from structgstream.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream.peers.session import PeerSession
 from structgstream.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig
 from structgstream.scene.render import render
@@ -31,7 +32,8 @@ class Run:
         self.capture = moving_capture()
         self.watched = Watched(TINY_METHODS[name])
         self.path = folder / f"{name}.sgp"
-        self.reports = list(PeerSession(self.capture, self.path, self.watched, BACKEND, seed=5).run())
+        method: AnyMethod = cast("AnyMethod", self.watched)
+        self.reports = list(PeerSession(self.capture, self.path, method, BACKEND, seed=5).run())
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +173,7 @@ def test_additions_live_for_one_frame(runs: dict[str, Run]) -> None:
 def test_sizes_are_those_of_the_cache(runs: dict[str, Run]) -> None:
     run = runs["3dgstream"]
     grid = TINY_METHODS["3dgstream"].config.grid
-    sizes = dict(run.reports[1].field_bytes)
+    sizes: dict[str, int] = {**run.reports[1].field_bytes}
     assert sizes["grid"] == 2 * grid.total_rows * grid.features + 4 + 4 + 8
     assert sizes["network"] == 2 * grid.weights + 4 + 7 + 4
     added = len(run.watched.fits[1].state.added)

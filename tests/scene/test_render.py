@@ -41,5 +41,6 @@ def test_the_screen_gradient_is_the_gradient_of_the_projected_mean() -> None:
         )
         sums.append((moved.image * target).sum())
     assert rendering.screen_offsets is not None
+    assert rendering.screen_offsets.grad is not None
     total = rendering.screen_offsets.grad[:, 0].sum()
     assert torch.allclose(total, (sums[0] - sums[1]) / (2 * step), rtol=0.05)

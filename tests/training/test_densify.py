@@ -6,7 +6,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.training.densify import Densifier
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import ANCHOR_ROWS, Parameters
+from structgstream.training.parameters import ANCHOR_ROWS, ParameterName, Parameters
 
 CONFIG = GrowthConfig(collect_from=0, start=0, interval=5, eligible_count=0, prune_visits=0)
 
@@ -16,7 +16,9 @@ def prepared():
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
     densifier = Densifier.of(scene, config=CONFIG, voxel_size=0.01)
     adam = Adam(reference_backend())
-    gradients = {name: torch.ones_like(row) for name, row in parameters.values.items() if name in ANCHOR_ROWS}
+    gradients: dict[ParameterName, torch.Tensor] = {
+        name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS
+    }
     adam.step(parameters, gradients, dict.fromkeys(ANCHOR_ROWS, 1e-9))
     return scene, parameters, densifier, adam
 
