@@ -235,7 +235,7 @@ def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
         (["--preset", "tiny", "--held-out", "cam77"], 1, "cam77"),
         (["--preset", "tiny", "--scale", "3"], 1, "(0, 1]"),
         (["--preset", "tiny", "--start", "12"], 1, "12 frames"),
-        (["--quality", "1"], 2, "--quality is for streams with the codec compact; the preset 'rig'"),
+        (["--preset", "rig", "--quality", "1"], 2, "--quality is for streams with the codec compact; the preset 'rig'"),
         (
             ["--preset", "motion", "--mbits", "5"],
             2,
