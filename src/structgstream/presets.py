@@ -140,5 +140,7 @@ PRESETS: dict[str, StreamConfig] = {
     "fast": FAST,
     "tiny": TINY,
 }
-DEFAULT_PRESET = "rig"
+DEFAULT_PRESET = "compact"
+PAPER_MODE = "rig"
+"""What the paper's ablations are edits of, and what others are compared with."""
 DEMO_PRESET = "fast"

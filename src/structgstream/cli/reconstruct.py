@@ -44,7 +44,7 @@ class Reconstruct:
 
     Example: structgstream reconstruct basketball -o ball.sgs --preset fast --scale 0.5 --online.iterations 40
 
-    Example: structgstream reconstruct basketball -o ball.sgs --preset compact --mbits 5
+    Example: structgstream reconstruct basketball -o ball.sgs --mbits 5
     """
 
     scene: tyro.conf.Positional[Folder]
@@ -52,12 +52,12 @@ class Reconstruct:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """rig (default: any rig), compact (small packets), motion (fits only what moves), fast (a try in minutes),
-    paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
+    """compact (default: small packets), rig (the paper on any rig), motion (rig, fits only what moves), fast (a try in
+    minutes), paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
-    """With --preset compact: 0 is its own quality, 1 makes every step half as large, -1 twice as large."""
+    """Of compact streams: 0 is the preset's own quality, 1 makes every step half as large, -1 twice as large."""
     mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
-    """With --preset compact: keep to R Mbit/s over every second, the header left aside. Default: constant quality,
+    """Of compact streams: keep to R Mbit/s over every second, the header left aside. Default: constant quality,
     whatever it costs."""
     device: Device = "auto"
     """What computes; auto takes the first of cuda, cpu, reference that is there."""

@@ -29,7 +29,7 @@ from structgstream.experiments.sweep import unique
 from structgstream.experiments.tasks import Variation
 from structgstream.experiments.variants import FULL, TABLES, variants
 from structgstream.experiments.worker import Task
-from structgstream.presets import DEFAULT_PRESET, PRESETS, StreamConfig
+from structgstream.presets import PAPER_MODE, PRESETS, StreamConfig
 
 if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
@@ -54,7 +54,7 @@ def ablation_runs(
     frames: int,
     seeds: Sequence[int],
     folder: Path,
-    paper: StreamConfig = PRESETS[DEFAULT_PRESET],
+    paper: StreamConfig = PRESETS[PAPER_MODE],
 ) -> list[Variation]:
     """Every variant of the tables with every seed, seed by seed.
 
@@ -113,7 +113,7 @@ def comparison_runs(
     """Every method with every seed.
 
     Args:
-        methods: presets, ``held`` (frame 0 for ever, after the default preset) and peers by name.
+        methods: presets, ``held`` (frame 0 for ever, after paper mode) and peers by name.
         capture: which pictures.
         frames: number of frames of ``capture``.
         alone_every: methods that fit each frame alone do so for every so many-th frame.
@@ -130,7 +130,7 @@ def comparison_runs(
             if name not in known:
                 raise ConfigError(f"There is no method {name!r}; there are {', '.join(known)}.")
             if name in PRESETS or name == "held":
-                config = replace(PRESETS[DEFAULT_PRESET if name == "held" else name], seed=seed)
+                config = replace(PRESETS[PAPER_MODE if name == "held" else name], seed=seed)
                 variant = variants(config)["held" if name == "held" else FULL]
                 runs.append(Variation(method_key(name), capture, variant.config, folder, frames))
             else:
@@ -140,8 +140,8 @@ def comparison_runs(
 
 
 def method_key(name: str) -> str:
-    """The key of a method's results: the default preset's is the full method of the ablations."""
-    return FULL if name == DEFAULT_PRESET else name
+    """The key of a method's results: paper mode is the full method of the ablations."""
+    return FULL if name == PAPER_MODE else name
 
 
 def method_titles() -> dict[str, str]:
@@ -228,12 +228,12 @@ def write_methods(folder: Path, runs: Sequence[Variation | PeerRun], *, backend:
 
 def variant_titles() -> dict[str, str]:
     """Every variant's name in tables."""
-    return {key: variant.title for key, variant in variants(PRESETS[DEFAULT_PRESET]).items()}
+    return {key: variant.title for key, variant in variants(PRESETS[PAPER_MODE]).items()}
 
 
 def effect_titles() -> dict[str, str]:
     """The rows of the table of effects, in its order."""
-    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[DEFAULT_PRESET])
+    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_MODE])
     return {key: variant.title for key, variant in found.items()}
 
 
