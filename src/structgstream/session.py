@@ -127,7 +127,7 @@ class Session:
         encoder: SceneEncoder | None = None
         past, online = _Past(), self._config.online
         steps: Mapping[str, float] = {}
-        controller = RateController(self._config.rate, self._source.fps)
+        controller = RateController(self._config.rate, self._source.fps, key_interval=self._key_interval)
         start = 0
         if self._resumed is not None:
             encoder, steps = SceneEncoder(self._resumed.header), self._resumed.header.steps
