@@ -49,6 +49,7 @@ def test_what_the_switches_are() -> None:
     assert whole.rounding.free_priced
     assert not online["compact-free-unpriced"].rounding.free_priced
     assert online["compact-unseen-kept"].motion.unseen_pixels == 0.0 < whole.motion.unseen_pixels
+    assert online["compact-few-views"].motion.least_views_share == 0.0 < whole.motion.least_views_share
     assert online["compact-rank-8"].appearance_rank == 8 != whole.appearance_rank
     trained = online["compact-with-covariance-mlp"]
     assert trained.dynamic - whole.dynamic == {"covariance_mlp"}

@@ -43,16 +43,22 @@ def test_one_view_is_not_enough() -> None:
     assert moving(config=replace(CONFIG, least_views=1)).anchors.sum() >= moving().anchors.sum()
 
 
-def test_each_view_tells_which_gaussians_it_shows() -> None:
-    backend, found = reference_backend(), moving()
-    views = training_views(WORLD.frames[1], WORLD.rig, CPU)
-    assert found.shown.keys() == {view.index for view in views}
-    for view in views:
-        drawn = torch.zeros(60 * 5, dtype=torch.bool)
-        drawn[WORLD.scene.gaussians(view.camera, backend).ids] = True
-        shown = found.shown[view.index]
-        assert 0 < shown.sum() < drawn.sum()  # Some are hidden behind others.
-        assert not shown[~drawn].any()
+def test_what_most_views_see_unchanged_stays() -> None:
+    """One view's picture changes everywhere: with another's half that lets things in that all others see at rest."""
+    views, same = (training_views(WORLD.frames[0], WORLD.rig, CPU) for _ in range(2))
+    changed = [replace(view, image=255 - view.image) if number < 2 else view for number, view in enumerate(views)]
+    config = replace(CONFIG, least_share=0.1)
+    backend = reference_backend()
+    found = moving_parts(WORLD.scene, changed, same, config=config, backend=backend).anchors
+    strict = replace(config, least_views_share=2.5 / len(views))
+    kept = moving_parts(WORLD.scene, changed, same, config=strict, backend=backend).anchors
+    assert found.sum() > 20
+    assert not (kept & ~found).any()
+    # What stays in is what few views see at all.
+    assert kept.sum() < 0.5 * found.sum()
+    everywhere = [replace(view, image=255 - view.image) for view in views]
+    moved = moving_parts(WORLD.scene, everywhere, same, config=strict, backend=backend).anchors
+    assert torch.equal(moved, moving_parts(WORLD.scene, everywhere, same, config=config, backend=backend).anchors)
 
 
 def test_what_moved_before_moves_more_easily() -> None:

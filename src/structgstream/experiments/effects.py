@@ -73,6 +73,12 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     calm = replace(full.initial, disturbance=DisturbanceConfig())
     row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
     gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
+    gated(
+        "few-views",
+        "two views alone can let an anchor move",
+        replace(motion, least_views_share=0.0),
+        "least_views_share",
+    )
     eased = EASED if motion.moved_ease == 1.0 else 1.0
     title = "the gate remembers what moved" if eased != 1.0 else "the gate remembers nothing"
     gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")

@@ -34,6 +34,9 @@ class MotionConfig:
     """... and so large a part of what it covers."""
     least_views: int = 2
     """Votes that let an anchor, or a free Gaussian, move: one picture cannot tell motion from noise."""
+    least_views_share: float = 0.0
+    """So large a part of the views that show it must vote too: a wall beside which something passes in a few of them
+    does not move."""
     moved_ease: float = 1.0
     """What the last frame changed needs only so many times the pixels and the share: what moves comes to rest in more
     than a frame, and what is at the edge of a change does not stutter. 1: no memory."""
@@ -41,12 +44,14 @@ class MotionConfig:
     """Free Gaussians that cover less than this in every view, counted by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
     """Who covers what is found on pictures of this size."""
+    least_weight: float = 0.05
+    """What moves is drawn, and finds its loss, in tiles with a pixel of which it makes more than this ..."""
     margin_pixels: int = 8
-    """Tiles this far around what moves are drawn too, so that it finds its loss where it goes."""
+    """... and so far around them, where it may go."""
     full_every_frames: int = 0
     """Everything may move in every so many-th frame: changes too slow to be seen add up. 0: never."""
     tiles: bool = True
-    """Draw only the tiles that moving Gaussians reach. Off: whole pictures, for the same result at their cost."""
+    """Draw only the tiles in which moving Gaussians show. Off: whole pictures, for the same result at their cost."""
 
 
 SHARED_FIELDS: frozenset[FieldName] = frozenset({"opacity_mlp", "color_mlp", "covariance_mlp", "camera_color"})
@@ -61,13 +66,11 @@ class Moving:
         anchors: mask ``[M]``.
         free: mask ``[F]``.
         unseen: mask ``[F]``, apart from ``free``: what no view shows.
-        shown: for each view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
     """
 
     anchors: Tensor
     free: Tensor
     unseen: Tensor
-    shown: dict[int, Tensor]
 
 
 def changed_since(older: Scene, scene: Scene) -> Tensor:
@@ -108,11 +111,11 @@ def moving_parts(
     """
     k, anchors, free = scene.anchors.offsets_per_anchor, len(scene.anchors), len(scene.free)
     votes = torch.zeros(anchors + free, device=scene.anchors.positions.device)
+    seen = torch.zeros_like(votes)
     ease = torch.ones_like(votes)
     if older is not None:
         ease[changed_since(older, scene)] = config.moved_ease
     most = torch.zeros(free, device=votes.device)
-    shown: dict[int, Tensor] = {}
     with torch.no_grad():
         scene = scene.baked()
         for view, last in zip(views, before, strict=True):
@@ -123,11 +126,12 @@ def moving_parts(
             # The K Gaussians of an anchor vote together: it moves as one.
             structured, single = weights[: anchors * k].reshape(anchors, k, 2), weights[anchors * k :]
             total, part = torch.cat([structured.sum(1), single]).unbind(1)
+            seen += total > config.least_pixels
             votes += (part > config.least_pixels * ease) & (part > config.least_share * ease * total)
             most = torch.maximum(most, single[:, 0])
-            shown[view.index] = weights[:, 0] > config.least_pixels
-    enough, unseen = votes >= config.least_views, most < config.unseen_pixels
-    return Moving(enough[:anchors], enough[anchors:] & ~unseen, unseen, shown)
+    enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
+    unseen = most < config.unseen_pixels
+    return Moving(enough[:anchors], enough[anchors:] & ~unseen, unseen)
 
 
 def _weights(scene: Scene, camera: Camera, changed: Tensor, config: MotionConfig, backend: Backend) -> Tensor:
