@@ -88,7 +88,7 @@ COMPACT = replace(
     online=replace(
         MOTION.online,
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),
-        motion=replace(MOTION.online.motion, least_views_share=0.3, moved_ease=0.5, unseen_pixels=0.1),
+        motion=replace(MOTION.online.motion, moved_ease=0.5, unseen_pixels=0.1),
         motion_prior=0.7,
         rounding=RoundingConfig(free_priced=True),
     ),

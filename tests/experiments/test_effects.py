@@ -12,6 +12,7 @@ from structgstream.experiments.effects import (
     EASED,
     LEAST_GAIN,
     REFRESH_FRAMES,
+    VIEWS_SHARE,
     WHOLE,
     effects,
     effects_sheet,
@@ -49,7 +50,6 @@ def test_what_the_switches_are() -> None:
     assert whole.rounding.free_priced
     assert not online["compact-free-unpriced"].rounding.free_priced
     assert online["compact-unseen-kept"].motion.unseen_pixels == 0.0 < whole.motion.unseen_pixels
-    assert online["compact-few-views"].motion.least_views_share == 0.0 < whole.motion.least_views_share
     assert online["compact-rank-8"].appearance_rank == 8 != whole.appearance_rank
     trained = online["compact-with-covariance-mlp"]
     assert trained.dynamic - whole.dynamic == {"covariance_mlp"}
@@ -58,12 +58,13 @@ def test_what_the_switches_are() -> None:
 
 def test_what_is_off_is_tried_and_what_is_on_is_left_out() -> None:
     online = COMPACT.online
-    on = replace(online, least_gain=0.03, motion=replace(online.motion, moved_ease=0.3))
-    off = replace(online, least_gain=0.0, motion=replace(online.motion, moved_ease=1.0))
-    for whole, gain, ease in ((on, 0.0, 1.0), (off, LEAST_GAIN, EASED)):
+    on = replace(online, least_gain=0.03, motion=replace(online.motion, moved_ease=0.3, least_views_share=0.2))
+    off = replace(online, least_gain=0.0, motion=replace(online.motion, moved_ease=1.0, least_views_share=0.0))
+    for whole, gain, ease, share in ((on, 0.0, 1.0, 0.0), (off, LEAST_GAIN, EASED, VIEWS_SHARE)):
         rows = effects(replace(COMPACT, online=whole), paper=RIG)
         assert rows["compact-settling"].config.online.least_gain == gain
         assert rows["compact-memory"].config.online.motion.moved_ease == ease
+        assert rows["compact-views-share"].config.online.motion.least_views_share == share
 
 
 @pytest.mark.parametrize(("whole", "other"), [(0.0, 1.0), (0.7, 0.0)])

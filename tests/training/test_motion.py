@@ -43,6 +43,18 @@ def test_one_view_is_not_enough() -> None:
     assert moving(config=replace(CONFIG, least_views=1)).anchors.sum() >= moving().anchors.sum()
 
 
+def test_each_view_tells_which_gaussians_it_shows() -> None:
+    backend, found = reference_backend(), moving()
+    views = training_views(WORLD.frames[1], WORLD.rig, CPU)
+    assert found.shown.keys() == {view.index for view in views}
+    for view in views:
+        drawn = torch.zeros(60 * 5, dtype=torch.bool)
+        drawn[WORLD.scene.gaussians(view.camera, backend).ids] = True
+        shown = found.shown[view.index]
+        assert 0 < shown.sum() < drawn.sum()  # Some are hidden behind others.
+        assert not shown[~drawn].any()
+
+
 def test_what_most_views_see_unchanged_stays() -> None:
     """One view's picture changes everywhere: with another's half that lets things in that all others see at rest."""
     views, same = (training_views(WORLD.frames[0], WORLD.rig, CPU) for _ in range(2))

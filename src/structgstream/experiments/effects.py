@@ -22,7 +22,7 @@ WHOLE = "compact"
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode on the frame 0 that the compact stream begins with."""
 DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{field.name}" for field in fields(DisturbanceConfig))
-EASED, LEAST_GAIN, OTHER_RANK = 0.5, 0.1, 8
+EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """What is tried where the whole has it not."""
 REFRESH_FRAMES = 5
 """MLPs can change only in frames in which everything may move; this often, where one is trained."""
@@ -73,12 +73,11 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     calm = replace(full.initial, disturbance=DisturbanceConfig())
     row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
     gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
-    gated(
-        "few-views",
-        "two views alone can let an anchor move",
-        replace(motion, least_views_share=0.0),
-        "least_views_share",
+    share = 0.0 if motion.least_views_share else VIEWS_SHARE
+    title = (
+        f"what moves changes in {share:.0%} of the views that show it" if share else "what moves changes in two views"
     )
+    gated("views-share", title, replace(motion, least_views_share=share), "least_views_share")
     eased = EASED if motion.moved_ease == 1.0 else 1.0
     title = "the gate remembers what moved" if eased != 1.0 else "the gate remembers nothing"
     gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")

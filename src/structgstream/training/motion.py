@@ -44,14 +44,12 @@ class MotionConfig:
     """Free Gaussians that cover less than this in every view, counted by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
     """Who covers what is found on pictures of this size."""
-    least_weight: float = 0.05
-    """What moves is drawn, and finds its loss, in tiles with a pixel of which it makes more than this ..."""
     margin_pixels: int = 8
-    """... and so far around them, where it may go."""
+    """Tiles this far around what moves are drawn too, so that it finds its loss where it goes."""
     full_every_frames: int = 0
     """Everything may move in every so many-th frame: changes too slow to be seen add up. 0: never."""
     tiles: bool = True
-    """Draw only the tiles in which moving Gaussians show. Off: whole pictures, for the same result at their cost."""
+    """Draw only the tiles that moving Gaussians reach. Off: whole pictures, for the same result at their cost."""
 
 
 SHARED_FIELDS: frozenset[FieldName] = frozenset({"opacity_mlp", "color_mlp", "covariance_mlp", "camera_color"})
@@ -66,11 +64,13 @@ class Moving:
         anchors: mask ``[M]``.
         free: mask ``[F]``.
         unseen: mask ``[F]``, apart from ``free``: what no view shows.
+        shown: for each view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
     """
 
     anchors: Tensor
     free: Tensor
     unseen: Tensor
+    shown: dict[int, Tensor]
 
 
 def changed_since(older: Scene, scene: Scene) -> Tensor:
@@ -116,6 +116,7 @@ def moving_parts(
     if older is not None:
         ease[changed_since(older, scene)] = config.moved_ease
     most = torch.zeros(free, device=votes.device)
+    shown: dict[int, Tensor] = {}
     with torch.no_grad():
         scene = scene.baked()
         for view, last in zip(views, before, strict=True):
@@ -129,9 +130,10 @@ def moving_parts(
             seen += total > config.least_pixels
             votes += (part > config.least_pixels * ease) & (part > config.least_share * ease * total)
             most = torch.maximum(most, single[:, 0])
+            shown[view.index] = weights[:, 0] > config.least_pixels
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
     unseen = most < config.unseen_pixels
-    return Moving(enough[:anchors], enough[anchors:] & ~unseen, unseen)
+    return Moving(enough[:anchors], enough[anchors:] & ~unseen, unseen, shown)
 
 
 def _weights(scene: Scene, camera: Camera, changed: Tensor, config: MotionConfig, backend: Backend) -> Tensor:

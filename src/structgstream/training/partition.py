@@ -5,10 +5,8 @@ The moving part is a scene of its own with the same MLPs: a trainer works on it 
 moves. Its ids are its own (Note [Ids]).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import torch
 from torch import Tensor
@@ -18,7 +16,7 @@ from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
 from structgstream.scene.focus import Focus
-from structgstream.scene.render import draw
+from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
 from structgstream.training.motion import MotionConfig, Moving
 from structgstream.training.views import View
@@ -65,50 +63,57 @@ class Partition:
 
 def focuses(partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend) -> dict[int, Focus]:
     """By index, the views that the moving part shows in, and where."""
-    which, moving = partition.which, partition.moving.baked()
-    whole, still = partition.whole.baked(), partition.still.baked()
+    which, moving, still = partition.which, partition.moving.baked(), partition.still.baked()
     k = moving.anchors.offsets_per_anchor
     rows = torch.cat([which.anchors.repeat_interleave(k), which.free])  # of the whole scene's Gaussians
-    found: dict[int, Focus] = {}
     with torch.no_grad():
-        for view in views:
-            tiles = moving_tiles(whole, rows, view.camera, config=config, backend=backend)
-            if tiles.any():
-                tiles = tiles if config.tiles else torch.ones_like(tiles)
-                found[view.index] = _focus(still, moving, tiles, view.camera, backend)
-    return found
+        found = {
+            view.index: _focus(still, moving, which.shown[view.index][rows], view.camera, config, backend)
+            for view in views
+        }
+    return {index: focus for index, focus in found.items() if focus is not None}
 
 
-def _focus(still: Scene, moving: Scene, tiles: Tensor, camera: Camera, backend: Backend) -> Focus:
+def _focus(
+    still: Scene, moving: Scene, shown: Tensor, camera: Camera, config: MotionConfig, backend: Backend
+) -> Focus | None:
+    in_motion = moving.gaussians(camera, backend)
+    tiles = reached_tiles(draw(in_motion, camera, backend), shown[in_motion.ids], camera, config.margin_pixels)
+    if not tiles.any():
+        return None
+    if not config.tiles:
+        tiles = torch.ones_like(tiles)
     # The loss looks ten pixels beyond a tile: a ring of tiles around them is drawn once and stays as it is.
     ring = torch.nn.functional.max_pool2d(tiles[None].float(), 3, stride=1, padding=1)[0] > 0
     structured, _ = still.structured(camera, backend, tiles=ring)
     at_rest = still.dressed(structured)
     nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
-    in_motion = moving.gaussians(camera, backend)
     rendering = draw(concatenate(in_motion, at_rest), camera, backend, focus=Focus(ring, empty, nothing))
     return Focus(tiles, rendering.image, at_rest)
 
 
-def moving_tiles(scene: Scene, moving: Tensor, camera: Camera, *, config: MotionConfig, backend: Backend) -> Tensor:
-    """Mask of the tiles in which Gaussians of the mask ``moving`` ``[M * K + F]`` (Note [Ids]) show, or could soon.
+def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> Tensor:
+    """Mask of the tiles that drawn Gaussians of the mask ``shown`` reach, or could within ``margin_pixels``.
 
-    They show where they make more than ``config.least_weight`` of a pixel, and could within ``config.margin_pixels``.
+    Two standard deviations of a Gaussian count: what lies beyond hardly shows.
     """
-    small = camera.resized(*(max(1, round(size * config.picture_scale)) for size in (camera.width, camera.height)))
-    gaussians = scene.gaussians(small, backend)
-    colors = moving[gaussians.ids].to(gaussians.colors)[:, None].expand(-1, 3).contiguous()
-    weights = draw(replace(gaussians, colors=colors), small, backend).image[..., 0]
-    reach = math.ceil(config.margin_pixels * config.picture_scale)
-    near = (weights > config.least_weight).float()
-    near = torch.nn.functional.max_pool2d(near[None], 2 * reach + 1, stride=1, padding=reach)[0] > 0
-    tiles = near.new_zeros(tiles_of(camera.width, camera.height))
-    y, x = near.nonzero().unbind(1)
-    # A small pixel covers a box of large ones, which two tiles can share.
-    ends = (0.0, 1.0 - 1e-4)
-    rows = [((y + end) * (camera.height / small.height / TILE_PIXELS)).long() for end in ends]
-    columns = [((x + end) * (camera.width / small.width / TILE_PIXELS)).long() for end in ends]
-    for row, column in product(rows, columns):
-        tiles[row, column] = True
-    return tiles
+    rows, columns = tiles_of(camera.width, camera.height)
+    drawn = shown & (rendering.radii > 0)
+    means = rendering.gaussians.means[drawn]
+    viewmat, K, _ = camera.beside(means)
+    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    centers = (points @ K.T)[:, :2] / points[:, 2:]
+    reach = 0.6 * rendering.radii[drawn, None] + margin_pixels
+    none, last = centers.new_zeros(2), centers.new_tensor([columns - 1, rows - 1])
+    low = ((centers - reach) / TILE_PIXELS).floor()
+    high = ((centers + reach) / TILE_PIXELS).floor()
+    inside = ((high >= none) & (low <= last)).all(1)
+    low = low[inside].clamp(min=none, max=last).long()
+    high = high[inside].clamp(min=none, max=last).long() + 1
+    # Each box adds one at two of its corners and takes one at the others; running sums then count boxes.
+    corners = torch.zeros((rows + 1) * (columns + 1), device=centers.device)
+    one = torch.ones(len(low), device=centers.device)
+    for x, y, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
+        corners.index_add_(0, y[:, 1] * (columns + 1) + x[:, 0], sign * one)
+    return corners.reshape(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns] > 0.5
