@@ -76,6 +76,8 @@ def weight_of(level: int, p: int) -> int:
 
 def tables_of(bits: Bits, previous: list[Row]) -> list[Row]:
     """Section Table sets."""
+    if not bits.text:
+        return previous
     found = []
     for before in previous:
         alphabet = len(before)

@@ -102,7 +102,8 @@ def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
             for place in np.flatnonzero(entry.cost < cost[tried]):
                 context = tried[place]
                 rows[context], cost[context], pieces[context] = entry.rows[place], entry.cost[place], entry.bits(place)
-    return FrequencyTables(rows.astype(np.uint16)), packed_bits(pieces)
+    changes = any(piece != "0" for piece in pieces)
+    return FrequencyTables(rows.astype(np.uint16)), packed_bits(pieces) if changes else b""
 
 
 def _explicit(

@@ -48,8 +48,8 @@ def decoded_tables(
     """
     if len(data) > _MOST_ROW_BYTES * previous.contexts:
         raise StreamError(f"{where} has {len(data)} bytes for {previous.contexts} contexts; it is damaged.")
-    if len(data) == -(-previous.contexts // 8) and not any(data):
-        return previous  # every row stays: the rule where there is little to tell
+    if not len(data):
+        return previous  # the rule where there is little to tell
     reader = BitReader(data, where=where)
     family = geometric_family(previous.alphabet)
     rows = previous.rows.copy()

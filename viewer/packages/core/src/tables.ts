@@ -72,8 +72,7 @@ export function decodedTables(data: Uint8Array, previous: FrequencyTables, where
   if (data.length > MOST_ROW_BYTES * contexts) {
     throw new StreamError(`${where} has ${data.length} bytes for ${contexts} contexts; it is damaged.`);
   }
-  // Every row stays: the rule where there is little to tell.
-  if (data.length === Math.ceil(contexts / 8) && data.every((byte) => byte === 0)) return previous;
+  if (!data.length) return previous; // the rule where there is little to tell
   const reader = new BitReader(data, where);
   const rows = previous.rows.slice();
   for (let context = 0; context < contexts; context++) {

@@ -70,6 +70,6 @@ test("few bytes do not make many numbers", () => {
   const bytes = [...coded.values()].reduce((sum, data) => sum + data.length, 0);
   const others = bytes - coded.get("anchor_positions")!.length;
   const most = Math.floor((2 ** 20 + 64 * (others + 23)) / 3);
-  expect(many(most)).toThrow("anchor_positions.far, ends within a number");
+  expect(many(most)).toThrow("anchor_positions.far,");
   expect(many(most + 1)).toThrow("The init record has more than 64 numbers a byte; it is damaged.");
 });
