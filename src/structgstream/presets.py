@@ -87,6 +87,8 @@ COMPACT = replace(
     codec="compact",
     online=replace(
         MOTION.online,
+        iterations=75,
+        patching=replace(MOTION.online.patching, iteration=40),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),
         motion=replace(MOTION.online.motion, moved_ease=0.5, unseen_pixels=0.1),
         motion_prior=0.7,

@@ -24,6 +24,7 @@ BETTER_FIRST = "paper-better-first"
 DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{field.name}" for field in fields(DisturbanceConfig))
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """What is tried where the whole has it not."""
+PAPER_ITERATIONS = 100
 REFRESH_FRAMES = 5
 """MLPs can change only in frames in which everything may move; this often, where one is trained."""
 
@@ -92,6 +93,8 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     gain = 0.0 if whole.least_gain else LEAST_GAIN
     title = "a frame ends when it has settled" if gain else "all iterations in every frame"
     online("settling", title, replace(whole, least_gain=gain), "least_gain")
+    paced = replace(whole, iterations=PAPER_ITERATIONS, patching=replace(patching, iteration=PAPER_ITERATIONS // 2))
+    online("more-iterations", f"{PAPER_ITERATIONS} iterations in a frame", paced, "iterations", "patching.iteration")
     spawnless = replace(whole, patching=replace(patching, spawn="off"))
     online("without-free", "w/o free 3DGs", spawnless, "patching.spawn")
     priced("free-unpriced", "bits of free 3DGs cost nothing", replace(rounding, free_priced=False), "free_priced")

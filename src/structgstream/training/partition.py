@@ -90,7 +90,8 @@ def _focus(
     nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
     rendering = draw(concatenate(in_motion, at_rest), camera, backend, focus=Focus(ring, empty, nothing))
-    return Focus(tiles, rendering.image, at_rest)
+    # Anchors were culled as a whole; what reaches no tile is not looked at again.
+    return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
 
 
 def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> Tensor:
