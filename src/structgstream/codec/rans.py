@@ -17,11 +17,11 @@ LANES = (1, 4, 32)
 
 _NO_MEMORY = 1
 _LANE_BYTES = 3  # what a lane costs: half of its final state, and half of what is left of the other half
-_MOST_SHARE = 128  # a section spends up to a 128th on its lanes
+_MOST_SHARE = 512  # a section spends up to a 512th on its lanes
 
 
 def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables) -> int:
-    """How many lanes the encoder takes: as many as cost less than a 128th of what the symbols will."""
+    """How many lanes the encoder takes: as many as cost less than a 512th of what the symbols will."""
     used = np.bincount(tables.rows[contexts, symbols], minlength=TOTAL + 1)
     size_bytes = int(used @ code_costs()) >> COST_BITS + 3
     return max(lanes for lanes in LANES if (lanes - 1) * _LANE_BYTES * _MOST_SHARE <= size_bytes)
