@@ -104,7 +104,12 @@ class Packets(Sequence[PacketInfo]):
         number, pts_seconds = FRAME.unpack(payload[: FRAME.size])
         if number != index:
             raise self.damaged(index)
-        blocks = blocks_in(payload, FRAME.size, where=f"Packet {index}")
+        try:
+            blocks = [*blocks_in(payload, FRAME.size, where=f"Packet {index}")]
+        except StreamError as error:
+            if record_at(self._data, offset) is None:  # Nothing in it is what was written.
+                raise self.damaged(index) from error
+            raise
         field_bytes: dict[FieldName, int] = {block.name: block.end - block.start for block in blocks}
         size = RECORD.size + head[1] + CHECKSUM.size
         return PacketInfo(_KINDS[RecordType(head[0])], index, pts_seconds, offset, size, field_bytes)
