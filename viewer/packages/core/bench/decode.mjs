@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What frames cost to decode in core time: `node bench/decode.mjs FILE [ROUNDS]`, after `npm run build`.
-// A file: `python viewer/packages/core/test/make_fixtures.py --bench 100000 /tmp/bench.sgs`.
+// A file: `python viewer/packages/core/test/make_fixtures.py --bench 100000 bench.sgs`.
 
 import { readFileSync } from "node:fs";
 import { readStream } from "../dist/main.js";
