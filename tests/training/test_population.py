@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Free Gaussians that die and are born in the middle of a frame, in the tensors that are being fitted."""
+
+from dataclasses import replace
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.free import FreeGaussians
+from structgstream.training.optim import Adam
+from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
+from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
+from structgstream.training.population import patched
+from structgstream.training.statistics import GradientStatistics
+from structgstream.training.views import training_views
+from worlds import moving_world
+
+CPU = torch.device("cpu")
+BACKEND = reference_backend()
+WORLD = moving_world(1)
+SCENE = replace(
+    WORLD.scene,
+    free=FreeGaussians(
+        means=torch.zeros(3, 3),
+        log_scales=torch.full((3, 3), 0.1).log(),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1),
+        logit_opacities=torch.tensor([2.0, -9.0, 1.0]),  # The second is fainter than what survives.
+        colors=torch.tensor([[0.2, 0.4, 0.6]]).repeat(3, 1),
+        births=torch.tensor([4, 5, 6]),
+    ),
+)
+SLOTS = len(SCENE.anchors) * SCENE.anchors.offsets_per_anchor
+
+
+def patch(*, room: int) -> tuple[Parameters, Adam, torch.Tensor, int]:
+    parameters = Parameters.of(SCENE, trained=parameters_of_fields({"free"}))
+    adam = Adam(BACKEND)
+    ones = {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
+    adam.step(parameters, ones, dict.fromkeys(FREE_ROWS, 0.0))
+    statistics = GradientStatistics(SLOTS + 3, CPU)
+    statistics.total[SLOTS] = 1.0  # Two free ones have large gradients, ...
+    statistics.total[SLOTS + 2] = 2.0  # ... the last the largest.
+    statistics.count[SLOTS:] = 1.0
+    keep, born = patched(
+        parameters,
+        adam,
+        scene=SCENE,
+        statistics=statistics,
+        views=training_views(WORLD.frames[0], WORLD.rig, CPU),
+        frame_index=7,
+        room=room,
+        config=PatchingConfig(),
+        backend=BACKEND,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return parameters, adam, keep, born
+
+
+def test_the_faint_die_and_children_follow_those_that_stay() -> None:
+    parameters, adam, keep, born = patch(room=10)
+    assert keep.tolist() == [True, False, True]
+    assert born == 2
+    assert parameters.births.tolist() == [4, 6, 7 * BIRTHS_PER_FRAME, 7 * BIRTHS_PER_FRAME + 1]
+    assert all(len(parameters.values[name]) == 4 for name in FREE_ROWS)
+    assert torch.equal(parameters.values["free_logit_opacities"][:2], torch.tensor([2.0, 1.0]))
+    torch.testing.assert_close(parameters.values["free_colors"][2:], torch.tensor([[0.2, 0.4, 0.6]] * 2))
+    # Moments have gone the same way: another step takes them all.
+    adam.step(parameters, {n: torch.ones_like(parameters.values[n]) for n in FREE_ROWS}, dict.fromkeys(FREE_ROWS, 0.1))
+
+
+def test_no_more_are_born_than_there_is_room_for_and_the_largest_gradient_comes_first() -> None:
+    whole, _, _, _ = patch(room=10)
+    parameters, _, keep, born = patch(room=3)
+    assert born == 1
+    assert len(parameters.births) == int(keep.sum()) + 1 == 3
+    assert patch(room=2)[3] == 0
+    assert len(whole.births) == 4
