@@ -8,7 +8,7 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
+from structgstream.training.parameters import FREE_ROWS, ParameterName, Parameters, parameters_of_fields
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.population import patched
 from structgstream.training.statistics import GradientStatistics
@@ -32,11 +32,14 @@ SCENE = replace(
 SLOTS = len(SCENE.anchors) * SCENE.anchors.offsets_per_anchor
 
 
+def ones(parameters: Parameters) -> dict[ParameterName, torch.Tensor]:
+    return {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
+
+
 def patch(*, room: int) -> tuple[Parameters, Adam, torch.Tensor, int]:
     parameters = Parameters.of(SCENE, trained=parameters_of_fields({"free"}))
     adam = Adam(BACKEND)
-    ones = {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
-    adam.step(parameters, ones, dict.fromkeys(FREE_ROWS, 0.0))
+    adam.step(parameters, ones(parameters), dict.fromkeys(FREE_ROWS, 0.0))
     statistics = GradientStatistics(SLOTS + 3, CPU)
     statistics.total[SLOTS] = 1.0  # Two free ones have large gradients, ...
     statistics.total[SLOTS + 2] = 2.0  # ... the last the largest.
@@ -65,7 +68,7 @@ def test_the_faint_die_and_children_follow_those_that_stay() -> None:
     assert torch.equal(parameters.values["free_logit_opacities"][:2], torch.tensor([2.0, 1.0]))
     torch.testing.assert_close(parameters.values["free_colors"][2:], torch.tensor([[0.2, 0.4, 0.6]] * 2))
     # Moments have gone the same way: another step takes them all.
-    adam.step(parameters, {n: torch.ones_like(parameters.values[n]) for n in FREE_ROWS}, dict.fromkeys(FREE_ROWS, 0.1))
+    adam.step(parameters, ones(parameters), dict.fromkeys(FREE_ROWS, 0.1))
 
 
 def test_no_more_are_born_than_there_is_room_for_and_the_largest_gradient_comes_first() -> None:
