@@ -34,8 +34,9 @@ from structgstream.training.parameters import (
 from structgstream.training.partition import Partition, focuses
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.population import patched
+from structgstream.training.price import Rate
 from structgstream.training.result import FitResult, Step, StepListener
-from structgstream.training.rounding import Rate, RoundingConfig
+from structgstream.training.rounding import RoundingConfig
 from structgstream.training.settling import Settling
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import LastPass, gradients_of, view_loss
