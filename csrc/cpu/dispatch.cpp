@@ -18,7 +18,7 @@
     void project(const GaussianInputs&, Raster&, float*, int);                                                        \
     void project_backward(const GaussianInputs&, const Raster&, const float*, const GaussianGradients&, int);         \
     void rasterize(const Raster&, const float*, float*, float*, int);                                                 \
-    void weigh(const Raster&, const float*, float*, int);                                                             \
+    void weigh(const Raster&, const float*, int, float*, int);                                                        \
     void rasterize_backward(                                                                                          \
         const Raster&, const float*, const float*, const float*, const float*, const float*, float*, int);            \
     void l1_ssim(const Pictures&, const Part*, int, float*, int);                                                     \
@@ -92,8 +92,8 @@ void rasterize_backward_dispatched(
     SGS_DISPATCH(rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments, threads))
 }
 
-void weigh_dispatched(const Raster& raster, const float* maps, float* sums, int threads) {
-    SGS_DISPATCH(weigh(raster, maps, sums, threads))
+void weigh_dispatched(const Raster& raster, const float* maps, int channels, float* sums, int threads) {
+    SGS_DISPATCH(weigh(raster, maps, channels, sums, threads))
 }
 
 void project_backward_dispatched(
@@ -162,8 +162,8 @@ void* sgs_raster_forward(
 
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, float* weights,
-    int threads) {
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, int channels,
+    float* weights, int threads) {
     try {
         Raster raster;
         raster.camera = pinhole(viewmat, K, width, height, near_plane);
@@ -175,13 +175,12 @@ int sgs_raster_weights(
         // Colours play no part; any numbers of the right count will do.
         project_dispatched({means, quats, scales, opacities, means, nullptr, count}, raster, radii.data(), threads);
         bin(raster);
-        std::vector<float> sums(2 * raster.pairs.size());
-        weigh_dispatched(raster, maps, sums.data(), threads);
-        for (int64_t i = 0; i < count; ++i) {
-            weights[2 * i] = weights[2 * i + 1] = 0.0f;
+        const std::unique_ptr<float[]> sums(new float[raster.pairs.size() * channels]);
+        weigh_dispatched(raster, maps, channels, sums.get(), threads);
+        std::fill_n(weights, count * channels, 0.0f);
+        for (int64_t i = 0; i < count; ++i)
             for (int64_t slot = raster.slots[i]; slot < raster.slots[i + 1]; ++slot)
-                weights[2 * i] += sums[2 * slot], weights[2 * i + 1] += sums[2 * slot + 1];
-        }
+                for (int c = 0; c < channels; ++c) weights[i * channels + c] += sums[slot * channels + c];
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;

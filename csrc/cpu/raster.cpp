@@ -22,6 +22,7 @@ constexpr int kBlocksX = kTile / kBlockX;
 constexpr int kBlocksY = kTile / kBlockY;
 constexpr int kBlocks = kBlocksX * kBlocksY;
 constexpr int kAhead = 4;  // splats
+constexpr int kMapsAtOnce = 8;
 
 // The sums over the lanes of each moment, for all of them at once where there are as many lanes.
 inline void store_sums(const vf (&m)[kMomentCount], float* out) {
@@ -254,21 +255,26 @@ void blend_backward(
             std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
 }
 
-// Sums over the pixels of each pair's weight times each of two maps: sums[2 * slot], all of which are written.
-void weigh(const Raster& raster, int index, const float* maps, float* sums) {
+// Sums over the pixels of each pair's weight times each of the first Maps maps, of `stride`: sums[stride * slot].
+template <int Maps>
+void weigh(const Raster& raster, int index, const float* maps, int stride, float* sums) {
     const Tile tile(raster, index);
     const Lanes lanes;
-    alignas(kAlignment) float values[2][kTilePixels];
+    alignas(kAlignment) float values[Maps][kTilePixels] = {};
     Front front;
-    gather<2>(maps, raster.camera.width, tile, values);
+    for_pixels(tile, raster.camera.width, [&](size_t pixel, int at) {
+#pragma GCC unroll 8
+        for (int k = 0; k < Maps; ++k) values[k][at] = maps[pixel * stride + k];
+    });
     for (int n = raster.starts[index]; n < raster.starts[index + 1]; ++n) {
-        float* out = sums + 2 * static_cast<size_t>(raster.pair_slots[n]);
-        out[0] = out[1] = 0.0f;
+        float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
+        std::fill_n(out, Maps, 0.0f);
         if (front.live == 0) continue;
         const Splat& s = raster.splats[raster.pairs[n]];
         __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
         const Blocks blocks(s, tile.left, tile.top);
-        vf m[2] = {splat(0.0f), splat(0.0f)};
+        vf m[Maps];
+        for (vf& v : m) v = splat(0.0f);
         for (int by = blocks.y0; by < blocks.y1; ++by)
             for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
                 const int block = by * kBlocksX + bx, at = block * kLanes;
@@ -277,10 +283,12 @@ void weigh(const Raster& raster, int index, const float* maps, float* sums) {
                 Coverage c;
                 if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
                 const vf weight = c.alpha * before;
-                m[0] += weight * load(values[0] + at), m[1] += weight * load(values[1] + at);
+#pragma GCC unroll 8
+                for (int k = 0; k < Maps; ++k) m[k] += weight * load(values[k] + at);
                 front.pass(block, before, c);
             }
-        for (int k = 0; k < 2; ++k) {
+#pragma GCC unroll 8
+        for (int k = 0; k < Maps; ++k) {
             float parts[kLanes];
             store(parts, m[k]);
             for (int step = kLanes / 2; step > 0; step /= 2)
@@ -290,12 +298,19 @@ void weigh(const Raster& raster, int index, const float* maps, float* sums) {
     }
 }
 
+// By the number of maps, from one on.
+constexpr void (*kWeigh[kMapsAtOnce])(const Raster&, int, const float*, int, float*) = {
+    weigh<1>, weigh<2>, weigh<3>, weigh<4>, weigh<5>, weigh<6>, weigh<7>, weigh<8>};
+
 }  // namespace
 
-void weigh(const Raster& raster, const float* maps, float* sums, int threads) {
+// maps: `count` numbers for each pixel; sums: as many for each pair, all of which are written.
+void weigh(const Raster& raster, const float* maps, int count, float* sums, int threads) {
     const int tiles = raster.tiles_x * raster.tiles_y;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
-    for (int t = 0; t < tiles; ++t) weigh(raster, t, maps, sums);
+    for (int t = 0; t < tiles; ++t)
+        for (int first = 0; first < count; first += kMapsAtOnce)
+            kWeigh[std::min(count - first, kMapsAtOnce) - 1](raster, t, maps + first, count, sums + first);
 }
 
 void rasterize(const Raster& raster, const float* background, float* image, float* alpha, int threads) {

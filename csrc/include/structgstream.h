@@ -26,12 +26,13 @@ void* sgs_raster_forward(
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* screen_offsets, const uint8_t* drawn_tiles, int64_t trained, float* image,
     float* alpha, float* radii, int threads);
-/* weights [N,2]: for each Gaussian the sum over the pixels of its blending weight times either of maps [H,W,2]. Returns
- * 0, or 1 where memory does not suffice. */
+/* weights [N,C]: for each Gaussian the sum over the pixels of its blending weight times each of maps [H,W,C], C =
+ * channels >= 1. Takes C numbers of memory for each pair of a Gaussian and a tile. Returns 0, or 1 where memory does not
+ * suffice. */
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, float* weights,
-    int threads);
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, int channels,
+    float* weights, int threads);
 /* grad_image [H,W,3]; grad_alpha [H,W] or null. Returns 0, or 1 where memory does not suffice. */
 int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,

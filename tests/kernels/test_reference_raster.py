@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from structgstream.kernels.reference_raster import rasterize
+from structgstream.kernels.reference_raster import blending_weights, rasterize
 
 K = torch.tensor([[50.0, 0, 16.5], [0, 50.0, 12.5], [0, 0, 1]], dtype=torch.float64)
 EYE = torch.eye(4, dtype=torch.float64)
@@ -63,6 +63,18 @@ def test_opaque_layers_stop_the_pixel() -> None:
     output = draw(means, torch.full((n, 3), 0.5), torch.full((n,), 0.95), torch.ones(n, 3))
     # 0.05^3 is above the limit of 1e-4, 0.05^4 below it: the fourth layer is not blended.
     assert output.alpha[12, 16].item() == pytest.approx(1 - 0.05**3, abs=1e-6)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
+def test_blending_weights_are_the_pictures_of_each_gaussian_alone_in_its_colour(channels: int) -> None:
+    means = torch.tensor([[0, 0, 3.0], [0.1, 0, 2.0], [-0.2, 0.1, 2.5]], dtype=torch.float64)
+    scales, opacities = torch.full((3, 3), 0.2, dtype=torch.float64), torch.tensor([0.9, 0.6, 0.4], dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(3, 4)
+    pictures = draw(means, scales, opacities, torch.eye(3)).image
+    maps = torch.rand(25, 33, channels, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    found = blending_weights(rasterize, means, quats, scales, opacities, EYE, K, maps, near=0.1)
+    assert found.shape == (3, channels)
+    assert torch.allclose(found, torch.einsum("hwn,hwc->nc", pictures, maps), rtol=1e-12)
 
 
 def test_gradients_are_those_of_finite_differences() -> None:

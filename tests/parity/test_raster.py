@@ -252,13 +252,43 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
 
 
 @native
-def test_blending_weights(isa: int) -> None:
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
+def test_blending_weights(isa: int, channels: int) -> None:
     means, quats, scales, opacities, _, _ = gaussians()
     viewmat, K = camera()
-    maps = torch.rand(HEIGHT, WIDTH, 2, dtype=torch.float64) * safe_pixels(gaussians())[..., None]
+    maps = torch.rand(HEIGHT, WIDTH, channels, dtype=torch.float64) * safe_pixels(gaussians())[..., None]
     exact = reference_raster.blending_weights(reference, means, quats, scales, opacities, viewmat, K, maps, near=NEAR)
     single = [value.float() for value in (means, quats, scales, opacities, viewmat, K, maps)]
     ours = cpu_raster.blending_weights(*single, near=NEAR)
-    assert (ours - exact).norm() < 1e-5 * exact.norm()
+    assert ours.shape == exact.shape == (len(means), channels)
+    # Float32 sums of some hundreds of terms of size one: 1e-5 is 80 units in the last place.
+    assert ((ours - exact).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
     again = reference_raster.blending_weights(cpu_raster.rasterize, *single, near=NEAR)
-    assert (ours - again).norm() < 1e-5 * exact.norm()
+    assert ((ours - again).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
+
+
+@native
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
+def test_blending_weights_do_not_depend_on_threads(isa: int, channels: int) -> None:
+    means, quats, scales, opacities, _, _ = gaussians(2000)
+    single = [value.float() for value in (means, quats, scales, opacities, *camera())]
+    maps = torch.rand(HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(3))
+    results = []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2, 2):
+            torch.set_num_threads(threads)
+            results.append(cpu_raster.blending_weights(*single, maps, near=NEAR))
+    finally:
+        torch.set_num_threads(before)
+    assert results[0].any()
+    assert all(torch.equal(results[0], other) for other in results[1:])
+
+
+@native
+def test_blending_weights_of_nothing(isa: int) -> None:
+    means, quats, scales, opacities = (value[:0].float() for value in gaussians()[:4])
+    viewmat, K = camera()
+    maps = torch.ones(HEIGHT, WIDTH, 5)
+    weights = cpu_raster.blending_weights(means, quats, scales, opacities, viewmat, K, maps, near=NEAR)
+    assert weights.shape == (0, 5)

@@ -168,15 +168,16 @@ def blending_weights(
     *,
     near: float,
 ) -> Tensor:
-    """Sums of blending weights ``[N, 2]``, see ``kernels.reference_raster.blending_weights``; float32.
+    """Sums of blending weights ``[N, C]``, see ``kernels.reference_raster.blending_weights``; float32.
 
     Raises:
         MemoryError: the lists of what each tile draws do not fit.
     """
     tensors = [t.detach().float().contiguous() for t in (means, quats, scales, opacities, viewmat, K)]
     maps = maps.float().contiguous()
-    height, width = maps.shape[:2]
-    weights = torch.empty(means.shape[0], 2)
+    height, width, channels = maps.shape
+    assert channels > 0, maps.shape
+    weights = torch.empty(means.shape[0], channels)
     failed = native_library().sgs_raster_weights(
         ctypes.c_int64(means.shape[0]),
         *(_pointer(tensor) for tensor in tensors),
@@ -184,6 +185,7 @@ def blending_weights(
         ctypes.c_int(height),
         ctypes.c_float(near),
         _pointer(maps),
+        ctypes.c_int(channels),
         _pointer(weights),
         ctypes.c_int(torch.get_num_threads()),
     )

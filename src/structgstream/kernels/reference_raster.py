@@ -185,9 +185,10 @@ def blending_weights(
     *,
     near: float,
 ) -> Tensor:
-    """For each Gaussian the sum over the pixels of its blending weight times either of two maps, ``[N, 2]``.
+    """For each Gaussian the sum over the pixels of its blending weight times each map, ``[N, C]``.
 
-    A colour's gradient is the sum of its Gaussian's weights times the picture's gradient, so any rasteriser can tell.
+    A colour's gradient is the sum of its Gaussian's weights times the picture's gradient, so any rasteriser can tell,
+    for three maps with each gradient.
 
     Args:
         rasterize: one with the contract of :func:`rasterize`.
@@ -197,16 +198,22 @@ def blending_weights(
         opacities: ``[N]``.
         viewmat: ``[4, 4]``.
         K: ``[3, 3]``.
-        maps: ``[H, W, 2]``; they give the picture's size.
+        maps: ``[H, W, C]``, C at least 1; they give the picture's size.
         near: smallest z.
     """
-    height, width = maps.shape[:2]
+    height, width, channels = maps.shape
+    assert channels > 0, maps.shape
+    found = []
     with torch.enable_grad():
         colors = torch.zeros_like(means).requires_grad_()
         output = rasterize(means, quats, scales, opacities, colors, viewmat, K, width=width, height=height, near=near)
-        cotangent = torch.cat([maps, torch.zeros_like(maps[..., :1])], dim=-1)
-        (found,) = torch.autograd.grad(output.image, colors, cotangent)
-    return found[:, :2]
+        for first in range(0, channels, 3):
+            group = maps[..., first : first + 3]
+            cotangent = torch.nn.functional.pad(group, (0, 3 - group.shape[-1]))
+            more = first + 3 < channels
+            (sums,) = torch.autograd.grad(output.image, colors, cotangent, retain_graph=more)
+            found.append(sums[:, : group.shape[-1]])
+    return torch.cat(found, dim=1)
 
 
 def _reaching(low: Tensor, high: Tensor, tiles: Tensor, width: int, height: int) -> Tensor:
