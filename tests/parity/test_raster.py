@@ -271,14 +271,15 @@ def test_blending_weights(isa: int, channels: int) -> None:
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
 def test_blending_weights_do_not_depend_on_threads(isa: int, channels: int) -> None:
     means, quats, scales, opacities, _, _ = gaussians(2000)
-    single = [value.float() for value in (means, quats, scales, opacities, *camera())]
+    viewmat, K = camera()
     maps = torch.rand(HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(3))
+    single = [value.float() for value in (means, quats, scales, opacities, viewmat, K, maps)]
     results = []
     before = torch.get_num_threads()
     try:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
-            results.append(cpu_raster.blending_weights(*single, maps, near=NEAR))
+            results.append(cpu_raster.blending_weights(*single, near=NEAR))
     finally:
         torch.set_num_threads(before)
     assert results[0].any()
