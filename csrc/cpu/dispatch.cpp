@@ -7,6 +7,7 @@
 #include <new>
 
 #include "bin.h"
+#include "lift.h"
 #include "splat.h"
 #include "ssim.h"
 #include "structgstream.h"
@@ -32,6 +33,7 @@
     void adam_step(                                                                                                   \
         float*, const float*, float*, float*, const int64_t*, int64_t, int64_t, double, int64_t, double, double,      \
         double, int);                                                                                                 \
+    void lift_flow(const FlowLift&, int);                                                                             \
     }
 
 SGS_DECLARE(baseline)
@@ -110,6 +112,8 @@ void anchors_visible_dispatched(
     SGS_DISPATCH(anchors_visible(anchors, count, view, covered, visible, threads))
 }
 
+void lift_flow_dispatched(const FlowLift& lift, int threads) { SGS_DISPATCH(lift_flow(lift, threads)) }
+
 Pinhole pinhole(const float* viewmat, const float* K, int width, int height, float near_plane) {
     Pinhole c;
     std::copy_n(viewmat, 12, c.view);
@@ -181,6 +185,22 @@ int sgs_raster_weights(
         for (int64_t i = 0; i < count; ++i)
             for (int64_t slot = raster.slots[i]; slot < raster.slots[i + 1]; ++slot)
                 for (int c = 0; c < channels; ++c) weights[i * channels + c] += sums[slot * channels + c];
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
+}
+
+int sgs_lift_flow(
+    const float* centers, const float* weights, const float* flows, const float* viewmats, const float* Ks,
+    const float* near_planes, const int64_t* neighbours, const float* affinities, const float* priors, int64_t movers,
+    int64_t targets, int views, int neighbour_count, float share, float* displacements, float* inlier_share,
+    int64_t* agreeing_views, int threads) {
+    try {
+        lift_flow_dispatched(
+            {centers, weights, flows, viewmats, Ks, near_planes, neighbours, affinities, priors, movers, targets, views,
+             neighbour_count, share, displacements, inlier_share, agreeing_views},
+            threads);
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;

@@ -58,6 +58,26 @@ int sgs_changed_pixels(
     const uint8_t* before, const uint8_t* now, int height, int width, float threshold, int reach, uint8_t* changed,
     int threads);
 
+/* Flow in pictures lifted to displacements (kernels/reference_lift.py). centers [E,3], weights [V,E], flows [V,E,2],
+ * viewmats [V,4,4], Ks [V,3,3], near_planes [V], neighbours [T,N] rows of movers, affinities [T,N], priors [T,3]. Out:
+ * displacements [T,3], inlier_share [T], agreeing_views [T]. Returns 0, or 1 where memory does not suffice. */
+int sgs_lift_flow(
+    const float* centers, const float* weights, const float* flows, const float* viewmats, const float* Ks,
+    const float* near_planes, const int64_t* neighbours, const float* affinities, const float* priors, int64_t movers,
+    int64_t targets, int views, int neighbour_count, float share, float* displacements, float* inlier_share,
+    int64_t* agreeing_views, int threads);
+
+/* A view that rays are swept through (kernels/reference_sweep.py). colors [h,w,3], missing [h,w], depths [h,w]. */
+struct sgs_sweep_view {
+    const float *colors, *missing, *depths;
+    float viewmat[12], K[9], near_plane;
+    int width, height;
+};
+/* pixels [count,2] column and row in view `view_index`, farthest [count]. Out: depths [count], 0 for none; costs [count]. */
+void sgs_sweep(
+    const struct sgs_sweep_view* views, int view_count, int view_index, const int64_t* pixels, const float* farthest,
+    int64_t count, int planes, int least_supports, float most_contradictions, float* depths, float* costs, int threads);
+
 /* Anchors (of `count`) that can put a Gaussian into the picture, or into its tiles that are not zero; ascending. Reads
  * positions, scales and offsets. Returns their number, or -1 where memory does not suffice. */
 int64_t sgs_anchors_visible(

@@ -23,7 +23,9 @@ from structgstream.scene.state import FieldName, on_device
 from structgstream.similarity import normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame, remembers
+from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.result import FitResult, StepListener
+from structgstream.training.views import training_views
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,13 @@ class FrameReport:
 
 @dataclass
 class _Past:
-    """What a frame is fitted after: the last scene, the one before it, and the last pictures, as far as they count."""
+    """What a frame is fitted after: the last scene, the one before it, the last pictures, and what frame 0 missed, as
+    far as they count."""
 
     scene: Scene | None = None
     older: Scene | None = None
     frame: MultiViewFrame | None = None
+    floor: ResidualFloor | None = None
 
 
 class Session:
@@ -142,6 +146,9 @@ class Session:
         if start >= len(self._source):
             return
         # What moves shows against the frame before, so a resumed stream reads that one once more.
+        if start > 0 and online.motion.residual_threshold > 0.0:
+            assert self._resumed is not None
+            past.floor = self._floor(self._resumed.scene(0), next(self._source.frames(0)))
         again = start > 0 and online.motion.enabled
         frames = self._source.frames(start - again)
         past.frame = next(frames) if again else None
@@ -173,8 +180,11 @@ class Session:
             kind = PacketKind.KEY if frame.index % self._key_interval == 0 else PacketKind.DELTA
             encoded = encoder.encode(fitted_scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
             scene = encoded.reconstruction
+            if frame.index == 0 and online.motion.residual_threshold > 0.0:
+                past.floor = self._floor(scene, frame)
             past = _Past(
                 scene,
+                floor=past.floor,
                 older=past.scene if remembers(online) else None,
                 frame=frame if online.motion.enabled else None,
             )
@@ -208,6 +218,11 @@ class Session:
                 peak_memory_kind=peaks.kind,
                 cpu_seconds=time.process_time() - cpu_started,
             )
+
+    def _floor(self, scene: Scene, frame: MultiViewFrame) -> ResidualFloor:
+        device, scale = self._backend.device, self._config.online.motion.picture_scale
+        views = training_views(frame, self._rig, device)
+        return residual_floor(on_device(scene, device), views, scale=scale, backend=self._backend)
 
     @property
     def _key_interval(self) -> int:
@@ -244,6 +259,7 @@ class Session:
             seed=seed,
             before=past.frame,
             steps=steps,
+            floor=past.floor,
             older=None if past.older is None else on_device(past.older, device),
             on_step=self._on_step,
         )

@@ -4,7 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.evaluation.flow import FlowField, sampled
+from structgstream.evaluation.flow import FlowField
+from structgstream.flow import sampled
 
 Picture = NDArray[np.uint8]
 

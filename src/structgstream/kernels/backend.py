@@ -18,6 +18,8 @@ from structgstream.errors import BackendError
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.raster_types import RasterOutput
+from structgstream.kernels.reference_lift import Lifted
+from structgstream.kernels.reference_sweep import Swept
 
 _log = logging.getLogger(__name__)
 
@@ -36,6 +38,8 @@ class Backend:
         l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
         volume: ``(scales, opacities) -> (sum, count)``, see ``kernels.reference_volume.volume``.
         changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
+        lift: see ``kernels.reference_lift.lift``.
+        sweep: see ``kernels.reference_sweep.sweep``.
         visible_anchors: see ``kernels.reference_anchors.visible_anchors``.
         generate_structured: see ``kernels.reference_anchors.generate_structured``.
         adam_step: see ``kernels.reference_adam.adam_step``.
@@ -48,6 +52,8 @@ class Backend:
     l1_ssim: Callable[..., tuple[Tensor, Tensor]]
     volume: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
     changed_pixels: Callable[..., Tensor]
+    lift: Callable[..., Lifted]
+    sweep: Callable[..., Swept]
     visible_anchors: Callable[..., Tensor]
     generate_structured: Callable[..., StructuredGaussians]
     adam_step: Callable[..., None]
@@ -59,8 +65,10 @@ def reference_backend() -> Backend:
         reference_adam,
         reference_anchors,
         reference_change,
+        reference_lift,
         reference_raster,
         reference_ssim,
+        reference_sweep,
         reference_volume,
     )
 
@@ -72,6 +80,8 @@ def reference_backend() -> Backend:
         l1_ssim=reference_ssim.l1_ssim,
         volume=reference_volume.volume,
         changed_pixels=reference_change.changed_pixels,
+        lift=reference_lift.lift,
+        sweep=reference_sweep.sweep,
         visible_anchors=reference_anchors.visible_anchors,
         generate_structured=reference_anchors.generate_structured,
         adam_step=reference_adam.adam_step,
@@ -84,7 +94,16 @@ def cpu_backend() -> Backend:
     Raises:
         BackendError: the native library was not built or cannot be loaded.
     """
-    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_change, cpu_raster, cpu_ssim, cpu_volume
+    from structgstream.kernels import (
+        cpu_adam,
+        cpu_anchors,
+        cpu_change,
+        cpu_lift,
+        cpu_raster,
+        cpu_ssim,
+        cpu_sweep,
+        cpu_volume,
+    )
     from structgstream.kernels._load import native_library
 
     native_library()
@@ -96,6 +115,8 @@ def cpu_backend() -> Backend:
         l1_ssim=cpu_ssim.l1_ssim,
         volume=cpu_volume.volume,
         changed_pixels=cpu_change.changed_pixels,
+        lift=cpu_lift.lift,
+        sweep=cpu_sweep.sweep,
         visible_anchors=cpu_anchors.visible_anchors,
         generate_structured=cpu_anchors.generate_structured,
         adam_step=cpu_adam.adam_step,
@@ -114,8 +135,10 @@ def cuda_backend() -> Backend:
         cuda_ssim,
         reference_anchors,
         reference_change,
+        reference_lift,
         reference_raster,
         reference_ssim,
+        reference_sweep,
         reference_volume,
     )
     from structgstream.kernels._nvcc import loss_library
@@ -134,6 +157,8 @@ def cuda_backend() -> Backend:
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         volume=reference_volume.volume,
         changed_pixels=reference_change.changed_pixels,
+        lift=reference_lift.lift,
+        sweep=reference_sweep.sweep,
         visible_anchors=reference_anchors.visible_anchors,
         generate_structured=cuda_anchors.generate_structured,
         adam_step=cuda_adam.adam_step,

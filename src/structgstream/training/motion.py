@@ -2,20 +2,25 @@
 """What moves: only anchors and free Gaussians whose place in the pictures changed are fitted (design, change gate).
 
 A Gaussian votes in every view that draws it: it may move if it covers changed pixels, and if they are a good part of
-what it covers there. Blending weights are used, so what is hidden behind something does not vote.
+what it covers there. Blending weights are used, so what is hidden behind something does not vote. A pixel has changed
+when it differs from the last frame's, or when the rendering misses there what frame 0 did not miss: change that is too
+slow to be seen between two frames adds up, and what was left behind stays wrong.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d
 
-from structgstream.cameras import Camera
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName
-from structgstream.training.views import View
+from structgstream.training.flow_maps import flow_map
+from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
+from structgstream.training.residuals import ResidualFloor, residual_of
+from structgstream.training.views import View, reduced
 
 
 @dataclass(frozen=True)
@@ -26,6 +31,9 @@ class MotionConfig:
     """Fit only what moves. Off, the paper: everything."""
     change_threshold: float = 0.05
     """Mean absolute difference, in 0 ... 1, of 3 x 3 pixels since the last frame; above the sensors' noise."""
+    residual_threshold: float = 0.0
+    """A pixel has changed too when the rendering misses so much more there than frame 0's did. 0: only differences
+    between frames count."""
     reach_pixels: int = 3
     """So far around a changed pixel things may have moved."""
     least_pixels: float = 0.3
@@ -55,6 +63,9 @@ class MotionConfig:
 SHARED_FIELDS: frozenset[FieldName] = frozenset({"opacity_mlp", "color_mlp", "covariance_mlp", "camera_color"})
 """What all anchors share changes only in frames in which everything may move: what stands still depends on it."""
 
+FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS = 0.3, 20.0
+"""Fewer pixels of flow say nothing of a mover, more say no more than so many."""
+
 
 @dataclass(frozen=True)
 class Moving:
@@ -65,12 +76,23 @@ class Moving:
         free: mask ``[F]``.
         unseen: mask ``[F]``, apart from ``free``: what no view shows.
         shown: for each view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
+        changed_share: of the pixels of all views.
+        evidence: how all movers were seen to move, if that was asked for.
+        centers: ``[M + F, 3]`` where all movers are seen, if that was asked for.
     """
 
     anchors: Tensor
     free: Tensor
     unseen: Tensor
     shown: dict[int, Tensor]
+    changed_share: float = 0.0
+    evidence: MotionEvidence | None = None
+    centers: Tensor | None = None
+
+    @property
+    def movers(self) -> Tensor:
+        """Indices (Note [Movers]) of what may move, ascending."""
+        return torch.cat([self.anchors, self.free]).nonzero()[:, 0]
 
 
 def changed_since(older: Scene, scene: Scene) -> Tensor:
@@ -98,6 +120,8 @@ def moving_parts(
     config: MotionConfig,
     backend: Backend,
     older: Scene | None = None,
+    floor: ResidualFloor | None = None,
+    with_flow: bool = False,
 ) -> Moving:
     """What may move between the pictures ``before`` and those of ``views`` (same cameras, same order).
 
@@ -108,8 +132,10 @@ def moving_parts(
         config: what counts as moving.
         backend: what computes.
         older: the scene a frame earlier, for ``moved_ease``; None for none.
+        floor: what frame 0 missed, for ``residual_threshold``; None for none.
+        with_flow: also find how everything was seen to move.
     """
-    k, anchors, free = scene.anchors.offsets_per_anchor, len(scene.anchors), len(scene.free)
+    anchors, free = len(scene.anchors), len(scene.free)
     votes = torch.zeros(anchors + free, device=scene.anchors.positions.device)
     seen = torch.zeros_like(votes)
     ease = torch.ones_like(votes)
@@ -117,43 +143,47 @@ def moving_parts(
         ease[changed_since(older, scene)] = config.moved_ease
     most = torch.zeros(free, device=votes.device)
     shown: dict[int, Tensor] = {}
+    flows: list[Tensor] = []
+    cover: Tensor | float = 0.0
+    shares = []
     with torch.no_grad():
-        scene = scene.baked()
+        baked = scene.baked()
         for view, last in zip(views, before, strict=True):
+            small = reduced(view, config.picture_scale)
+            gaussians = baked.gaussians(small.camera, backend)
             changed = backend.changed_pixels(
                 last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
             )
-            weights = _weights(scene, view.camera, changed, config, backend)
-            # The K Gaussians of an anchor vote together: it moves as one.
-            structured, single = weights[: anchors * k].reshape(anchors, k, 2), weights[anchors * k :]
-            total, part = torch.cat([structured.sum(1), single]).unbind(1)
+            size = (small.camera.height, small.camera.width)
+            part = interpolate(changed[None, None].to(gaussians.means), size=size, mode="area")
+            if floor is not None and config.residual_threshold > 0.0:
+                missing = residual_of(gaussians, small, scene.camera_color, backend)
+                wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
+                part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
+            shares.append(part.mean())
+            maps = [torch.ones(*size, 1, device=votes.device), part[0, 0, :, :, None]]
+            if with_flow:
+                maps += [flow_map(last.image, view.image, changed, size), reduced(last, config.picture_scale).colors]
+            sums = gathered(gaussians, baked, small.camera, torch.cat(maps, dim=-1), backend)
+            sums *= view.camera.height * view.camera.width / part.numel()
+            total, inside = by_mover(sums[:, :2], baked).unbind(1)
             seen += total > config.least_pixels
-            votes += (part > config.least_pixels * ease) & (part > config.least_share * ease * total)
-            most = torch.maximum(most, single[:, 0])
-            shown[view.index] = weights[:, 0] > config.least_pixels
+            votes += (inside > config.least_pixels * ease) & (inside > config.least_share * ease * total)
+            most = torch.maximum(most, sums[len(sums) - free :, 0])
+            shown[view.index] = sums[:, 0] > config.least_pixels
+            if with_flow:
+                flows.append(by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], baked))
+                cover = cover + sums[:, 0]
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
     unseen = most < config.unseen_pixels
-    return Moving(enough[:anchors], enough[anchors:] & ~unseen, unseen, shown)
-
-
-def _weights(scene: Scene, camera: Camera, changed: Tensor, config: MotionConfig, backend: Backend) -> Tensor:
-    """Blending weight of each Gaussian over the picture and over its changed part, ``[M * K + F, 2]`` pixels."""
-    height, width = changed.shape
-    small = camera.resized(*(max(1, round(size * config.picture_scale)) for size in (width, height)))
-    gaussians = scene.gaussians(small, backend)
-    part = torch.nn.functional.interpolate(
-        changed[None, None].to(gaussians.means), size=(small.height, small.width), mode="area"
-    )[0, 0]
-    found = backend.blending_weights(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        *small.beside(gaussians.means)[:2],
-        torch.stack([torch.ones_like(part), part], dim=-1),
-        near=small.near,
+    found = Moving(
+        enough[:anchors],
+        enough[anchors:] & ~unseen,
+        unseen,
+        shown,
+        changed_share=float(torch.stack(shares).mean()),
     )
-    slots = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
-    weights = found.new_zeros(slots, 2)
-    weights[gaussians.ids] = found * (changed.numel() / part.numel())
-    return weights
+    if not with_flow or not isinstance(cover, Tensor):
+        return found
+    evidence = flow_evidence(flows, least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS)
+    return replace(found, evidence=evidence, centers=mover_centers(scene, cover))

@@ -20,21 +20,29 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, without_waiting
 from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.focus import Focus
+from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
+from structgstream.training.births import BirthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
+from structgstream.training.motion_start import MotionStartConfig, displaced, started
+from structgstream.training.observation import slots_of
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
+    FREE_ROWS,
     ParameterName,
     Parameters,
     detached,
+    free_rows,
     parameters_of_fields,
 )
-from structgstream.training.partition import Partition, focuses
+from structgstream.training.partition import Partition
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.population import patched
 from structgstream.training.price import Rate
+from structgstream.training.renewal import renewal
+from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, Step, StepListener
 from structgstream.training.rounding import RoundingConfig
 from structgstream.training.settling import Settling
@@ -80,6 +88,10 @@ class OnlineConfig:
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    start: MotionStartConfig = field(default_factory=MotionStartConfig)
+    """Where what moves begins a frame; only with ``motion``."""
+    births: BirthConfig = field(default_factory=BirthConfig)
+    """What is born from geometry, and dies of blame, before the first iteration; only with ``motion``."""
     motion_prior: float = 0.0
     """Anchors that move begin a frame this share of their last step further on (the paper: 0, where they are)."""
     least_gain: float = 0.0
@@ -123,6 +135,7 @@ def fit_next_frame(
     before: MultiViewFrame | None = None,
     steps: Mapping[str, float] | None = None,
     older: Scene | None = None,
+    floor: ResidualFloor | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult:
     """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
@@ -136,6 +149,7 @@ def fit_next_frame(
         seed: all randomness comes from it, so a frame can be repeated alone.
         steps: of what is sent rounded (Note [Bins]); what it names is drawn rounded and comes back so.
         older: the decoded scene two frames before, for what has a memory (:func:`remembers`); None for none.
+        floor: what frame 0 missed (:func:`looks_back`); None for none.
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
@@ -148,26 +162,63 @@ def fit_next_frame(
     def fitted(stepping: Backend) -> FitResult:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
         fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
-        ahead = None
+        ahead = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
         if older is not None and config.motion_prior:
-            ahead = config.motion_prior * (scene.anchors.positions - older.anchors.positions)
+            ahead[: len(scene.anchors)] = config.motion_prior * (scene.anchors.positions - older.anchors.positions)
         if earlier is None:
             return fit.run(scene, views, ahead=ahead)
         with watch.stage("find motion"):
             motion = config.motion
-            which = moving_parts(scene, views, earlier, config=motion, backend=backend, older=older)
-            partition = Partition.of(scene, which)
-        ahead = None if ahead is None else ahead[which.anchors]
-        result = fit.run(partition.moving, views, partition=partition, ahead=ahead)
-        pruned = result.pruned + int(which.unseen.sum())
-        return replace(result, scene=partition.together(result.scene), pruned=pruned)
+            which = moving_parts(
+                scene,
+                views,
+                earlier,
+                config=motion,
+                backend=backend,
+                older=older,
+                floor=floor,
+                with_flow=config.start.enabled,
+            )
+            partition, ahead = Partition.of(scene, which), ahead[which.movers]
+        with watch.stage("start motion"):
+            start = started(partition, views, ahead, config=config.start, motion=motion, backend=backend)
+        with watch.stage("renew"):
+            new = renewal(
+                replace(partition, moving=displaced(partition.moving, start.displacements)),
+                views,
+                start.places,
+                frame_index=frame.index,
+                floor=floor,
+                room=config.patching.max_free - len(partition.still.free),
+                least_pixels=motion.least_pixels,
+                config=config.births,
+                backend=backend,
+            )
+            alive = torch.cat([torch.ones(len(partition.moving.anchors), dtype=torch.bool).to(new.kept), new.kept])
+            moving = replace(partition.moving, free=partition.moving.free.select(new.kept))
+        ahead = start.displacements[alive]
+        result = fit.run(moving, views, partition=partition, places=start.places, ahead=ahead, born=new.born)
+        died = int((~new.kept).sum())
+        return replace(
+            result,
+            scene=partition.together(result.scene),
+            pruned=result.pruned + int(which.unseen.sum()) + died,
+            spawned=result.spawned + len(new.born),
+            counts={
+                "lifted": start.lifted,
+                "corrected": start.corrected,
+                "born": len(new.born),
+                "blamed": died,
+                "refused": int(new.refused),
+            },
+        )
 
     if backend.device.type != "cuda":
         return fitted(backend)
     # The host runs ahead of a GPU as long as no iteration waits for it.
     return with_enough_room(
         lambda budget: fitted(without_waiting(backend, budget)),
-        capacity=max(1 << 18, 8 * _slots(scene)),
+        capacity=max(1 << 18, 8 * slots_of(scene)),
         device=backend.device,
     )
 
@@ -195,14 +246,20 @@ class _Fit:
     on_step: StepListener | None
 
     def run(
-        self, scene: Scene, views: list[View], *, partition: Partition | None = None, ahead: Tensor | None = None
+        self,
+        scene: Scene,
+        views: list[View],
+        *,
+        ahead: Tensor,
+        partition: Partition | None = None,
+        places: Mapping[int, Focus] | None = None,
+        born: FreeGaussians | None = None,
     ) -> FitResult:
-        """Fit ``scene`` to the pictures, its anchors starting ``ahead`` ``[M, 3]`` of where they are.
+        """Fit ``scene`` to the pictures, its movers (Note [Movers]) starting ``ahead`` ``[M + F, 3]`` of their places.
 
-        With a partition it is its moving part, where that shows.
+        With a partition it is its moving part, which shows in ``places`` by view index. What is ``born`` joins it.
         """
         config, watch, patching = self.config, self.watch, self.config.patching
-        places = None if partition is None else self._places(partition, views)
         still_free = 0 if partition is None else len(partition.still.free)
         seen = views if places is None else [view for view in views if view.index in places]
         iterations = math.ceil(config.iterations * len(seen) / len(views))  # Each view as often as in a full frame.
@@ -214,10 +271,17 @@ class _Fit:
         parameters = Parameters.of(scene, trained=trained, steps=steps)
         rounding = config.rounding.resolved()
         rate = Rate.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
-        if ahead is not None and "anchor_positions" in trained:  # What a step costs is counted from the last frame.
-            parameters.values["anchor_positions"].data += ahead
+        anchors = len(scene.anchors)  # What a step costs is counted from the last frame.
+        if "anchor_positions" in trained:
+            parameters.values["anchor_positions"].data += ahead[:anchors]
+        if "free_means" in trained:
+            parameters.values["free_means"].data += ahead[anchors:]
+        if born is not None and "free_means" in trained:
+            keep = torch.ones(len(scene.free), dtype=torch.bool, device=born.means.device)
+            parameters.births = torch.cat([parameters.births, born.births])
+            parameters.replace_rows(FREE_ROWS, keep=keep, added=free_rows(born))
         adam = Adam(self.backend)
-        statistics = GradientStatistics(_slots(scene), self.backend.device)
+        statistics = GradientStatistics(slots_of(scene) + (0 if born is None else len(born)), self.backend.device)
         last_pass = LastPass()
         settling = Settling(config.least_gain * len(views) / max(1, config.iterations), len(seen))
         tells_every = 1 if self.backend.device.type == "cpu" else 10  # Asking a GPU for the loss waits for it.
@@ -278,15 +342,6 @@ class _Fit:
             seconds=watch.seconds,
             losses=last_pass.terms,
         )
-
-    def _places(self, partition: Partition, views: list[View]) -> dict[int, Focus]:
-        with self.watch.stage("find motion"):
-            return focuses(partition, views, config=self.config.motion, backend=self.backend)
-
-
-def _slots(scene: Scene) -> int:
-    """Number of ids in a scene (Note [Ids])."""
-    return len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
 
 
 def without_patching(config: OnlineConfig) -> OnlineConfig:

@@ -65,6 +65,17 @@ def parameters_of_fields(names: Iterable[FieldName]) -> frozenset[ParameterName]
     return frozenset(found)
 
 
+def free_rows(free: FreeGaussians) -> dict[ParameterName, Tensor]:
+    """The rows of :data:`FREE_ROWS` that stand for ``free``."""
+    return {
+        "free_means": free.means,
+        "free_log_scales": free.log_scales,
+        "free_quats": free.quats,
+        "free_logit_opacities": free.logit_opacities,
+        "free_colors": free.colors,
+    }
+
+
 @dataclass
 class Parameters:
     """Leaf tensors by name. The one mutable thing of a fit; it never leaves it.

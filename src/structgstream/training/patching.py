@@ -111,12 +111,12 @@ def _empty_like(scene: Scene) -> Gaussians:
 
 
 def children_of(
-    parents: Gaussians, *, frame_index: int, config: PatchingConfig, generator: torch.Generator
+    parents: Gaussians, *, first_birth: int, config: PatchingConfig, generator: torch.Generator
 ) -> FreeGaussians:
     """One free Gaussian for each parent, drawn from N(mu, factor * Sigma).
 
     With Sigma = R S S^T R^T a draw is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
-    parent's, the rotation is the unit quaternion, the opacity ``config.opacity``.
+    parent's, the rotation is the unit quaternion, the opacity ``config.opacity``. Births count from ``first_birth``.
     """
     count = len(parents)
     z = torch.randn(count, 3, generator=generator).to(parents.means)
@@ -130,5 +130,5 @@ def children_of(
         quats=unit.expand(count, 4).clone(),
         logit_opacities=torch.logit(opacity).to(parents.means).expand(count).clone(),
         colors=parents.colors.clone(),
-        births=frame_index * BIRTHS_PER_FRAME + torch.arange(count, device=parents.means.device),
+        births=first_birth + torch.arange(count, device=parents.means.device),
     )

@@ -5,11 +5,11 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import FREE_ROWS, ParameterName, Parameters
+from structgstream.training.parameters import FREE_ROWS, Parameters, free_rows
 from structgstream.training.patching import (
+    BIRTHS_PER_FRAME,
     PatchingConfig,
     children_of,
     gaussians_by_id,
@@ -60,19 +60,12 @@ def patched(
         generator=generator,
     )
     parents = gaussians_by_id(current, views, ids, backend)
-    children = children_of(parents, frame_index=frame_index, config=config, generator=generator)
-    added = _free_rows(children)
+    first_birth = frame_index * BIRTHS_PER_FRAME
+    if len(parameters.births):  # Some may have been born in this frame already.
+        first_birth = max(first_birth, int(parameters.births.max()) + 1)
+    children = children_of(parents, first_birth=first_birth, config=config, generator=generator)
+    added = free_rows(children)
     parameters.births = torch.cat([parameters.births[keep], children.births])
     parameters.replace_rows(FREE_ROWS, keep=keep, added=added)
     adam.replace_rows(FREE_ROWS, keep=keep, added=len(children))
     return keep, len(children)
-
-
-def _free_rows(free: FreeGaussians) -> dict[ParameterName, Tensor]:
-    return {
-        "free_means": free.means,
-        "free_log_scales": free.log_scales,
-        "free_quats": free.quats,
-        "free_logit_opacities": free.logit_opacities,
-        "free_colors": free.colors,
-    }

@@ -33,6 +33,7 @@ class FitResult:
         moving: anchors that were free to move.
         spawned: free Gaussians added in this frame.
         pruned: free Gaussians removed in this frame.
+        counts: how often each further mechanism acted, by its name.
         seconds: wall-clock seconds by stage (``render``, ``loss``, ``backward``, ``optimise``, ``patch``, ...).
         losses: mean of each loss term over the last pass through the cameras.
     """
@@ -43,5 +44,6 @@ class FitResult:
     moving: int = 0
     spawned: int = 0
     pruned: int = 0
+    counts: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     losses: Mapping[str, float] = field(default_factory=dict)

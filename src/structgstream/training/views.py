@@ -25,6 +25,11 @@ class View:
     camera: Camera
     image: Tensor
 
+    @property
+    def colors(self) -> Tensor:
+        """The picture in 0 ... 1, ``[H, W, 3]`` float32."""
+        return self.image.float() / 255.0
+
 
 def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) -> list[View]:
     """The frame's training views in rig order; held-out pictures are not touched."""

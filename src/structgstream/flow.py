@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Optical flow between two pictures of one camera, and where it can be believed."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from structgstream.errors import MissingExtraError
+
+RELATIVE, ABSOLUTE = 0.01, 0.5  # of the check for occlusion: a share of the squared lengths, and squared pixels
+
+FlowSearch = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
+"""Pictures ``[H, W, 3]`` of one size; gives ``[H, W, 2]``, x and y in pixels: what is at ``p`` in the first picture is
+at ``p + flow[p]`` in the second."""
+
+
+def dis_search(extra: str) -> FlowSearch:
+    """Flow by dense inverse search (Kroeger et al., 2016), OpenCV's preset "medium", on grey pictures.
+
+    Args:
+        extra: the extra of this package that a user should install when OpenCV is missing.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", extra) from None
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
+        one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second))
+        # calc goes on from the flow that it is given, and writes into it.
+        return np.asarray(search.calc(one, other, np.zeros((*one.shape, 2), np.float32)), np.float32)
+
+    return flow
+
+
+def agreeing(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which pixels ``[H, W]`` lead back to themselves, so that they are not occluded (Sundaram et al., 2010).
+
+    With ``f`` the flow of a picture to another and ``b`` the one of that other back, ``[H, W, 2]``:
+    ``|f(p) + b(p + f(p))|^2 <= 0.01 (|f(p)|^2 + |b(p + f(p))|^2) + 0.5``, and ``p + f(p)`` lies in the picture.
+    """
+    returned = sampled(back, flow)
+    rest = np.square(flow + returned).sum(2)
+    lengths = np.square(flow).sum(2) + np.square(returned).sum(2)
+    return (rest <= RELATIVE * lengths + ABSOLUTE) & inside(flow)
+
+
+def inside(offsets: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which pixels ``[H, W]`` lead to a place between the centres of the picture's outermost pixels."""
+    height, width, _ = offsets.shape
+    x, y = offsets[..., 0] + np.arange(width), offsets[..., 1] + np.arange(height)[:, None]
+    return (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+
+
+def sampled(values: NDArray[np.float32], offsets: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``values`` ``[H, W, C]`` at each pixel plus its offset, of the same shape: bilinear, border repeated."""
+    height, width, _ = offsets.shape
+    x = (torch.from_numpy(offsets[..., 0]) + torch.arange(width)) * (2 / max(width - 1, 1)) - 1
+    y = (torch.from_numpy(offsets[..., 1]) + torch.arange(height)[:, None]) * (2 / max(height - 1, 1)) - 1
+    planes: Tensor = torch.from_numpy(np.ascontiguousarray(values)).permute(2, 0, 1)[None]
+    grid = torch.stack([x, y], -1)[None]
+    result = grid_sample(planes, grid, mode="bilinear", padding_mode="border", align_corners=True)
+    return result[0].permute(1, 2, 0).numpy()

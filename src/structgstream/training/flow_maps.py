@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Optical flow of a training camera as maps that can be gathered."""
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from structgstream.flow import agreeing, dis_search
+
+CONTEXT_PIXELS = 16
+"""Flow is looked for in the box around what changed, and so far around it."""
+
+
+def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, int]) -> Tensor:
+    """Flow from one picture to another of the same camera, with the confidence c in it: ``[h, w, 3]``, the maps
+    (c, c flow_x, c flow_y).
+
+    c is the share of the pixels whose flow leads back (``flow.agreeing``). It is zero outside a box around ``changed``.
+
+    Args:
+        first: ``[H, W, 3]`` uint8.
+        second: ``[H, W, 3]`` uint8.
+        changed: ``[H, W]`` bool, where the two differ.
+        size: h and w of the maps; flow is in pixels of the pictures.
+    """
+    height, width = changed.shape
+    maps = torch.zeros(height, width, 3)
+    box = _box(changed)
+    if box is not None:
+        rows, columns = box
+        search = dis_search("capture")
+        earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
+        forward, backward = search(earlier, later), search(later, earlier)
+        believed = agreeing(forward, backward).astype(np.float32)[..., None]
+        maps[rows, columns] = torch.from_numpy(np.concatenate([believed, believed * forward], axis=-1))
+    small = interpolate(maps.permute(2, 0, 1)[None], size=size, mode="area")
+    return small[0].permute(1, 2, 0).to(first.device)
+
+
+def _box(mask: Tensor) -> tuple[slice, slice] | None:
+    """Rows and columns around what is in the mask ``[H, W]``; None for nothing, or for too little to search in."""
+    if not mask.any():
+        return None
+    spans = []
+    for axis in (1, 0):
+        hit = mask.any(axis).nonzero()[:, 0]
+        low, high = int(hit[0]) - CONTEXT_PIXELS, int(hit[-1]) + 1 + CONTEXT_PIXELS
+        spans.append(slice(max(0, low), min(mask.shape[1 - axis], high)))
+    if min(span.stop - span.start for span in spans) < 2 * CONTEXT_PIXELS:
+        return None
+    return spans[0], spans[1]

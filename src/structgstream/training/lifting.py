@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flow in the training pictures, lifted to a displacement of every mover (Note [Movers])."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.errors import MissingExtraError
+from structgstream.kernels.backend import Backend
+from structgstream.training.observation import MotionEvidence
+from structgstream.training.views import View
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """How flow becomes motion."""
+
+    neighbours: int = 12
+    """A mover follows the flow of so many movers nearest to it, itself among them."""
+    bandwidth: float = 0.7
+    """Standard deviation of the weight of a neighbour by distance, in distances to the farthest of them."""
+    color_bandwidth: float = 0.15
+    """Standard deviation of the weight of a neighbour by difference in colour, in 0 ... 1: a hand and a ball do not
+    share a motion. 0: colours do not count."""
+    inlier_share: float = 0.4
+    """A displacement counts when so much of the flow agrees with it ..."""
+    agreeing_views: int = 2
+    """... in so many views; else a mover begins where its last step leads."""
+
+
+@dataclass(frozen=True)
+class MotionStart:
+    """Where movers ``[T]`` begin a frame.
+
+    Args:
+        displacements: ``[T, 3]`` from where they are.
+        lifted: mask ``[T]`` of those that follow flow; the others follow their last step.
+    """
+
+    displacements: Tensor
+    lifted: Tensor
+
+
+def lifted_motion(
+    evidence: MotionEvidence,
+    centers: Tensor,
+    priors: Tensor,
+    views: Sequence[View],
+    *,
+    config: LiftConfig,
+    backend: Backend,
+) -> MotionStart:
+    """A displacement for each of ``T`` movers.
+
+    Args:
+        evidence: of these movers.
+        centers: ``[T, 3]`` where they are seen.
+        priors: ``[T, 3]`` where they would go by themselves.
+        views: in the evidence's order; flow is in their pixels.
+        config: how.
+        backend: what computes.
+
+    Raises:
+        MissingExtraError: SciPy is not installed.
+    """
+    informed = (evidence.weights.amax(0) > 0).nonzero()[:, 0]
+    if not len(informed):
+        return MotionStart(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
+    near, distances = _nearest(centers, centers[informed], config.neighbours)
+    spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
+    affinities = torch.exp(-0.5 * (distances / spread).square())
+    neighbours = informed[near]
+    if config.color_bandwidth > 0.0:
+        apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
+        affinities = affinities * torch.exp(-0.5 * apart / config.color_bandwidth**2)
+    matrices = [view.camera.beside(centers) for view in views]
+    found = backend.lift(
+        centers,
+        evidence.weights,
+        evidence.flows,
+        torch.stack([m.viewmat for m in matrices]),
+        torch.stack([m.K for m in matrices]),
+        centers.new_tensor([view.camera.near for view in views]),
+        neighbours,
+        affinities,
+        priors,
+        share=config.inlier_share,
+    )
+    lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
+    return MotionStart(torch.where(lifted[:, None], found.displacements, priors), lifted)
+
+
+def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The ``count`` of ``among`` (or all of them) nearest to each of ``points``: rows and distances ``[T, N]``."""
+    try:
+        from scipy.spatial import KDTree
+    except ImportError as error:
+        raise MissingExtraError("scipy", "capture") from error
+    count = min(count, len(among))
+    distances, rows = KDTree(among.double().numpy(force=True)).query(
+        points.double().numpy(force=True), k=list(range(1, count + 1))
+    )
+    return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)

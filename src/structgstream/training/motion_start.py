@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Before the first iteration everything that moves is put where the pictures show it (design, motion start).
+
+The loss of a picture tells a Gaussian which way to go only while it still overlaps with where it belongs. Flow tells it
+from further away, so nothing fast smears, and nothing is left behind as a ghost. Two rounds: the flow between the last
+pictures and these, and then, with that motion made, the flow from what is rendered to these pictures, which also finds
+what lagged behind before.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import pixels_of_tiles
+from structgstream.scene.focus import Focus
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+from structgstream.training.flow_maps import flow_map
+from structgstream.training.lifting import LiftConfig, MotionStart, lifted_motion
+from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
+from structgstream.training.observation import by_mover, flow_evidence, gathered, mover_centers
+from structgstream.training.partition import Partition, focuses
+from structgstream.training.residuals import as_recorded
+from structgstream.training.views import View, reduced
+
+
+@dataclass(frozen=True)
+class MotionStartConfig:
+    """Where what moves begins a frame."""
+
+    enabled: bool = False
+    """Lift flow. Off, the paper: everything begins where it was."""
+    rounds: int = 2
+    """1: flow between the pictures alone; 2: and from the rendering to the pictures."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+
+
+@dataclass(frozen=True)
+class Started:
+    """How the moving part of a scene begins a frame.
+
+    Args:
+        displacements: ``[M + F, 3]`` of its movers (Note [Movers]), from where they were.
+        places: by view index, where it shows.
+        lifted: movers that follow the flow between pictures.
+        corrected: movers that follow the flow from the rendering.
+    """
+
+    displacements: Tensor
+    places: Mapping[int, Focus]
+    lifted: int = 0
+    corrected: int = 0
+
+
+def started(
+    partition: Partition,
+    views: Sequence[View],
+    priors: Tensor,
+    *,
+    config: MotionStartConfig,
+    motion: MotionConfig,
+    backend: Backend,
+) -> Started:
+    """Where the moving part of ``partition`` begins.
+
+    Args:
+        partition: with the evidence of flow, if the start is enabled.
+        views: of the frame.
+        priors: ``[M + F, 3]`` displacements of the moving part without any evidence.
+        config: how.
+        motion: what counts as moving.
+        backend: what computes.
+    """
+    which = partition.which
+    if not config.enabled or which.evidence is None or which.centers is None or not len(priors):
+        return Started(priors, focuses(partition, views, config=motion, backend=backend))
+    movers = which.movers
+    evidence, centers = which.evidence.select(movers), which.centers[movers]
+    first = lifted_motion(evidence, centers, priors, views, config=config.lift, backend=backend)
+    displacements, lifted, corrections = first.displacements, int(first.lifted.sum()), 0
+    moved = replace(partition, moving=displaced(partition.moving, displacements))
+    places = focuses(moved, views, config=motion, backend=backend)
+    if config.rounds > 1:
+        second = corrected(moved.moving, views, places, scale=motion.picture_scale, config=config.lift, backend=backend)
+        displacements, corrections = displacements + second.displacements, int(second.lifted.sum())
+    return Started(displacements, places, lifted, corrections)
+
+
+def displaced(scene: Scene, displacements: Tensor) -> Scene:
+    """``scene``, its movers (Note [Movers]) shifted by ``[M + F, 3]``."""
+    m = len(scene.anchors)
+    return replace(
+        scene,
+        anchors=replace(scene.anchors, positions=scene.anchors.positions + displacements[:m]),
+        free=replace(scene.free, means=scene.free.means + displacements[m:]),
+    )
+
+
+def corrected(
+    moving: Scene,
+    views: Sequence[View],
+    focuses: Mapping[int, Focus],
+    *,
+    scale: float,
+    config: LiftConfig,
+    backend: Backend,
+) -> MotionStart:
+    """What the movers of ``moving`` still lack: lifted from the flow from its rendering to the pictures.
+
+    Args:
+        moving: the moving part of a scene, where it is believed to be.
+        views: of the frame.
+        focuses: by view index, where it shows; views without one are not looked at.
+        scale: of the pictures on which is gathered.
+        config: how.
+        backend: what computes.
+    """
+    seen = [view for view in views if view.index in focuses]
+    baked = moving.baked()
+    sums, cover = [], moving.anchors.positions.new_zeros(())
+    with torch.no_grad():
+        for view in seen:
+            focus, small = focuses[view.index], reduced(view, scale)
+            gaussians = baked.gaussians(view.camera, backend)
+            onto = replace(focus, picture=focus.picture.clone())
+            image = as_recorded(
+                draw(gaussians, view.camera, backend, focus=onto).image, moving.camera_color, view.index
+            )
+            picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+            inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)
+            # Outside the tiles nothing was drawn: there the picture takes the place of the rendering.
+            picture = torch.where(inside[..., None], picture, view.image)
+            size = (small.camera.height, small.camera.width)
+            maps = [flow_map(picture, view.image, inside, size), torch.ones(*size, 1).to(image), small.colors]
+            found = gathered(gaussians, baked, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
+            found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
+            sums.append(by_mover(found, baked))
+            cover = cover + found[:, 3]
+    nothing = torch.zeros(len(moving.anchors) + len(moving.free), 3).to(moving.anchors.positions)
+    if not seen:
+        return MotionStart(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
+    evidence = flow_evidence(sums, least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS)
+    return lifted_motion(evidence, mover_centers(moving, cover), nothing, seen, config=config, backend=backend)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the pictures say of each thing that can move, gathered by blending weights.
+
+Note [Movers]
+~~~~~~~~~~~~~
+A mover is what moves as one: an anchor with its K Gaussians, or a free Gaussian. Movers are numbered anchors first,
+then free Gaussians, ``M + F`` of them. A map of a picture is gathered for a mover by summing it over the pixels with
+the blending weights of its Gaussians, so that what is hidden behind something says nothing.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import Gaussians, concatenate
+from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class MotionEvidence:
+    """How movers ``[E]`` were seen to move in each of ``V`` views.
+
+    Args:
+        weights: ``[V, E]`` pixels of believable flow that the mover covers.
+        flows: ``[V, E, 2]`` its mean over them, pixels of the full picture.
+        colors: ``[E, 3]`` mean colour of the pictures where it shows, in 0 ... 1.
+    """
+
+    weights: Tensor
+    flows: Tensor
+    colors: Tensor
+
+    def select(self, movers: Tensor) -> "MotionEvidence":
+        """Those of a mask or of indices."""
+        return MotionEvidence(self.weights[:, movers], self.flows[:, movers], self.colors[movers])
+
+
+def gathered(
+    gaussians: Gaussians,
+    scene: Scene,
+    camera: Camera,
+    maps: Tensor,
+    backend: Backend,
+    *,
+    still: Gaussians | None = None,
+) -> Tensor:
+    """Sums of ``maps`` ``[h, w, C]`` over the pixels, by id (Note [Ids]): ``[M * K + F, C]``.
+
+    Args:
+        gaussians: of ``scene``, as the camera sees it.
+        scene: whose ids.
+        camera: has the maps' size.
+        maps: what is gathered.
+        backend: what computes.
+        still: others, that hide or are hidden and are not told of.
+    """
+    drawn = gaussians if still is None else concatenate(gaussians, still)
+    found = backend.blending_weights(
+        drawn.means,
+        drawn.quats,
+        drawn.scales,
+        drawn.opacities,
+        *camera.beside(drawn.means)[:2],
+        maps,
+        near=camera.near,
+    )
+    sums = found.new_zeros(slots_of(scene), maps.shape[-1])
+    sums[gaussians.ids] = found[: len(gaussians)]
+    return sums
+
+
+def slots_of(scene: Scene) -> int:
+    """Number of ids in a scene (Note [Ids])."""
+    return len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
+
+
+def by_mover(sums: Tensor, scene: Scene) -> Tensor:
+    """Sums by id ``[M * K + F, C]`` as sums by mover ``[M + F, C]``."""
+    m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
+    return torch.cat([sums[: m * k].reshape(m, k, -1).sum(1), sums[m * k :]])
+
+
+def flow_evidence(sums: Sequence[Tensor], *, least_pixels: float, most_pixels: float) -> MotionEvidence:
+    """Evidence from what was gathered in each view of the maps c, c flow_x, c flow_y, 1, r, g and b.
+
+    Args:
+        sums: by view ``[E, 7]``, in pixels of the full picture.
+        least_pixels: fewer pixels of flow say nothing.
+        most_pixels: more count as so many.
+    """
+    together = torch.stack(list(sums))
+    weights, moved, cover, colors = together[..., 0], together[..., 1:3], together[..., 3], together[..., 4:]
+    flows = moved / weights.clamp(min=1e-6)[..., None]
+    weights = torch.where(weights < least_pixels, 0.0, weights.clamp(max=most_pixels))
+    return MotionEvidence(weights, flows, colors.sum(0) / cover.sum(0).clamp(min=1e-6)[:, None])
+
+
+def mover_centers(scene: Scene, cover: Tensor) -> Tensor:
+    """Where each mover is seen to be, ``[M + F, 3]``: the mean of its Gaussians, weighted with what each covers.
+
+    Args:
+        scene: whose movers.
+        cover: ``[M * K + F]`` pixels, by id.
+    """
+    anchors, m = scene.anchors, len(scene.anchors) * scene.anchors.offsets_per_anchor
+    reach = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
+    weights = cover[:m].reshape(len(anchors), -1, 1)
+    mean = (reach * weights).sum(1) / weights.sum(1).clamp(min=1e-6)
+    return torch.cat([anchors.positions + mean, scene.free.means])

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""After everything has moved: free Gaussians that are to blame for what is wrong die, and what emerged is born."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import concatenate
+from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import pixels_of_tiles
+from structgstream.scene.focus import Focus
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+from structgstream.training.births import BirthConfig, Missing, blamed, born, missing_in
+from structgstream.training.observation import gathered
+from structgstream.training.partition import Partition
+from structgstream.training.patching import BIRTHS_PER_FRAME
+from structgstream.training.residuals import ResidualFloor, as_recorded
+from structgstream.training.views import View
+
+LEAST_COVERAGE = 0.5
+"""A pixel that is covered less shows nothing that has a depth."""
+
+
+@dataclass(frozen=True)
+class Renewal:
+    """What became of the free Gaussians of a moving part.
+
+    Args:
+        kept: mask ``[F]`` of those that live on.
+        born: new ones.
+        missing_share: of the pixels of all training views.
+        refused: so much was missing that nothing can have emerged there.
+    """
+
+    kept: Tensor
+    born: FreeGaussians
+    missing_share: float = 0.0
+    refused: bool = False
+
+
+def renewal(
+    partition: Partition,
+    views: Sequence[View],
+    places: Mapping[int, Focus],
+    *,
+    frame_index: int,
+    floor: ResidualFloor | None,
+    room: int,
+    least_pixels: float,
+    config: BirthConfig,
+    backend: Backend,
+) -> Renewal:
+    """Deaths and births before the first iteration.
+
+    Args:
+        partition: its moving part where it is believed to be.
+        views: of the frame.
+        places: by view index, where the moving part shows.
+        frame_index: for the identities of births.
+        floor: what frame 0 missed; None for nothing.
+        room: how many free Gaussians the scene may get.
+        least_pixels: a view that sees less of something says nothing of it.
+        config: the rules.
+        backend: what computes.
+    """
+    moving = partition.moving.baked()
+    everything = torch.ones(len(moving.free), dtype=torch.bool, device=moving.free.means.device)
+    none = Renewal(everything, FreeGaussians.empty(moving.free.means))
+    if not config.enabled or not places:
+        return none
+    with torch.no_grad():
+        missing = _missing(moving, views, places, floor=floor, config=config, backend=backend)
+        share = float(torch.stack([(entry.share > 0.5).float().mean() for entry in missing]).mean())
+        if share > config.most_missing_share:
+            return replace(none, missing_share=share, refused=True)
+        kept = everything
+        if len(moving.free):
+            kept = ~_blamed(moving, missing, places, least_pixels=least_pixels, config=config, backend=backend)
+        if not kept.all():
+            moving = replace(moving, free=moving.free.select(kept))
+            missing = _missing(moving, views, places, floor=floor, config=config, backend=backend)
+        if sum(bool((entry.share > 0.5).any()) for entry in missing) <= config.least_supports:
+            return replace(none, kept=kept, missing_share=share)
+        still = partition.still.baked()
+        depths = {entry.view.index: _depths([moving, still], entry.view.camera, backend) for entry in missing}
+        new = born(
+            missing,
+            depths,
+            moving.camera_color,
+            first_birth=frame_index * BIRTHS_PER_FRAME,
+            config=replace(config, most=max(0, min(config.most, room - int(kept.sum())))),
+            backend=backend,
+        )
+    return Renewal(kept, new, share)
+
+
+def _missing(
+    moving: Scene,
+    views: Sequence[View],
+    places: Mapping[int, Focus],
+    *,
+    floor: ResidualFloor | None,
+    config: BirthConfig,
+    backend: Backend,
+) -> list[Missing]:
+    """What each view's rendering lacks; nothing where nothing moves."""
+    found = []
+    for view in views:
+        picture = view.colors
+        focus = places.get(view.index)
+        if focus is not None:
+            onto = replace(focus, picture=focus.picture.clone())
+            drawn = draw(moving.gaussians(view.camera, backend), view.camera, backend, focus=onto)
+            inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)[..., None]
+            picture = torch.where(inside, as_recorded(drawn.image, moving.camera_color, view.index), picture)
+        found.append(missing_in(picture.clamp(0.0, 1.0), view, floor=floor, config=config))
+    return found
+
+
+def _blamed(
+    moving: Scene,
+    missing: Sequence[Missing],
+    places: Mapping[int, Focus],
+    *,
+    least_pixels: float,
+    config: BirthConfig,
+    backend: Backend,
+) -> Tensor:
+    cover, wrong = [], []
+    for entry in missing:
+        focus, camera = places.get(entry.view.index), entry.view.camera
+        if focus is None:
+            continue
+        maps = torch.stack([torch.ones_like(entry.share), entry.wrong.to(entry.share)], dim=-1)
+        sums = gathered(moving.gaussians(camera, backend), moving, camera, maps, backend, still=focus.still)
+        of_free = sums[len(sums) - len(moving.free) :]
+        cover.append(of_free[:, 0])
+        wrong.append(of_free[:, 1])
+    return blamed(torch.stack(cover), torch.stack(wrong), least_pixels=least_pixels, config=config)
+
+
+def _depths(parts: Sequence[Scene], camera: Camera, backend: Backend) -> Tensor:
+    """Mean depth along z ``[h, w]`` of what a camera sees of scenes together; infinite where little is."""
+    first, second = (part.gaussians(camera, backend) for part in parts)
+    gaussians = concatenate(first, second)
+    viewmat = camera.beside(gaussians.means).viewmat
+    z = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
+    rendering = draw(replace(gaussians, colors=z[:, None].expand(-1, 3).contiguous()), camera, backend)
+    depth = rendering.image[..., 0] / rendering.alpha.clamp(min=LEAST_COVERAGE)
+    return torch.where(rendering.alpha > LEAST_COVERAGE, depth, torch.inf)

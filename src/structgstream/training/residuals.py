@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where renderings differ from the training pictures by more than they did in frame 0.
+
+Every scene misses something everywhere; what frame 0 already missed says nothing about what has happened since.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend
+from structgstream.scene.color import CameraColor
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+from structgstream.training.views import View, reduced
+
+SMOOTHED_PIXELS = 3
+FLOOR_PIXELS = 5
+"""A rendering of frame 0 that is wrong here may be wrong this far around in another frame."""
+
+
+@dataclass(frozen=True)
+class ResidualFloor:
+    """What frame 0 missed, for each training view.
+
+    Args:
+        scale: size of the maps against the pictures.
+        maps: by view index ``[h, w]``, the largest residual of the 5 x 5 pixels around each, in 0 ... 1.
+    """
+
+    scale: float
+    maps: dict[int, Tensor]
+
+
+def as_recorded(image: Tensor, color: CameraColor, view_index: int) -> Tensor:
+    """A rendering ``[H, W, 3]`` as the training camera would have recorded it."""
+    return image * color.gains[view_index] + color.biases[view_index]
+
+
+def box_mean(values: Tensor, pixels: int) -> Tensor:
+    """Mean of ``values`` ``[H, W]`` over the ``pixels`` x ``pixels`` around each that exist."""
+    return avg_pool2d(values[None, None], pixels, stride=1, padding=pixels // 2, count_include_pad=False)[0, 0]
+
+
+def residual(picture: Tensor, image: Tensor) -> Tensor:
+    """Mean absolute difference ``[H, W]`` of ``picture`` ``[H, W, 3]`` in 0 ... 1 to ``image`` (uint8), over channels
+    and 3 x 3 pixels."""
+    return box_mean((picture - image.to(picture) / 255.0).abs().mean(-1), SMOOTHED_PIXELS)
+
+
+def residual_of(gaussians: Gaussians, view: View, color: CameraColor, backend: Backend) -> Tensor:
+    """The :func:`residual` of drawing ``gaussians`` for ``view``."""
+    return residual(as_recorded(draw(gaussians, view.camera, backend).image, color, view.index), view.image)
+
+
+def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
+    """What ``scene``, frame 0 as every receiver has it, misses in its pictures, at ``scale`` of their size."""
+    scene = scene.baked()
+    maps = {}
+    with torch.no_grad():
+        for view in views:
+            small = reduced(view, scale)
+            found = residual_of(scene.gaussians(small.camera, backend), small, scene.camera_color, backend)
+            maps[view.index] = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
+    return ResidualFloor(scale, maps)

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flow lifted to displacements: each back-end against the oracle."""
+
+import pytest
+import torch
+
+from structgstream.kernels import cpu_lift, reference_lift
+from structgstream.kernels._load import native_library, native_reason
+
+needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+
+
+def scenery(seed: int, *, movers: int = 40, views: int = 5, targets: int = 30, count: int = 7) -> dict[str, torch.Tensor]:
+    """Cameras on a ring that look at movers around the origin, each of which moves by the same displacement."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    centers = 0.3 * draw(movers, 3)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
+    for v in range(views):
+        angle = torch.tensor(0.4 * v)
+        c, s = angle.cos(), angle.sin()
+        viewmats[v, :3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        viewmats[v, 2, 3] = 2.0
+    Ks = torch.tensor([[300.0, 0, 160], [0, 310.0, 120], [0, 0, 1]], dtype=torch.float64).repeat(views, 1, 1)
+    near = torch.full((views,), 1.5, dtype=torch.float64)  # some movers lie before it
+    motion = torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
+    jacobians = reference_lift.projection_jacobians(centers, viewmats, Ks, near)
+    flows = jacobians @ motion + 0.3 * draw(views, movers, 2)
+    weights = torch.rand(views, movers, generator=generator, dtype=torch.float64) * 5
+    weights[weights < 1.0] = 0.0
+    flows[0] += 30.0  # a view whose flow is wrong
+    return {
+        "centers": centers,
+        "weights": weights,
+        "flows": flows,
+        "viewmats": viewmats,
+        "Ks": Ks,
+        "near": near,
+        "neighbours": torch.randint(movers, (targets, count), generator=generator),
+        "affinities": torch.rand(targets, count, generator=generator, dtype=torch.float64),
+        "priors": 0.05 * draw(targets, 3),
+    }
+
+
+def single(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: t if t.dtype == torch.int64 else t.float() for name, t in tensors.items()}
+
+
+@needs_native
+@pytest.mark.parametrize("isa", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_cpu_finds_what_the_oracle_finds(isa: int, seed: int) -> None:
+    given = scenery(seed)
+    before = native_library().sgs_isa()
+    try:
+        if native_library().sgs_use_isa(isa) != isa:
+            pytest.skip("this processor has no such instructions")
+        found = cpu_lift.lift(**single(given), share=0.4)
+    finally:
+        native_library().sgs_use_isa(before)
+    oracle = reference_lift.lift(**given, share=0.4)
+    # Rounds feed on each other, so single precision shows in the fifth digit.
+    torch.testing.assert_close(found.displacements.double(), oracle.displacements, atol=2e-5, rtol=1e-3)
+    near_the_edge = (found.inlier_share.double() - oracle.inlier_share).abs() > 1e-3
+    assert near_the_edge.float().mean() <= 0.1  # a term may lie at 1.5 pixels exactly
+    assert (found.agreeing_views == oracle.agreeing_views).float().mean() >= 0.9
+
+
+@needs_native
+def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
+    given, threads = single(scenery(3, targets=200)), torch.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            results.append(cpu_lift.lift(**given, share=0.4))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert torch.equal(results[0].displacements, other.displacements)
+        assert torch.equal(results[0].inlier_share, other.inlier_share)
+
+
+@needs_native
+def test_cpu_without_evidence_keeps_the_prior() -> None:
+    given = single(scenery(2))
+    given["weights"] = torch.zeros_like(given["weights"])
+    found = cpu_lift.lift(**given, share=0.4)
+    assert torch.equal(found.displacements, given["priors"])
+    assert not found.inlier_share.any()
+    assert not found.agreeing_views.any()
