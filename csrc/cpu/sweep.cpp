@@ -11,7 +11,7 @@
 namespace {
 
 constexpr float kSupporting = 0.3f, kContradicting = 0.05f, kFrontShare = 1.03f;
-constexpr float kMostDifference = 0.3f, kMissCost = 0.15f, kLonelyCost = 0.05f;
+constexpr float kMostDifference = 0.3f, kMissCost = 0.15f, kLonelyCost = 0.05f, kEqualCost = 0.01f;
 
 // Where a ray that is a + z b in the world falls in a view: a and b in its camera.
 struct Line {
@@ -70,6 +70,7 @@ extern "C" void sgs_sweep(
 #pragma omp parallel num_threads(threads) if (threads > 1)
   {
     std::vector<Line> lines(view_count);
+    std::vector<float> cost(planes);
 #pragma omp for schedule(dynamic, 16)
     for (int64_t n = 0; n < count; ++n) {
         const int64_t x = pixels[2 * n], y = pixels[2 * n + 1];
@@ -79,16 +80,24 @@ extern "C" void sgs_sweep(
             ray[i] = own.viewmat[i] * local[0] + own.viewmat[4 + i] * local[1] + own.viewmat[8 + i] * local[2];
         for (int v = 0; v < view_count; ++v) lines[v] = line_in(views[v], origin, ray);
         const float* color = own.colors + 3 * (y * own.width + x);
-        depths[n] = 0.0f, costs[n] = std::numeric_limits<float>::infinity();
-        for (int plane = 0; plane < planes; ++plane) {
+        const auto depth_of = [&](int plane) {
             const float step = planes > 1 ? static_cast<float>(plane) / static_cast<float>(planes - 1) : 0.0f;
-            const float z = 1.0f / (1.0f / own.near_plane + step * (1.0f / farthest[n] - 1.0f / own.near_plane));
+            return 1.0f / (1.0f / own.near_plane + step * (1.0f / farthest[n] - 1.0f / own.near_plane));
+        };
+        for (int plane = 0; plane < planes; ++plane) {
+            const float z = depth_of(plane);
             Votes votes;
             for (int v = 0; v < view_count; ++v)
                 if (v != view_index) votes.add(views[v], lines[v], z, color);
-            const float cost = votes.cost(least_supports, most_contradictions);
-            if (cost < costs[n]) depths[n] = z, costs[n] = cost;
+            cost[plane] = votes.cost(least_supports, most_contradictions);
         }
+        const int best = static_cast<int>(std::min_element(cost.begin(), cost.end()) - cost.begin());
+        // On a plain surface a stretch of the ray is equally good: take its middle.
+        int first = best, last = best;
+        while (first > 0 && cost[first - 1] <= cost[best] + kEqualCost) --first;
+        while (last + 1 < planes && cost[last + 1] <= cost[best] + kEqualCost) ++last;
+        costs[n] = cost[best];
+        depths[n] = std::isfinite(cost[best]) ? depth_of((first + last) / 2) : 0.0f;
     }
   }
 }

@@ -53,6 +53,7 @@ class FrameReport:
     peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
     peak_memory_kind: PeakKind = PeakKind.NONE
     cpu_seconds: float = 0.0
+    counts: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass
@@ -205,6 +206,7 @@ class Session:
                 free=len(scene.free),
                 spawned=fit.spawned,
                 pruned=fit.pruned,
+                counts=dict(fit.counts),
                 seconds={
                     "read": read - started,
                     **fit.seconds,

@@ -8,8 +8,8 @@ import torch
 from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.evaluation.flow import FlowField, dis_flow
-from structgstream.flow import inside
 from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
+from structgstream.flow import inside
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 80.0, 4.0
 

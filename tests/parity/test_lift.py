@@ -10,7 +10,9 @@ from structgstream.kernels._load import native_library, native_reason
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
 
-def scenery(seed: int, *, movers: int = 40, views: int = 5, targets: int = 30, count: int = 7) -> dict[str, torch.Tensor]:
+def scenery(
+    seed: int, *, movers: int = 40, views: int = 5, targets: int = 30, count: int = 7
+) -> dict[str, torch.Tensor]:
     """Cameras on a ring that look at movers around the origin, each of which moves by the same displacement."""
     generator = torch.Generator().manual_seed(seed)
 

@@ -13,6 +13,7 @@ FRONT_SHARE = 1.03
 """A point counts as in front of what is rendered up to so many times its depth."""
 MOST_DIFFERENCE = 0.3
 MISS_COST, LONELY_COST = 0.15, 0.05
+EQUAL_COST = 0.01
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Swept:
 
     Args:
         depths: ``[P]`` along z; 0 for a ray without a point.
-        costs: ``[P]``; infinite without one.
+        costs: ``[P]`` the least; infinite without one.
     """
 
     depths: Tensor
@@ -63,7 +64,8 @@ def sweep(
 
     A view supports a point that falls into its picture where something is missing and in front of what is rendered
     there; it contradicts one where nothing is missing and the point would be seen. The cost is the mean difference of
-    colour over the supports (each at most 0.3), 0.15 times the share of contradictions, and 0.05 over the supports.
+    colour over the supports (each at most 0.3), 0.15 times the share of contradictions, and 0.05 over the supports. Of
+    the depths around the cheapest that cost at most 0.01 more the middle one is taken.
 
     Args:
         views: all of them.
@@ -108,5 +110,11 @@ def sweep(
     costs = difference / some + MISS_COST * share + LONELY_COST / some
     costs = torch.where((supports >= least_supports) & (share <= most_contradictions), costs, torch.inf)
     best = costs.argmin(1, keepdim=True)
-    costs = costs.gather(1, best)[:, 0]
-    return Swept(torch.where(costs.isfinite(), z.gather(1, best)[:, 0], 0.0), costs)
+    least = costs.gather(1, best)
+    # On a plain surface a stretch of the ray is equally good: take its middle.
+    worse = ~(costs <= least + EQUAL_COST)
+    plane = torch.arange(planes, device=costs.device).expand_as(costs)
+    first = torch.where(worse & (plane < best), plane, -1).amax(1, keepdim=True) + 1
+    last = torch.where(worse & (plane > best), plane, planes).amin(1, keepdim=True) - 1
+    least = least[:, 0]
+    return Swept(torch.where(least.isfinite(), z.gather(1, (first + last) // 2)[:, 0], 0.0), least)

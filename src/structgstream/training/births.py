@@ -2,8 +2,8 @@
 """What emerges is there, opaque, before the first iteration: free Gaussians from geometry (design, births).
 
 A gradient makes a child only beside a parent, faint, and lets it find its place over frames. Where pixels of several
-views stay wrong after everything has moved, the pictures themselves tell what is there and where: along the ray of such a
-pixel, in front of what is rendered, there is a depth at which the other views lack the same colour.
+views stay wrong after everything has moved, the pictures themselves tell what is there and where: along the ray of such
+a pixel, in front of what is rendered, there is a depth at which the other views lack the same colour.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from structgstream.kernels.reference_sweep import SweepView
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.training.residuals import ResidualFloor, box_mean, residual
-from structgstream.training.views import View, reduced
+from structgstream.training.views import View
 
 MASK_PIXELS = 5
 HIT_VOXELS = 1.8
@@ -77,7 +77,7 @@ class Missing:
 def missing_in(picture: Tensor, view: View, *, floor: ResidualFloor | None, config: BirthConfig) -> Missing:
     """Compare a rendering as recorded, ``[H, W, 3]`` in 0 ... 1, with the picture of ``view``."""
     scale = min(1.0, config.picture_width / view.camera.width)
-    small = reduced(view, scale) if scale < 1.0 else view
+    small = view.reduced(scale)
     size = (small.camera.height, small.camera.width)
     seen = interpolate(picture.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
     off = residual(seen, small.image)
@@ -126,9 +126,8 @@ def born(
     views = [_sweep_view(entry, depths[entry.view.index], color) for entry in missing]
     points, colors, spacings = [], [], []
     for index, (entry, view) in enumerate(zip(missing, views)):
-        wanted = entry.share > 0.5
-        wanted = wanted & _every(config.pixel_step, wanted)
-        rows, columns = wanted.nonzero().unbind(1)
+        lacking = entry.share > 0.5
+        rows, columns = (lacking & _every(config.pixel_step, lacking)).nonzero().unbind(1)
         if not len(rows):
             continue
         reachable = view.depths[view.depths.isfinite()]

@@ -20,7 +20,7 @@ from structgstream.scene.state import FieldName
 from structgstream.training.flow_maps import flow_map
 from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
 from structgstream.training.residuals import ResidualFloor, residual_of
-from structgstream.training.views import View, reduced
+from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def moving_parts(
     with torch.no_grad():
         baked = scene.baked()
         for view, last in zip(views, before, strict=True):
-            small = reduced(view, config.picture_scale)
+            small = view.reduced(config.picture_scale)
             gaussians = baked.gaussians(small.camera, backend)
             changed = backend.changed_pixels(
                 last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
@@ -163,7 +163,7 @@ def moving_parts(
             shares.append(part.mean())
             maps = [torch.ones(*size, 1, device=votes.device), part[0, 0, :, :, None]]
             if with_flow:
-                maps += [flow_map(last.image, view.image, changed, size), reduced(last, config.picture_scale).colors]
+                maps += [flow_map(last.image, view.image, changed, size), last.reduced(config.picture_scale).colors]
             sums = gathered(gaussians, baked, small.camera, torch.cat(maps, dim=-1), backend)
             sums *= view.camera.height * view.camera.width / part.numel()
             total, inside = by_mover(sums[:, :2], baked).unbind(1)

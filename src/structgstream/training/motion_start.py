@@ -24,7 +24,7 @@ from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, M
 from structgstream.training.observation import by_mover, flow_evidence, gathered, mover_centers
 from structgstream.training.partition import Partition, focuses
 from structgstream.training.residuals import as_recorded
-from structgstream.training.views import View, reduced
+from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def corrected(
     sums, cover = [], moving.anchors.positions.new_zeros(())
     with torch.no_grad():
         for view in seen:
-            focus, small = focuses[view.index], reduced(view, scale)
+            focus, small = focuses[view.index], view.reduced(scale)
             gaussians = baked.gaussians(view.camera, backend)
             onto = replace(focus, picture=focus.picture.clone())
             image = as_recorded(

@@ -44,8 +44,11 @@ class Rate:
         return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
 
     def kept(self, keep: Tensor) -> "Rate":
-        """The price after free Gaussians without the mask ``keep`` have died; what is born behind them has none."""
-        before = {name: value[keep] if name in FREE_ROWS else value for name, value in self.before.items()}
+        """The price after free Gaussians without the mask ``keep`` have died; what was or is born behind those that had
+        one has none."""
+        before = {
+            name: value[keep[: len(value)]] if name in FREE_ROWS else value for name, value in self.before.items()
+        }
         return replace(self, before=before)
 
     def price(self, values: Mapping[ParameterName, Tensor]) -> Tensor:

@@ -16,7 +16,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.views import View, reduced
+from structgstream.training.views import View
 
 SMOOTHED_PIXELS = 3
 FLOOR_PIXELS = 5
@@ -63,7 +63,7 @@ def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend
     maps = {}
     with torch.no_grad():
         for view in views:
-            small = reduced(view, scale)
+            small = view.reduced(scale)
             found = residual_of(scene.gaussians(small.camera, backend), small, scene.camera_color, backend)
             maps[view.index] = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
     return ResidualFloor(scale, maps)

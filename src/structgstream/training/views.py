@@ -2,7 +2,7 @@
 """The training pictures of one frame as tensors, and the order in which they are looked at."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -24,6 +24,15 @@ class View:
     index: int
     camera: Camera
     image: Tensor
+    _reduced: "dict[float, View]" = field(default_factory=dict, repr=False, compare=False)
+
+    def reduced(self, scale: float) -> "View":
+        """The view with its picture shrunk by ``scale`` (area average) and its camera to match; kept."""
+        if scale == 1.0:
+            return self
+        if scale not in self._reduced:
+            self._reduced[scale] = reduced(self, scale)
+        return self._reduced[scale]
 
     @property
     def colors(self) -> Tensor:

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The oracle of lifting flow, where the displacement is known."""
+
+import torch
+
+from structgstream.kernels.reference_lift import lift, projection_jacobians
+
+MOTION = torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
+VIEWS, MOVERS = 5, 30
+
+
+def cameras() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(VIEWS, 1, 1)
+    for v in range(VIEWS):
+        angle = torch.tensor(0.3 * v, dtype=torch.float64)
+        c, s = float(angle.cos()), float(angle.sin())
+        viewmats[v, :3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        viewmats[v, 2, 3] = 2.0
+    K = torch.tensor([[300.0, 0, 160], [0, 310.0, 120], [0, 0, 1]], dtype=torch.float64)
+    return viewmats, K.repeat(VIEWS, 1, 1), torch.full((VIEWS,), 0.1, dtype=torch.float64)
+
+
+def centers() -> torch.Tensor:
+    return 0.2 * torch.randn(MOVERS, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torch.Tensor | None = None):
+    viewmats, Ks, near = cameras()
+    return lift(
+        centers(),
+        torch.full((VIEWS, MOVERS), 5.0, dtype=torch.float64) if weights is None else weights,
+        flows,
+        viewmats,
+        Ks,
+        near,
+        torch.arange(MOVERS)[:, None],
+        torch.ones(MOVERS, 1, dtype=torch.float64),
+        torch.zeros(MOVERS, 3, dtype=torch.float64) if prior is None else prior,
+        share=0.4,
+    )
+
+
+def test_the_jacobian_is_that_of_the_projection() -> None:
+    viewmats, Ks, near = cameras()
+    points = centers()[:4]
+
+    def projected(x: torch.Tensor) -> torch.Tensor:
+        seen = torch.einsum("vij,ej->vei", viewmats[:, :3, :3], x) + viewmats[:, None, :3, 3]
+        pixels = torch.einsum("vij,vej->vei", Ks, seen)
+        return pixels[..., :2] / pixels[..., 2:]
+
+    step = 1e-6
+    found = projection_jacobians(points, viewmats, Ks, near)
+    for axis in range(3):
+        shift = torch.zeros(3, dtype=torch.float64)
+        shift[axis] = step
+        slope = (projected(points + shift) - projected(points - shift)) / (2 * step)
+        torch.testing.assert_close(found[..., axis], slope, atol=1e-4, rtol=1e-6)
+
+
+def test_flow_of_a_known_motion_gives_the_motion() -> None:
+    viewmats, Ks, near = cameras()
+    flows = projection_jacobians(centers(), viewmats, Ks, near) @ MOTION
+    found = lifted(flows)
+    # The pull towards no motion is two per cent of the flow's.
+    torch.testing.assert_close(found.displacements, MOTION.expand(MOVERS, 3), atol=2e-3, rtol=0.1)
+    assert (found.inlier_share > 0.99).all()
+    assert (found.agreeing_views == VIEWS).all()
+
+
+def test_a_view_whose_flow_is_wrong_is_outvoted() -> None:
+    viewmats, Ks, near = cameras()
+    flows = projection_jacobians(centers(), viewmats, Ks, near) @ MOTION
+    flows[2] += 12.0
+    found = lifted(flows)
+    torch.testing.assert_close(found.displacements, MOTION.expand(MOVERS, 3), atol=3e-3, rtol=0.1)
+    assert (found.agreeing_views == VIEWS - 1).all()
+    torch.testing.assert_close(found.inlier_share, torch.full_like(found.inlier_share, 0.8))
+
+
+def test_without_flow_the_prior_holds() -> None:
+    prior = 0.1 * centers()
+    found = lifted(torch.zeros(VIEWS, MOVERS, 2, dtype=torch.float64), torch.zeros(VIEWS, MOVERS).double(), prior)
+    assert torch.equal(found.displacements, prior)
+    assert not found.inlier_share.any()
+
+
+def test_one_view_leaves_depth_to_the_prior() -> None:
+    viewmats, Ks, near = cameras()
+    flows = projection_jacobians(centers(), viewmats, Ks, near) @ MOTION
+    weights = torch.zeros(VIEWS, MOVERS, dtype=torch.float64)
+    weights[0] = 5.0
+    found = lifted(flows, weights)
+    along = torch.nn.functional.normalize(centers() - torch.linalg.inv(viewmats[0])[:3, 3], dim=1)
+    assert ((found.displacements * along).sum(1).abs() < 0.002).all()
+    assert (found.agreeing_views == 1).all()

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flow as maps: where it is believed, and where it is not looked for."""
+
+import cv2
+import numpy as np
+import torch
+
+from structgstream.training.flow_maps import flow_map
+
+
+def textured(height: int = 120, width: int = 160) -> np.ndarray:
+    noise = np.random.default_rng(5).integers(0, 256, (height, width, 3)).astype(np.uint8)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), np.empty_like(noise), 0, 255, cv2.NORM_MINMAX)
+
+
+def test_a_shifted_patch_is_told_at_half_the_size_in_whole_pixels() -> None:
+    first = textured()
+    second = first.copy()
+    second[40:80, 56:106] = first[40:80, 50:100]  # six to the right
+    changed = torch.from_numpy(np.abs(first.astype(int) - second).sum(2) > 0)
+    maps = flow_map(torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
+    assert maps.shape == (60, 80, 3)
+    inner = maps[24:36, 30:45]
+    confidence, flow = inner[..., 0], inner[..., 1:] / inner[..., :1].clamp(min=1e-6)
+    assert confidence.mean() > 0.9
+    torch.testing.assert_close(flow[confidence > 0.5].median(0).values, torch.tensor([6.0, 0.0]), atol=0.3, rtol=0)
+
+
+def test_beyond_the_box_around_what_changed_there_is_no_flow() -> None:
+    first = textured()
+    second = np.roll(first, 3, 1)
+    changed = torch.zeros(120, 160, dtype=torch.bool)
+    changed[50:70, 60:90] = True
+    maps = flow_map(torch.from_numpy(first), torch.from_numpy(second), changed, (120, 160))
+    assert maps[50:70, 60:90, 0].mean() > 0.8
+    assert not maps[:30].any()
+    assert not maps[:, :40].any()
+
+
+def test_nothing_changed_is_no_flow() -> None:
+    picture = torch.from_numpy(textured())
+    assert not flow_map(picture, picture, torch.zeros(120, 160, dtype=torch.bool), (60, 80)).any()
+
+
+def test_flow_is_repeated_bit_for_bit() -> None:
+    first = textured()
+    second = np.roll(first, (2, 5), (0, 1))
+    changed = torch.ones(120, 160, dtype=torch.bool)
+    given = (torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
+    assert torch.equal(flow_map(*given), flow_map(*given))

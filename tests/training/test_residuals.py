@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What renderings miss beyond what they missed in frame 0."""
+
+from dataclasses import replace
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.residuals import as_recorded, box_mean, residual, residual_floor
+from structgstream.training.views import training_views
+from worlds import moving_world
+
+CPU = torch.device("cpu")
+WORLD = moving_world(3, speed=0.06, movers=20)
+BACKEND = reference_backend()
+
+
+def views(t: int):
+    return training_views(WORLD.frames[t], WORLD.rig, CPU)
+
+
+def test_a_mean_over_a_box_counts_pixels_that_exist() -> None:
+    values = torch.zeros(4, 5)
+    values[0, 0] = 9.0
+    found = box_mean(values, 3)
+    assert found[0, 0] == 9.0 / 4
+    assert found[1, 1] == 1.0
+    assert found[0, 1] == 9.0 / 6
+    assert not found[2:].any()
+
+
+def test_equal_pictures_have_no_residual() -> None:
+    image = torch.randint(256, (6, 7, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    assert not residual(image.float() / 255.0, image).any()
+    torch.testing.assert_close(residual(image.float() / 255.0 + 0.25, image), torch.full((6, 7), 0.25))
+
+
+def test_a_rendering_is_compared_as_its_camera_would_have_recorded_it() -> None:
+    color = replace(WORLD.scene.camera_color, gains=torch.full((4, 3), 2.0), biases=torch.full((4, 3), 0.1))
+    torch.testing.assert_close(as_recorded(torch.full((2, 2, 3), 0.3), color, 1), torch.full((2, 2, 3), 0.7))
+
+
+def test_the_floor_is_what_frame_0_missed_nearby() -> None:
+    spoiled = views(0)
+    image = spoiled[1].image.clone()
+    image[10, 20] = 255 - image[10, 20]
+    spoiled[1] = replace(spoiled[1], image=image)
+    clean, floor = (residual_floor(WORLD.scene, v, scale=1.0, backend=BACKEND).maps for v in (views(0), spoiled))
+    assert torch.equal(clean[0], floor[0])
+    more = floor[1] - clean[1]
+    assert (more[8:13, 18:23] > 0.01).all()
+    assert not more[:6].any()
+
+
+def test_slow_change_is_seen_by_the_residual_alone() -> None:
+    """Between two equal pictures nothing changed, but the scene was left behind a frame ago."""
+    floor = residual_floor(WORLD.scene, views(0), scale=1.0, backend=BACKEND)
+    config = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0, residual_threshold=0.05)
+
+    def found(threshold: float):
+        wanted = replace(config, residual_threshold=threshold)
+        return moving_parts(WORLD.scene, views(1), views(1), config=wanted, backend=BACKEND, floor=floor)
+
+    assert not found(0.0).anchors.any()
+    lagging = found(0.05).anchors
+    assert lagging[:20].float().mean() > 0.7
+    assert lagging[20:].float().mean() < lagging[:20].float().mean() - 0.1
+
+
+def test_what_frame_0_already_missed_does_not_count() -> None:
+    other = moving_world(1, movers=0)
+    wrong = replace(WORLD.scene, anchors=replace(WORLD.scene.anchors, positions=WORLD.scene.anchors.positions + 0.05))
+    seen = training_views(other.frames[0], other.rig, CPU)
+    floor = residual_floor(wrong, seen, scale=1.0, backend=BACKEND)
+    config = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0, residual_threshold=0.05)
+    assert not moving_parts(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()
+    free_of_it = replace(floor, maps={index: torch.zeros_like(values) for index, values in floor.maps.items()})
+    assert moving_parts(wrong, seen, seen, config=config, backend=BACKEND, floor=free_of_it).anchors.any()
