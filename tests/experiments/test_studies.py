@@ -117,7 +117,7 @@ def test_rates_are_written_with_what_else_the_folder_has(tmp_path: Path) -> None
     assert [row[0] for row in points.rows][-1] == "paper mode"
     assert versus.rows == []
     text = (tmp_path / "rates.md").read_text()
-    assert "| paper mode | 1 | 31.25 | - | 1500.0 | 360.00 | - |" in text
+    assert "| paper mode | 1 | 31.25 | - | - | 1500.0 | 360.00 | - | - | - |" in text
     (effects,) = write_ablation(tmp_path, "effects", [], backend=backend)
     assert (tmp_path / "effects.md").read_text().startswith(f"# {effects.title}\n\n| variant |")
 

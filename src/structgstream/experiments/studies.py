@@ -39,9 +39,9 @@ COMPACT_TABLES = (EFFECTS_TABLE, RATES_TABLE)
 """Tables of the compact stream."""
 COMPACT_PRESET = "compact"
 COMPARED = (
-    "psnr_first", "psnr", "ssim", "ms_ssim", "lpips_alex", "flip", "psnr_changed", "psnr_still", "drift_db_per_frame",
-    "online_bytes", "online_cpu_seconds", "first_cpu_seconds", "e_warp", "t_lpips", "temporal_flip",
-    "flicker",
+    "psnr_first", "psnr", "psnr_camera_color", "ssim", "ms_ssim", "lpips_alex", "flip", "psnr_changed", "psnr_still",
+    "drift_db_per_frame", "online_bytes", "bytes_with_header", "online_cpu_seconds", "first_cpu_seconds",
+    "decode_and_render_fps", "e_warp", "t_lpips", "temporal_flip", "flicker",
 )  # fmt: skip
 """Columns of the comparison, those without a value left out."""
 
