@@ -180,6 +180,13 @@ def test_demo_leaves_everything_to_look_at(
     assert all(name.split("/")[-1] in text for name in made - {"clip.log.jsonl"})
 
 
+def test_a_rig_that_is_not_the_papers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--frames", "1", "--scale", "0.25", *QUICK]
+    assert main([*asked, "--preset", "paper-meetroom"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The paper's data of paper-meetroom are others: pictures of 80x60 instead of 1280x720;" in said
+
+
 def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
     base = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--scale", "0.25", "--frames", "1", *QUICK]
     assert main([*base, "--codec", "compact", "--quality", "1.5", "--mbits", "0.5"]) == 0
