@@ -29,7 +29,7 @@ from structgstream.experiments.sweep import unique
 from structgstream.experiments.tasks import Variation
 from structgstream.experiments.variants import FULL, TABLES, variants
 from structgstream.experiments.worker import Task
-from structgstream.presets import PAPER_MODE, PRESETS, StreamConfig
+from structgstream.presets import PAPER_DATA, PAPER_MODE, PRESETS, StreamConfig
 
 if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
@@ -146,7 +146,9 @@ def method_key(name: str) -> str:
 
 def method_titles() -> dict[str, str]:
     """Every method that can be compared, with its name in tables."""
-    return {name: f"Struct-GStream ({name})" for name in PRESETS} | {"held": "frame 0 held"} | dict(PEER_TITLES)
+    ours = {name: f"Struct-GStream ({name})" for name in PRESETS}
+    ours |= {name: f"Struct-GStream as printed ({name})" for name in PAPER_DATA}
+    return ours | {"held": "frame 0 held"} | dict(PEER_TITLES)
 
 
 def fits_frames_alone(name: str) -> bool:
