@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configurations as values. Paper mode is a preset, not a fork; the paper's ablations are edits of one."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
+from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig
 from structgstream.rate_control import RateConfig
 from structgstream.training.disturbance import DisturbanceConfig
@@ -57,7 +59,54 @@ def decayed(rates: InitialRates, share: float) -> InitialRates:
 
 
 PAPER = StreamConfig()
-"""The paper's constants with the readings of docs/method.md, for rigs of equal exposure."""
+"""The paper's constants with the readings of docs/method.md, for rigs of equal exposure.
+
+Section Implementations gives one set of them for all data sets; what differs is :data:`PAPER_DATA`."""
+
+
+@dataclass(frozen=True)
+class PaperData:
+    """What the paper says of one data set (section Datasets): all that differs between its experiments.
+
+    Args:
+        width: of the pictures that are trained on and scored, in pixels, after whatever reduction.
+        height: the same.
+        cameras: of the rig.
+        held_out: how many of them are for testing; None where the paper does not say.
+        undistorted: whether pictures of fisheye lenses were made rectilinear first.
+    """
+
+    width: int
+    height: int
+    cameras: int
+    held_out: int | None
+    undistorted: bool = False
+
+
+PAPER_DATA: Mapping[str, PaperData] = {
+    "paper-n3dv": PaperData(1352, 1014, cameras=21, held_out=None),
+    "paper-meetroom": PaperData(1280, 720, cameras=13, held_out=1),
+    "paper-immersive": PaperData(1280, 960, cameras=46, held_out=1, undistorted=True),
+}
+"""By the preset that is named after it. They belong to the capture, so no configuration can hold them."""
+
+
+def departures(preset: str, rig: CameraRig) -> list[str]:
+    """In what a rig is not that of the paper's data set, a few words each; nothing for presets of no data set."""
+    data = PAPER_DATA.get(preset)
+    if data is None:
+        return []
+    found = []
+    sizes = sorted({(rig[name].width, rig[name].height) for name in rig})
+    if sizes != [(data.width, data.height)]:
+        theirs = ", ".join(f"{width}x{height}" for width, height in sizes)
+        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}")
+    if len(rig.cameras) != data.cameras:
+        found.append(f"{len(rig.cameras)} cameras instead of {data.cameras}")
+    if data.held_out is not None and len(rig.testing) != data.held_out:
+        found.append(f"{len(rig.testing)} held out instead of {data.held_out}")
+    return found
+
 
 RIG = StreamConfig(
     initial=InitialConfig(

@@ -3,6 +3,7 @@
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -67,7 +68,9 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.Ca
     assert {entry.name for entry in folder.iterdir()} == {"report.json", "over_time.png", "contact_sheet.png"}
     assert json.loads((folder / "report.json").read_text())["mean"]["psnr"] == content["mean"]["psnr"]
     table = capsys.readouterr().out
-    assert f"{content['mean']['psnr']:.2f}" in table
+    headline, beside = (f"{content['mean'][name]:.2f}" for name in ("psnr", "psnr_camera_color"))
+    assert re.search(rf"mean +{headline} +{beside} ", table)
+    assert "with the header shared over them" in " ".join(table.split())
     assert max(len(line) for line in table.splitlines() if str(folder) not in line) <= 80
 
 
@@ -176,8 +179,15 @@ def test_demo_leaves_everything_to_look_at(
     report = {"report/report.json", "report/over_time.png", "report/contact_sheet.png"}
     assert made == {"clip.sgs", "clip.log.jsonl", "held-out.mp4", "orbit.mp4"} | report
     text = capsys.readouterr().out
-    assert "Held-out PSNR" in text
+    assert re.search(r"Held-out PSNR [\d.]+ dB \([\d.]+ after frame 0's colour fit\)", text)
     assert all(name.split("/")[-1] in text for name in made - {"clip.log.jsonl"})
+
+
+def test_a_rig_that_is_not_the_papers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--frames", "1", "--scale", "0.25", *QUICK]
+    assert main([*asked, "--preset", "paper-meetroom"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The paper's data of paper-meetroom are others: pictures of 80x60 instead of 1280x720;" in said
 
 
 def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:

@@ -4,7 +4,14 @@
 import numpy as np
 import pytest
 
-from structgstream.evaluation.affine import affine_fit, corrected, psnr_affine
+from structgstream.evaluation.affine import (
+    ChannelFit,
+    affine_fit,
+    channel_fit,
+    corrected,
+    psnr_affine,
+    psnr_camera_color,
+)
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS, psnr
 
 PLANTED = np.array([[0.8, 0.1, 0.0, 0.05], [0.05, 0.7, 0.1, 0.02], [0.0, -0.05, 0.9, 0.1]])
@@ -40,3 +47,44 @@ def test_a_picture_of_one_colour_has_a_fit() -> None:
     assert np.isfinite(affine_fit(grey, truth)).all()
     assert psnr_affine(grey, truth) == pytest.approx(PSNR_OF_EQUALS, abs=250)
     assert psnr_affine(grey, truth) > 80
+
+
+EXPOSURE = ChannelFit(gains=(1.2, 0.8, 1.0), biases=(-0.05, 0.04, 0.0))
+IDENTITY = ChannelFit(gains=(1.0, 1.0, 1.0), biases=(0.0, 0.0, 0.0))
+
+
+def taken(scene: np.ndarray, fit: ChannelFit = EXPOSURE) -> np.ndarray:
+    """What a camera of that exposure records."""
+    return np.rint(corrected(scene, np.column_stack([np.diag(fit.gains), fit.biases]))).astype(np.uint8)
+
+
+def test_a_cameras_gain_and_bias_are_found_in_one_frame_and_hold_in_another() -> None:
+    fit = channel_fit(picture(), taken(picture()))
+    np.testing.assert_allclose(fit.gains, EXPOSURE.gains, atol=1e-3)
+    np.testing.assert_allclose(fit.biases, EXPOSURE.biases, atol=1e-3)
+    later = picture(1)
+    assert psnr(later, taken(later)) < 30
+    assert psnr_camera_color(later, taken(later), fit) > 55  # what rounding leaves
+
+
+def test_a_held_fit_does_not_forgive_light_that_changes_nor_colours_that_mix() -> None:
+    fit = channel_fit(picture(), taken(picture()))
+    later = picture(1)
+    darker = taken(later, ChannelFit(gains=(0.6, 0.6, 0.6), biases=EXPOSURE.biases))
+    assert psnr_camera_color(later, darker, fit) < 20 < psnr_affine(later, darker)
+    mixed = np.rint(corrected(later, PLANTED)).astype(np.uint8)
+    assert psnr_camera_color(later, mixed, channel_fit(later, mixed)) < psnr_affine(later, mixed) - 10
+
+
+def test_the_identity_leaves_psnr_as_it_is_and_the_fit_of_a_frame_does_not_lower_it() -> None:
+    source, truth = picture(), picture(2)
+    assert psnr_camera_color(source, truth, IDENTITY) == pytest.approx(psnr(source, truth))
+    assert psnr_camera_color(source, truth, channel_fit(source, truth)) >= psnr(source, truth)
+    assert psnr_camera_color(source, source, IDENTITY) == PSNR_OF_EQUALS
+
+
+def test_a_channel_of_one_value_is_shifted_and_not_stretched() -> None:
+    grey, truth = np.full((6, 7, 3), 90, np.uint8), picture()[:6, :7]
+    fit = channel_fit(grey, truth)
+    assert fit.gains == (1.0, 1.0, 1.0)
+    np.testing.assert_allclose(fit.biases, truth.mean((0, 1)) / 255 - 90 / 255, atol=1e-12)

@@ -191,6 +191,29 @@ def drawn(scene: Scene, world: World) -> list[MultiViewFrame]:
     return frames
 
 
+def exposed(frames: list[MultiViewFrame], *, gains: list[float]) -> list[MultiViewFrame]:
+    """The frames with the pictures of cam00, which is held out, taken with other gains."""
+    taken = []
+    for frame, gain in zip(frames, gains, strict=True):
+        picture = np.rint(gain * frame.images["cam00"]).clip(0, 255).astype(np.uint8)
+        taken.append(replace(frame, images={**frame.images, "cam00": picture}))
+    return taken
+
+
+def test_a_cameras_exposure_is_set_aside_once_and_then_held(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    report = run(reader, Source(world.rig, exposed(world.frames, gains=[0.7, 0.7, 0.7, 0.5])))
+    held = [value for frame in report.frames if (value := frame.mean.psnr_camera_color) is not None]
+    assert len(held) == 4
+    assert min(held[:3]) > 50
+    assert all(frame.mean.psnr < 30 for frame in report.frames)
+    # The last frame is darker still: the fit of frame 0 does not follow it, a fit of its own does.
+    assert held[3] < 30
+    assert report.frames[3].mean.psnr_affine > 50
+    assert report.stream["camera_colors"]["cam00"]["gains"] == pytest.approx([0.7] * 3, abs=0.01)
+    assert as_json(report)["cameras"]["cam00"]["psnr_camera_color"] == pytest.approx(np.mean(held))
+
+
 def test_sizes_and_rates_are_those_of_the_file(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     report = run(reader, Source(world.rig, world.frames))

@@ -53,7 +53,7 @@ def small_report() -> Report:
             )
         )
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in ("left", "right")}
-    facts = course([frame.mean.psnr for frame in frames]) | drawing_facts(frames)
+    facts = course([frame.mean.psnr for frame in frames]) | drawing_facts(frames) | {"total_bytes": 5000}
     return Report(frames, by_camera, mean_scores(frame.mean for frame in frames), facts, {"python": "3"})
 
 
@@ -80,11 +80,12 @@ def test_json_has_the_documented_keys(tmp_path: Path) -> None:
     content = json.loads((tmp_path / "deep" / "report.json").read_text())
     assert set(content) == {"mean", "cameras", "stream", "environment", "frames"}
     scores = {field.name for field in fields(Scores)}
-    assert {"psnr", "ms_ssim", "flip", "lpips_vgg", "e_warp", "flicker"} < scores
-    assert set(content["mean"]) == scores | {"bytes", "free", "seconds"}
+    assert {"psnr", "psnr_camera_color", "ms_ssim", "flip", "lpips_vgg", "e_warp", "flicker"} < scores
+    assert set(content["mean"]) == scores | {"bytes", "bytes_with_header", "free", "seconds"}
     assert content["mean"]["psnr"] == pytest.approx(27.5)
     assert content["mean"]["psnr_changed"] == pytest.approx(22.0)
     assert content["mean"]["bytes"] == 1000
+    assert content["mean"]["bytes_with_header"] == 1250
     assert content["mean"]["seconds"] == 2.0
     assert len(content["frames"]) == 4
     assert set(content["frames"][0]) == scores | {

@@ -114,5 +114,5 @@ def test_rows_beside_the_whole_seed_by_seed() -> None:
 
 def test_without_the_whole_nothing_is_compared() -> None:
     sheet = effects_sheet([outcome(FULL)], titles=effect_titles())
-    assert {row[3] for row in sheet.rows} == {"-"}
+    assert {row[4] for row in sheet.rows} == {"-"}
     assert all(len(row) == len(sheet.columns) for row in sheet.rows)

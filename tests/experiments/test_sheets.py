@@ -111,6 +111,20 @@ def test_methods_side_by_side_in_the_order_of_the_titles() -> None:
     ]
 
 
+def test_the_colour_fit_the_speed_and_the_header_shared_over_the_frames() -> None:
+    old = outcome(FULL, stream={"total_bytes": 9_000_000, "decode_and_render_fps": 22.776})
+    new = outcome("without-free", mean={"psnr_camera_color": 31.5, "bytes_with_header": 2_000_000.0})
+    methods = comparison_sheet([old, new], titles=variant_titles(), scores=COMPARED)
+    ablation = ablation_sheet(TABLES["free"], [old, new], titles=variant_titles())
+    for sheet in (methods, ablation):
+        assert column(sheet, "colour held, dB")["full method"] == "-"
+        assert column(sheet, "colour held, dB")["w/o free 3DGs"] == "31.50"
+        assert column(sheet, "with the header, MB a frame")["full method"] == "3.00"  # of a file of three frames
+        assert column(sheet, "with the header, MB a frame")["w/o free 3DGs"] == "2.00"
+        assert column(sheet, "pictures a second")["full method"] == "22.8"
+        assert column(sheet, "pictures a second")["w/o free 3DGs"] == "-"
+
+
 def test_every_tenth_frame_has_no_temporal_scores() -> None:
     scores = {"e_warp": 1e-3, "flicker": 1.5}
     found = [outcome("a", mean=scores), outcome("b", mean=scores, capture={"every": 10})]

@@ -71,6 +71,11 @@ def test_unknown_tables_and_methods_are_refused(tmp_path: Path) -> None:
         comparison_runs(["rig", "nerf"], CLIP, frames=3, alone_every=1, seeds=(0,), folder=tmp_path)
 
 
+def test_the_papers_presets_are_methods_that_are_named_as_what_is_printed() -> None:
+    assert method_titles()["paper-n3dv"] == "Struct-GStream as printed (paper-n3dv)"
+    assert method_titles()["rig"] == "Struct-GStream (rig)"
+
+
 def test_methods_are_presets_and_the_floor(tmp_path: Path) -> None:
     runs = comparison_runs(["rig", "fast", "held"], CLIP, frames=3, alone_every=2, seeds=(4,), folder=tmp_path)
     assert [run.key for run in runs] == [FULL, "fast", "held"]
@@ -117,7 +122,7 @@ def test_rates_are_written_with_what_else_the_folder_has(tmp_path: Path) -> None
     assert [row[0] for row in points.rows][-1] == "paper mode"
     assert versus.rows == []
     text = (tmp_path / "rates.md").read_text()
-    assert "| paper mode | 1 | 31.25 | - | 1500.0 | 360.00 | - |" in text
+    assert "| paper mode | 1 | 31.25 | - | - | 1500.0 | 360.00 | - | - | - |" in text
     (effects,) = write_ablation(tmp_path, "effects", [], backend=backend)
     assert (tmp_path / "effects.md").read_text().startswith(f"# {effects.title}\n\n| variant |")
 

@@ -5,7 +5,8 @@ from dataclasses import asdict
 
 import pytest
 
-from structgstream.presets import PRESETS
+from rigs import arc_rig
+from structgstream.presets import PAPER_DATA, PRESETS, PaperData, departures
 from structgstream.scene.state import PAPER_DYNAMIC
 
 PAPERS = ["paper-n3dv", "paper-meetroom", "paper-immersive"]
@@ -59,3 +60,33 @@ def test_patching(name: str) -> None:
     assert patching["prune_opacity"] == 0.005
     assert patching["lifetime"] == "stream"
     assert patching["spawn"] == "gradient"
+
+
+def test_one_set_of_constants_is_printed_for_all_data_sets() -> None:
+    """Section Implementations names no data set; a constant that differed would have to be made up."""
+    assert len({PRESETS[name] for name in PAPERS}) == 1
+    assert list(PAPER_DATA) == PAPERS
+
+
+def test_what_differs_is_the_data() -> None:
+    """Section Datasets."""
+    assert {name: (data.width, data.height, data.cameras) for name, data in PAPER_DATA.items()} == {
+        "paper-n3dv": (1352, 1014, 21),
+        "paper-meetroom": (1280, 720, 13),
+        "paper-immersive": (1280, 960, 46),
+    }
+    assert [data.held_out for data in PAPER_DATA.values()] == [None, 1, 1]
+    assert [data.undistorted for data in PAPER_DATA.values()] == [False, False, True]
+
+
+def test_another_rig_than_the_papers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = arc_rig(4)
+    assert departures("paper-immersive", rig) == [
+        "pictures of 48x32 instead of 1280x960",
+        "4 cameras instead of 46",
+    ]
+    assert departures("rig", rig) == []
+    monkeypatch.setitem(PAPER_DATA, "paper-n3dv", PaperData(48, 32, cameras=4, held_out=None))  # type: ignore[arg-type]
+    assert departures("paper-n3dv", rig) == []
+    monkeypatch.setitem(PAPER_DATA, "paper-n3dv", PaperData(48, 32, cameras=4, held_out=2))  # type: ignore[arg-type]
+    assert departures("paper-n3dv", rig) == ["1 held out instead of 2"]

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, parsed_with_rest, resolved_config
-from structgstream.cli.tables import report_tables
+from structgstream.cli.tables import quality, report_tables
 
 SLOWED = 0.2  # twelve frames would be over in 0.4 s
 
@@ -95,7 +95,7 @@ def main(arguments: list[str]) -> None:
     for name, path in places.items():
         console.print(f"{name:<14}  {path}", highlight=False, markup=False, soft_wrap=True)
     console.print(
-        f"\nHeld-out PSNR {report.mean.psnr:.2f} dB over {len(report.frames)} frames, "
+        f"\nHeld-out PSNR {quality(report)} over {len(report.frames)} frames, "
         f"everything in {time.perf_counter() - began:.0f} s.",
         highlight=False,
     )

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, parsed
-from structgstream.cli.tables import report_tables
+from structgstream.cli.tables import quality, report_tables
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -130,7 +130,7 @@ def scored(
             lpips_weights=lpips_weights,
         )
     if folder is not None:
-        title = f"{source.name}, {stream.name}: {report.mean.psnr:.2f} dB over {frames} frames"
+        title = f"{source.name}, {stream.name}: {quality(report)} over {frames} frames"
         write_json(folder / "report.json", as_json(report))
         write_plots(folder / "over_time.png", report, title=title)
         contact_sheet(folder / "contact_sheet.png", kept, title=title)

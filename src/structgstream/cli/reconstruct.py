@@ -83,6 +83,7 @@ def main(arguments: list[str]) -> None:
     config = with_budget(config, preset=preset, quality=options.quality, mbits=options.mbits)
     check_output(options.output, may_exist=options.resume or options.overwrite)
     from structgstream.kernels.backend import select_backend
+    from structgstream.presets import departures
 
     source = opened_capture(options.scene, options.capture)
     backend = select_backend(options.device)
@@ -94,6 +95,8 @@ def main(arguments: list[str]) -> None:
         markup=False,
         soft_wrap=True,
     )
+    if differences := departures(preset, source.rig):
+        console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
     peaks = reconstructed(
         source,
         config,

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 SHOWN_FRAMES = 24  # a longer stream is shown in even steps
 
+BASIC = ("PSNR", "colour", "SSIM", "changed", "still")
+"""Heads of the scores that every table of them begins with; colour is PSNR after frame 0's colour fit."""
+
 FURTHER = (  # title, key, digits
     ("MS-SSIM", "ms_ssim", 4),
     ("FLIP", "flip", 4),
@@ -60,7 +63,7 @@ def columns() -> Table:
 def _frames(report: "Report", title: str) -> Table:
     table = columns()
     table.title = Text(title)
-    for name in ("frame", "PSNR", "SSIM", "affine", "changed", "still", "bytes", "anchors", "free", "seconds"):
+    for name in ("frame", *BASIC, "bytes", "anchors", "free", "seconds"):
         table.add_column(name, justify="right", no_wrap=True)
     frames = report.frames
     step = -(-len(frames) // SHOWN_FRAMES)
@@ -82,10 +85,11 @@ def _frames(report: "Report", title: str) -> Table:
 
 def _cameras(report: "Report") -> Table:
     table = columns()
-    for name in ("camera", "", "PSNR", "SSIM", "affine", "changed", "still"):
+    for name in ("camera", "", *BASIC, "affine"):
         table.add_column(name, justify="left" if name in ("camera", "") else "right")
     for name, scores in report.cameras.items():
-        table.add_row(*plain(name, report.stream["cameras"][name]), *_scores(scores))
+        affine = f"{scores.psnr_affine:.2f}"
+        table.add_row(*plain(name, report.stream["cameras"][name]), *_scores(scores), affine)
     return table
 
 
@@ -123,7 +127,9 @@ def _facts(report: "Report") -> Table:
     table.add_row(
         "size",
         f"{human_bytes(s['total_bytes'])}: header {human_bytes(s['header_bytes'])}, "
-        f"{s['frames']} packets {human_bytes(s['packet_bytes'])}",
+        f"{s['frames']} packets {human_bytes(s['packet_bytes'])}; "
+        f"a frame {human_bytes(s['packet_bytes'] / s['frames'])}, {human_bytes(s['total_bytes'] / s['frames'])} with "
+        "the header shared over them",
     )
     table.add_row(
         "rate",
@@ -156,6 +162,13 @@ def _facts(report: "Report") -> Table:
 
 
 def _scores(scores: "Scores") -> list[str]:
-    values = (scores.psnr, scores.ssim, scores.psnr_affine, scores.psnr_changed, scores.psnr_still)
-    digits = (2, 4, 2, 2, 2)
+    values = (scores.psnr, scores.psnr_camera_color, scores.ssim, scores.psnr_changed, scores.psnr_still)
+    digits = (2, 2, 4, 2, 2)
     return ["-" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]
+
+
+def quality(report: "Report") -> str:
+    """The headline, with what is left of its error once each camera's colour is set aside."""
+    held = report.mean.psnr_camera_color
+    beside = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"
+    return f"{report.mean.psnr:.2f} dB{beside}"

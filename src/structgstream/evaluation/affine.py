@@ -4,7 +4,16 @@
 A held-out camera's exposure and white balance are unknown to training, so a part of its error says nothing of
 the scene. The best affine change of colour, fitted on the very picture that is scored, bounds that part. It
 uses the truth, so it is never a headline: reports label it ``psnr_affine``.
+
+Note [Colour of a camera]
+~~~~~~~~~~~~~~~~~~~~~~~~~
+What a camera does to colours belongs to the camera, not to the frame. So ``psnr_camera_color`` takes a gain and a bias
+for each channel from the camera's first frame, as training has them of its own cameras (``scene/color.py``), and holds
+them: later frames are scored as if the camera had been calibrated once. Light that changes, and colours that are wrong
+in a part of the picture, remain errors, which a fit of every picture, or one that mixes channels, would forgive.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -38,6 +47,49 @@ def psnr_affine(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     pixels = truth.size // 3
     difference = _through(planes[:4], _fitted(planes))[:, :pixels] - planes[4:].flatten(1)[:, :pixels]
     return decibels(float(difference.square_().sum(dtype=torch.float64)) / (255.0**2 * truth.size))
+
+
+@dataclass(frozen=True)
+class ChannelFit:
+    """What a camera makes of a rendering, ``gain * rendering + bias`` for each channel (Note [Colour of a camera]).
+
+    Args:
+        gains: red, green, blue.
+        biases: the same, full scale is 1.
+    """
+
+    gains: tuple[float, float, float]
+    biases: tuple[float, float, float]
+
+
+def channel_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> ChannelFit:
+    """The gain and bias of each channel with the least squared error of ``picture`` against ``truth``.
+
+    Both are ``[H, W, 3]`` uint8. A channel of one value has the gain 1: that much colour cannot tell.
+    """
+    pairs = [_line(picture[..., channel], truth[..., channel]) for channel in range(3)]
+    (r, g, b), biases = zip(*pairs, strict=True)
+    return ChannelFit((r, g, b), biases)
+
+
+def _line(values: NDArray[np.uint8], targets: NDArray[np.uint8]) -> tuple[float, float]:
+    x, y = values.astype(np.float64), targets.astype(np.float64)
+    mean_x, mean_y = float(x.mean()), float(y.mean())
+    x -= mean_x
+    variance = float(np.square(x).sum())
+    gain = float((x * (y - mean_y)).sum()) / variance if variance > 0.0 else 1.0
+    return gain, (mean_y - gain * mean_x) / 255.0
+
+
+def psnr_camera_color(picture: NDArray[np.uint8], truth: NDArray[np.uint8], fit: ChannelFit) -> float:
+    """PSNR of ``picture`` through ``fit``, clamped and not rounded, dB: the fit is another frame's, or this one's."""
+    levels = np.arange(256, dtype=np.float64)
+    total = 0.0
+    for channel, (gain, bias) in enumerate(zip(fit.gains, fit.biases, strict=True)):
+        table = np.clip(gain * levels + 255.0 * bias, 0.0, 255.0).astype(np.float32)
+        difference = table[picture[..., channel]] - truth[..., channel]
+        total += float(np.square(difference).sum(dtype=np.float64))
+    return decibels(total / (255.0**2 * truth.size))
 
 
 def _planes(*pictures: NDArray[np.uint8]) -> Tensor:

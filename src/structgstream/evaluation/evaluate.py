@@ -17,7 +17,7 @@ from structgstream.codec.reader import PacketInfo
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import of_cameras
 from structgstream.errors import CaptureError
-from structgstream.evaluation.affine import psnr_affine
+from structgstream.evaluation.affine import ChannelFit, channel_fit, psnr_affine, psnr_camera_color
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.facts import (
     check_same_frames,
@@ -95,6 +95,7 @@ def evaluate(
         size = len(recording.packets)
         tools = instruments(views.items(), frames=size, device=backend.device, flow=flow, lpips_weights=lpips_weights)
     first: dict[str, Picture] = {}
+    colors: dict[str, ChannelFit] = {}
     before: dict[str, Seen] = {}
     frames = []
     peaks = PeakMeter(backend.device)
@@ -106,7 +107,9 @@ def evaluate(
             truth = frame.images[name]
             first.setdefault(name, truth)
             picture, seconds = rendered(scene, views[name], backend)
-            scores = score(picture, truth, first[name], backend=backend, seconds=seconds)
+            if name not in colors:
+                colors[name] = channel_fit(picture, truth)
+            scores = score(picture, truth, first[name], backend=backend, seconds=seconds, color=colors[name])
             if tools is not None:
                 further, before[name] = measured(
                     tools, truth=truth, picture=picture, before=before.get(name), camera=name, index=info.index
@@ -120,6 +123,7 @@ def evaluate(
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
     facts = stream_facts(recording, names) | course([frame.mean.psnr for frame in frames])
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
+    facts |= {"camera_colors": {name: vars(fit) for name, fit in colors.items()}}
     facts |= {"metrics": metrics, "not_available": dict(tools.not_available) if tools else {}}
     facts |= {"lpips_weights": dict(tools.weights) if tools else {}}
     peaks.end(EVALUATION)
@@ -138,8 +142,24 @@ def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[Packet
         began = time.perf_counter()
 
 
-def score(picture: Picture, truth: Picture, first: Picture, *, backend: Backend, seconds: float = 0.0) -> Scores:
-    """The scores of a rendering against ``truth``; ``first`` is the camera's picture of frame 0.
+def score(
+    picture: Picture,
+    truth: Picture,
+    first: Picture,
+    *,
+    backend: Backend,
+    seconds: float = 0.0,
+    color: ChannelFit | None = None,
+) -> Scores:
+    """The scores of a rendering against ``truth``.
+
+    Args:
+        picture: the rendering.
+        truth: what the camera took.
+        first: what it took of frame 0.
+        backend: what computes SSIM.
+        seconds: that the rendering took.
+        color: what the camera does to colours, by its frame 0; None for no score of it.
 
     Raises:
         CaptureError: the pictures have different sizes.
@@ -163,6 +183,7 @@ def score(picture: Picture, truth: Picture, first: Picture, *, backend: Backend,
         else None,
         changed_share=moving / errors.size,
         render_seconds=seconds,
+        psnr_camera_color=None if color is None else psnr_camera_color(picture, truth, color),
     )
 
 

@@ -59,6 +59,8 @@ def _quality(axis: "Axes", report: Report) -> None:
         )
     if len(report.cameras) > 1:
         axis.plot(index, [frame.mean.psnr for frame in report.frames], color=INK, linewidth=2, label="mean")
+    if colored := _known(report, "psnr_camera_color"):
+        axis.plot(*zip(*colored), color=INK, linewidth=1.5, linestyle="--", label="mean, frame 0's colour fit")
     if changed := _known(report, "psnr_changed"):
         axis.plot(*zip(*changed), color=INK, linewidth=1, linestyle=":", label="changed pixels")
     axis.set_ylabel("PSNR, dB", fontsize=9)

@@ -20,6 +20,8 @@ class Scores:
         psnr: dB, the headline.
         ssim: see ``metrics.ssim``.
         psnr_affine: dB after the best affine change of colour towards the truth (``affine.py``).
+        psnr_camera_color: dB after a gain and a bias for each channel that the camera's first frame gave and that are
+            held (``affine.py``, Note [Colour of a camera]); None where no fit was made.
         psnr_changed: dB over the pixels that changed since the camera's first picture; None where there are
             none.
         psnr_still: dB over the others; None where there are none.
@@ -54,6 +56,7 @@ class Scores:
     t_lpips: float | None = None
     flicker: float | None = None
     truth_flicker: float | None = None
+    psnr_camera_color: float | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,7 @@ def as_json(report: Report) -> dict[str, Any]:
     seconds = [frame.log["total_seconds"] for frame in report.frames if "total_seconds" in frame.log]
     mean = vars(report.mean) | {
         "bytes": float(np.mean(packets)),
+        "bytes_with_header": report.stream["total_bytes"] / len(report.frames),
         "free": float(np.mean([frame.free for frame in report.frames])),
         "seconds": float(np.mean(seconds)) if seconds else None,
     }

@@ -7,10 +7,10 @@ A marker is a comment of Markdown on a line of its own::
     ...
     <!-- end -->
 
-with ``ablation TABLE STUDY``, ``methods STUDY``, ``readings STUDY``, ``effects STUDY``, ``rates STUDY``, ``bd-rate
-STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE STUDY``, ``plot STUDY`` and ``rate-plot STUDY`` for
-pictures, which go to ``images/`` beside the document. A study is a folder of results of one capture and one full
-method, named after the capture or after what is asked of it.
+with ``ablation TABLE STUDY``, ``methods STUDY``, ``folds STUDY OTHER``, ``cited DATA``, ``readings STUDY``, ``effects
+STUDY``, ``rates STUDY``, ``bd-rate STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE STUDY``, ``plot
+STUDY`` and ``rate-plot STUDY`` for pictures, which go to ``images/`` beside the document. A study is a folder of
+results of one capture and one full method, named after the capture or after what is asked of it.
 """
 
 import re
@@ -18,8 +18,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from structgstream.errors import ConfigError
+from structgstream.experiments.cited import cited_sheet, cited_words
 from structgstream.experiments.effects import effects_sheet
 from structgstream.experiments.figures import write_comparison, write_curves
+from structgstream.experiments.folds import folds_sheet
 from structgstream.experiments.rate_distortion import bd_sheet, listed, rates_sheet, versus_sheet
 from structgstream.experiments.rate_figures import write_rates
 from structgstream.experiments.readings import readings_sheet
@@ -110,6 +112,15 @@ def _methods(words: Sequence[str], studies: Studies) -> str:
     return markdown(comparison_sheet(studies.get(words[0], ()), titles=_method_titles(), scores=COMPARED))
 
 
+def _folds(words: Sequence[str], studies: Studies) -> str:
+    return markdown(folds_sheet([studies.get(word, ()) for word in words], titles=_method_titles()))
+
+
+def _cited(words: Sequence[str], _: Studies) -> str:
+    sheet = cited_sheet(words[0])
+    return f"{cited_words(words[0])}\n{markdown(sheet)}"
+
+
 def _method_titles() -> dict[str, str]:
     return {method_key(name): title for name, title in method_titles().items()}
 
@@ -179,6 +190,8 @@ def _pictures(capture: Mapping[str, object]) -> str:
 _MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Studies], str]]] = {
     "ablation": (2, _ablation),
     "methods": (1, _methods),
+    "folds": (2, _folds),
+    "cited": (1, _cited),
     "readings": (1, _readings),
     "effects": (1, _effects),
     "rates": (1, _rates),

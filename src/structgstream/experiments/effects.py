@@ -33,9 +33,11 @@ _COLUMNS = (
     ("psnr_still", "psnr_still"),
     ("drift_db_per_frame", "drift_db_per_frame"),
     ("online_bytes", "online_kilobytes"),
+    ("bytes_with_header", "kilobytes_with_header"),
     ("flicker", "flicker"),
     ("e_warp", "e_warp"),
     ("online_cpu_seconds", "online_cpu_seconds"),
+    ("decode_and_render_fps", "decode_and_render_fps"),
 )
 """Scores beside PSNR, and how each is written."""
 
@@ -130,18 +132,19 @@ def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str]) -> Sh
     """
     found = summaries(result for result in results if result.key in titles)
     whole = found.get(WHOLE)
-    heads = ["variant", "seeds", SCORES["psnr"].title, "to compact, dB"]
+    heads = ["variant", "seeds", SCORES["psnr"].title, SCORES["psnr_camera_color"].title, "to compact, dB"]
     columns = [*heads, *(SCORES[name].title for _, name in _COLUMNS)]
     return Sheet("Effects", columns, [[title, *_cells(found.get(key), whole)] for key, title in titles.items()])
 
 
 def _cells(summary: Summary | None, whole: Summary | None) -> list[str]:
     if summary is None:
-        return ["-"] * (3 + len(_COLUMNS))
+        return ["-"] * (4 + len(_COLUMNS))
     difference = None if whole is None or summary.key == WHOLE else summary.difference(whole, "psnr")
     cells = [
         str(len(summary.results)),
         written(summary.score("psnr"), "psnr"),
+        written(summary.score("psnr_camera_color"), "psnr_camera_color"),
         written(difference, "psnr", signed=True),
     ]
     return cells + [written(summary.score(score), name) for score, name in _COLUMNS]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Picture = NDArray[np.uint8]
 CROP_SHARE = 4  # a detail is a quarter of the picture across
-CURVES = ("psnr", "psnr_changed", "e_warp", "flicker")
+CURVES = ("psnr", "psnr_camera_color", "psnr_changed", "e_warp", "flicker")
 
 
 def write_curves(path: Path, results: Iterable[Result], *, keys: Sequence[str], titles: Mapping[str, str]) -> None:

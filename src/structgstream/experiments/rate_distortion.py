@@ -65,20 +65,24 @@ def rates_sheet(results: Iterable[Result]) -> Sheet:
     shown = [result for result in results if result.key in curve_titles()]
     found = summaries(shown)
     fps = next((float(result.identity["capture"]["fps"]) for result in shown), 0.0)
-    scores = ("psnr", "psnr_changed")
-    heads = [*(SCORES[name].title for name in scores), SCORES["online_kilobytes"].title, "Mbit/s"]
+    scores = ("psnr", "psnr_camera_color", "psnr_changed")
+    after = (("bytes_with_header", "kilobytes_with_header"), ("flicker", "flicker"))
+    after += (("decode_and_render_fps", "decode_and_render_fps"),)
+    heads = ["seeds", *(SCORES[name].title for name in scores), SCORES["online_kilobytes"].title, "Mbit/s"]
+    heads += [SCORES[name].title for _, name in after]
     rows = []
     for key, title in curve_titles().items():
         summary = found.get(key)
         if summary is None:
             if key not in OTHERS:
-                rows.append([title, *["-"] * 6])
+                rows.append([title, *["-"] * len(heads)])
             continue
         cost = summary.score("online_bytes")
         cells = [written(summary.score(name), name) for name in scores]
-        cells += [written(cost, "online_kilobytes"), _megabits(cost, fps), written(summary.score("flicker"), "flicker")]
+        cells += [written(cost, "online_kilobytes"), _megabits(cost, fps)]
+        cells += [written(summary.score(score), name) for score, name in after]
         rows.append([title, str(len(summary.results)), *cells])
-    return Sheet("Rates", ["stream", "seeds", *heads, SCORES["flicker"].title], rows)
+    return Sheet("Rates", ["stream", *heads], rows)
 
 
 def _megabits(cost: Spread | None, fps: float) -> str:

@@ -98,7 +98,7 @@ def readings_sheet(results: Iterable[Result]) -> Sheet:
     """Every reading beside the default: mean over seeds, and the difference seed by seed."""
     found = summaries(result for result in results if result.key in READINGS)
     base = found.get(BASE)
-    scores = ("psnr_first", "psnr", "psnr_changed")
+    scores = ("psnr_first", "psnr", "psnr_camera_color", "psnr_changed")
     rows = []
     for key, reading in READINGS.items():
         if key not in found:

@@ -83,8 +83,10 @@ class Summary:
 
 
 def score_of(result: Result, name: str) -> float | None:
-    """A score of a result by its name: a mean over the stream, or a fact of the file."""
+    """A score of a result by its name: a mean over the stream, a fact of the file, or what follows from its facts."""
     value: Any = result.mean.get(name, result.stream.get(name))
+    if value is None and name == "bytes_with_header" and result.stream.get("total_bytes"):
+        value = result.stream["total_bytes"] / len(result.frames)  # Results from before the score was written down.
     return None if value is None or isinstance(value, str | Mapping) else float(value)
 
 

@@ -19,7 +19,7 @@ class CameraColor:
     ~~~~~~~~~~~~~~~~~~~
     A common gain could move into the scene's colours and back, so the split is fixed: the training cameras' mean
     correction is the identity, exactly. Held-out cameras, of which nothing may be learned, render with that mean. A
-    soft penalty was measured to drift (``docs/method.md``).
+    soft penalty would only slow the drift, for the loss does not see a common gain at all.
     """
 
     gains: Tensor
