@@ -29,7 +29,7 @@ def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, in
     box = _box(changed)
     if box is not None:
         rows, columns = box
-        search = dis_search("capture", preset="fast")
+        search = dis_search("capture", preset="medium")
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
         forward, backward = search(earlier, later), search(later, earlier)
         believed = agreeing(forward, backward).astype(np.float32)[..., None]

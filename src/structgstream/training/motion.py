@@ -20,6 +20,7 @@ from structgstream.scene.state import FieldName
 from structgstream.training.flow_maps import flow_map
 from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
 from structgstream.training.residuals import ResidualFloor, residual_of
+from structgstream.training.trust import ViewChange, believed, jumped
 from structgstream.training.views import View
 
 
@@ -75,8 +76,9 @@ class Moving:
         anchors: mask ``[M]``.
         free: mask ``[F]``.
         unseen: mask ``[F]``, apart from ``free``: what no view shows.
-        shown: for each view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
-        changed_share: of the pixels of all views.
+        shown: for each trusted view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
+        trusted: numbers of the views whose pictures can be believed (``trust``); only they were asked.
+        jumped: whether everything changed, so that there is no motion to follow.
         evidence: how all movers were seen to move, if that was asked for.
         centers: ``[M + F, 3]`` where all movers are seen, if that was asked for.
     """
@@ -85,7 +87,8 @@ class Moving:
     free: Tensor
     unseen: Tensor
     shown: dict[int, Tensor]
-    changed_share: float = 0.0
+    trusted: tuple[int, ...] = ()
+    jumped: bool = False
     evidence: MotionEvidence | None = None
     centers: Tensor | None = None
 
@@ -136,54 +139,84 @@ def moving_parts(
         with_flow: also find how everything was seen to move.
     """
     anchors, free = len(scene.anchors), len(scene.free)
-    votes = torch.zeros(anchors + free, device=scene.anchors.positions.device)
-    seen = torch.zeros_like(votes)
-    ease = torch.ones_like(votes)
+    ease = torch.ones(anchors + free, device=scene.anchors.positions.device)
     if older is not None:
         ease[changed_since(older, scene)] = config.moved_ease
-    most = torch.zeros(free, device=votes.device)
-    shown: dict[int, Tensor] = {}
-    flows: list[Tensor] = []
-    cover: Tensor | float = 0.0
-    shares = []
+    looks: list[_Look] = []
     with torch.no_grad():
         baked = scene.baked()
         for view, last in zip(views, before, strict=True):
-            small = view.reduced(config.picture_scale)
-            gaussians = baked.gaussians(small.camera, backend)
-            changed = backend.changed_pixels(
-                last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
+            looks.append(
+                _look(baked, view, last, config=config, backend=backend, ease=ease, floor=floor, with_flow=with_flow)
             )
-            size = (small.camera.height, small.camera.width)
-            part = interpolate(changed[None, None].to(gaussians.means), size=size, mode="area")
-            if floor is not None and config.residual_threshold > 0.0:
-                missing = residual_of(gaussians, small, scene.camera_color, backend)
-                wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
-                part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
-            shares.append(part.mean())
-            maps = [torch.ones(*size, 1, device=votes.device), part[0, 0, :, :, None]]
-            if with_flow:
-                maps += [flow_map(last.image, view.image, changed, size), last.reduced(config.picture_scale).colors]
-            sums = gathered(gaussians, baked, small.camera, torch.cat(maps, dim=-1), backend)
-            sums *= view.camera.height * view.camera.width / part.numel()
-            total, inside = by_mover(sums[:, :2], baked).unbind(1)
-            seen += total > config.least_pixels
-            votes += (inside > config.least_pixels * ease) & (inside > config.least_share * ease * total)
-            most = torch.maximum(most, sums[len(sums) - free :, 0])
-            shown[view.index] = sums[:, 0] > config.least_pixels
-            if with_flow:
-                flows.append(by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], baked))
-                cover = cover + sums[:, 0]
+    changes = [look.change for look in looks]
+    trusted = [number for number, good in enumerate(believed(changes)) if good]
+    seen, votes = (torch.stack([getattr(looks[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))
+    cover = torch.stack([looks[n].cover for n in trusted])
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
-    unseen = most < config.unseen_pixels
+    unseen = cover[:, cover.shape[1] - free :].amax(0) < config.unseen_pixels
     found = Moving(
         enough[:anchors],
         enough[anchors:] & ~unseen,
         unseen,
-        shown,
-        changed_share=float(torch.stack(shares).mean()),
+        shown={views[n].index: looks[n].cover > config.least_pixels for n in trusted},
+        trusted=tuple(trusted),
+        jumped=jumped(changes),
     )
-    if not with_flow or not isinstance(cover, Tensor):
+    if not with_flow or found.jumped:
         return found
-    evidence = flow_evidence(flows, least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS)
-    return replace(found, evidence=evidence, centers=mover_centers(scene, cover))
+    evidence = flow_evidence(
+        [looks[n].flows for n in trusted], least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS
+    )
+    return replace(found, evidence=evidence, centers=mover_centers(scene, cover.sum(0)))
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What one view says: whether it sees movers ``[E]`` and votes for them, what each id covers, and flow."""
+
+    seen: Tensor
+    votes: Tensor
+    cover: Tensor
+    flows: Tensor
+    change: ViewChange
+
+
+def _look(
+    scene: Scene,
+    view: View,
+    last: View,
+    *,
+    config: MotionConfig,
+    backend: Backend,
+    ease: Tensor,
+    floor: ResidualFloor | None,
+    with_flow: bool,
+) -> _Look:
+    small = view.reduced(config.picture_scale)
+    gaussians = scene.gaussians(small.camera, backend)
+    changed = backend.changed_pixels(
+        last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
+    )
+    size = (small.camera.height, small.camera.width)
+    part = interpolate(changed[None, None].to(gaussians.means), size=size, mode="area")
+    difference = float(part.mean())
+    wrong_share = 0.0
+    if floor is not None and config.residual_threshold > 0.0:
+        missing = residual_of(gaussians, small, scene.camera_color, backend)
+        wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
+        wrong_share = float(wrong.mean())
+        part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
+    maps = [torch.ones_like(part[0, 0, :, :, None]), part[0, 0, :, :, None]]
+    if with_flow:
+        maps += [flow_map(last.image, view.image, changed, size), last.reduced(config.picture_scale).colors]
+    sums = gathered(gaussians, scene, small.camera, torch.cat(maps, dim=-1), backend)
+    sums *= view.camera.height * view.camera.width / part.numel()
+    total, inside = by_mover(sums[:, :2], scene).unbind(1)
+    return _Look(
+        seen=total > config.least_pixels,
+        votes=(inside > config.least_pixels * ease) & (inside > config.least_share * ease * total),
+        cover=sums[:, 0],
+        flows=by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if with_flow else total,
+        change=ViewChange(difference, wrong_share, same=torch.equal(last.image, view.image)),
+    )

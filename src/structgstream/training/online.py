@@ -180,12 +180,13 @@ def fit_next_frame(
                 with_flow=config.start.enabled,
             )
             partition, ahead = Partition.of(scene, which), ahead[which.movers]
+            trusted = [views[number] for number in which.trusted]
         with watch.stage("start motion"):
-            start = started(partition, views, ahead, config=config.start, motion=motion, backend=backend)
+            start = started(partition, trusted, ahead, config=config.start, motion=motion, backend=backend)
         with watch.stage("renew"):
             new = renewal(
                 replace(partition, moving=displaced(partition.moving, start.displacements)),
-                views,
+                trusted,
                 start.places,
                 frame_index=frame.index,
                 floor=floor,
@@ -197,7 +198,7 @@ def fit_next_frame(
             alive = torch.cat([torch.ones(len(partition.moving.anchors), dtype=torch.bool).to(new.kept), new.kept])
             moving = replace(partition.moving, free=partition.moving.free.select(new.kept))
         ahead = start.displacements[alive]
-        result = fit.run(moving, views, partition=partition, places=start.places, ahead=ahead, born=new.born)
+        result = fit.run(moving, trusted, partition=partition, places=start.places, ahead=ahead, born=new.born)
         died = int((~new.kept).sum())
         return replace(
             result,
@@ -209,7 +210,9 @@ def fit_next_frame(
                 "corrected": start.corrected,
                 "born": len(new.born),
                 "blamed": died,
-                "refused": int(new.refused),
+                "births refused": int(new.refused),
+                "views left out": len(views) - len(trusted),
+                "jumps": int(which.jumped),
             },
         )
 

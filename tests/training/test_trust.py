@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures that do not tell of the scene are found by what the others say."""
+
+from dataclasses import replace
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.trust import ViewChange, believed, jumped
+from structgstream.training.views import training_views
+from worlds import moving_world
+
+USUAL = ViewChange(changed=0.05, wrong=0.02, same=False)
+WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)
+CONFIG = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0)
+
+
+def test_usual_pictures_are_believed() -> None:
+    assert believed([USUAL] * 5) == [True] * 5
+    assert not jumped([USUAL] * 5)
+
+
+def test_a_picture_that_changed_or_is_wrong_everywhere_is_not() -> None:
+    for odd in (replace(USUAL, changed=0.9), replace(USUAL, wrong=0.9)):
+        assert believed([USUAL, odd, USUAL, USUAL]) == [True, False, True, True]
+
+
+def test_a_frozen_picture_is_not_while_others_change() -> None:
+    frozen = ViewChange(changed=0.0, wrong=0.0, same=True)
+    assert believed([USUAL, USUAL, USUAL, frozen]) == [True, True, True, False]
+    assert believed([frozen] * 3) == [True] * 3, "nothing moves: all are equal to the last"
+
+
+def test_when_all_change_everywhere_it_is_a_jump_and_all_are_believed() -> None:
+    everywhere = [replace(USUAL, changed=0.95)] * 4
+    assert jumped(everywhere)
+    assert all(believed(everywhere))
+
+
+def test_two_views_are_always_left() -> None:
+    assert believed([USUAL, replace(USUAL, changed=0.9)]) == [True, True]
+
+
+def test_a_black_picture_moves_nothing() -> None:
+    cpu, backend = torch.device("cpu"), reference_backend()
+    before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
+    spoiled = [replace(v, image=torch.zeros_like(v.image)) if n in (1, 3) else v for n, v in enumerate(views)]
+    good = [n for n in range(len(views)) if n not in (1, 3)]
+    found = moving_parts(WORLD.scene, spoiled, before, config=CONFIG, backend=backend)
+    without = moving_parts(
+        WORLD.scene, [views[n] for n in good], [before[n] for n in good], config=CONFIG, backend=backend
+    )
+    assert found.trusted == tuple(good)
+    assert torch.equal(found.anchors, without.anchors)
+    assert found.anchors.any()
+
+
+def test_a_light_switched_on_is_a_jump() -> None:
+    cpu, backend = torch.device("cpu"), reference_backend()
+    before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
+    bright = [replace(v, image=(v.image.int() + 60).clamp(max=255).to(torch.uint8)) for v in views]
+    found = moving_parts(WORLD.scene, bright, before, config=CONFIG, backend=backend, with_flow=True)
+    assert found.jumped
+    assert found.evidence is None
+    assert len(found.trusted) == len(views)
