@@ -8,11 +8,13 @@ from typing import Any, Literal
 from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig
 from structgstream.rate_control import RateConfig
+from structgstream.training.births import BirthConfig
 from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
+from structgstream.training.motion_start import MotionStartConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.optim import Rate
 from structgstream.training.patching import PatchingConfig
@@ -137,9 +139,14 @@ COMPACT = replace(
     online=replace(
         MOTION.online,
         iterations=75,
-        patching=replace(MOTION.online.patching, iteration=40),
+        rates=replace(MOTION.online.rates, anchor_positions=2e-4),
+        patching=replace(MOTION.online.patching, spawn="off"),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),
-        motion=replace(MOTION.online.motion, moved_ease=0.5, unseen_pixels=0.1),
+        motion=replace(
+            MOTION.online.motion, moved_ease=0.5, unseen_pixels=0.1, residual_threshold=0.05, picture_scale=0.5
+        ),
+        start=MotionStartConfig(enabled=True),
+        births=BirthConfig(enabled=True),
         motion_prior=0.7,
         rounding=RoundingConfig(free_priced=True),
     ),
@@ -148,9 +155,9 @@ COMPACT = replace(
 is disturbed while it is fitted, so that it does not learn its cameras by heart."""
 
 FAST = replace(
-    RIG,
+    COMPACT,
     initial=replace(
-        RIG.initial,
+        COMPACT.initial,
         iterations=1200,
         schedule_iterations=1200,
         coarse_iterations=700,
@@ -164,9 +171,8 @@ FAST = replace(
             max_anchors=40_000,
         ),
     ),
-    online=replace(RIG.online, rates=replace(RIG.online.rates, anchor_positions=1e-3)),
 )
-"""A try in minutes on a laptop: a shorter frame 0, and anchors that follow fast motion (docs/method.md)."""
+"""A try in minutes on a laptop: as COMPACT, after a shorter frame 0."""
 
 TINY = replace(
     FAST,

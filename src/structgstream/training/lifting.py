@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -115,7 +116,6 @@ def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
     count = min(count, len(among))
-    distances, rows = KDTree(among.double().numpy(force=True)).query(
-        points.double().numpy(force=True), k=list(range(1, count + 1))
-    )
+    ranks: Any = list(range(1, count + 1))  # A list, so that one neighbour is a column too.
+    distances, rows = KDTree(among.double().numpy(force=True)).query(points.double().numpy(force=True), k=ranks)
     return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
