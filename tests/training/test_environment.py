@@ -22,10 +22,10 @@ TRUTH = torch.tensor([[0.1, 0.0, -0.2], [0.2, 0.1, 0.0], [0.05, 0.3, 0.2], [-0.1
 
 def views(color: CameraColor):
     """Pictures of nothing but an environment, each through its camera's correction."""
-    pixels = torch.cartesian_prod(torch.arange(32), torch.arange(48))
+    pixels = torch.arange(32 * 48)
     images = {}
     for name in RIG:
-        colors = environment(TRUTH, pixel_directions(RIG[name], pixels).float()).reshape(32, 48, 3)
+        colors = environment(TRUTH, pixel_directions(RIG[name], pixels)).reshape(32, 48, 3)
         if name in RIG.training:
             index = RIG.training.index(name)
             colors = colors * color.gains[index] + color.biases[index]

@@ -35,23 +35,20 @@ def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
 
 
 def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
-    """Unit directions ``[N, 3]`` of the centres of ``pixels`` ``[N, 2]`` (rows and columns) in the world.
+    """Unit directions ``[N, 3]`` of the centres of ``pixels`` ``[N]``, counted row by row, in the axes of the scene.
 
     A similarity does not rotate: they are the same in units of the capture and of the scene.
     """
     viewmat, K, _ = camera.beside(torch.zeros(0, dtype=torch.float64, device=pixels.device))
-    y, x = (pixels.double() + 0.5).unbind(1)
-    rays = torch.stack([x, y, torch.ones_like(x)], dim=1) @ torch.linalg.inv(K).T
-    return torch.nn.functional.normalize(rays @ viewmat[:3, :3], dim=1)
+    y = torch.div(pixels, camera.width, rounding_mode="floor")
+    centers = torch.stack([pixels - y * camera.width + 0.5, y + 0.5, torch.ones_like(y)], dim=1)
+    rays = centers @ (torch.linalg.inv(K).T @ viewmat[:3, :3]).to(centers)
+    return rays * rays.square().sum(1, keepdim=True).rsqrt()
 
 
 def in_environment(image: Tensor, alpha: Tensor, camera: Camera, coefficients: Tensor) -> Tensor:
     """``image`` ``[H, W, 3]``, drawn on black with coverage ``alpha`` ``[H, W]``, before the environment."""
-    rest = 1.0 - alpha
-    pixels = (rest > _INVISIBLE).nonzero()
-    found = image.clone()
-    if len(pixels):
-        behind = environment(coefficients.to(image), pixel_directions(camera, pixels).to(image))
-        rows, columns = pixels.unbind(1)
-        found[rows, columns] += rest[rows, columns, None] * behind
-    return found
+    rest = 1.0 - alpha.reshape(-1)
+    pixels = (rest > _INVISIBLE).nonzero()[:, 0]
+    behind = environment(coefficients.to(image), pixel_directions(camera, pixels).to(image))
+    return image.reshape(-1, 3).index_add(0, pixels, rest[pixels, None] * behind).reshape(image.shape)

@@ -36,7 +36,7 @@ class EnvironmentConfig:
     """Of the spherical harmonics, 0 to 2."""
     smoothness: float = 1e-3
     """Ridge: of a coefficient of degree l it is l (l + 1) times that of all pixels' mean weight."""
-    least_weight: float = 1e-3
+    least_weight: float = 1e-2
     """Of a pixel that is covered. Others weigh as much more as they are open: what is there continues nearby."""
     step: float = 1 / 256
     """What the coefficients are whole multiples of, in streams with the codec ``compact``."""
@@ -58,13 +58,12 @@ def fitted_environment(scene: Scene, views: Sequence[View], *, config: Environme
     for view in views:
         with torch.no_grad():
             alpha = draw(scene.gaussians(view.camera, backend), view.camera, backend).alpha
-        rows, columns = (torch.arange(size // 2 % _STRIDE, size, _STRIDE) for size in alpha.shape)
-        pixels = torch.cartesian_prod(rows, columns)
-        taken = tuple(part.to(alpha.device) for part in pixels.unbind(1))
+        rows, columns = (torch.arange(0, size, _STRIDE, device=alpha.device) for size in alpha.shape)
+        pixels = (rows[:, None] * alpha.shape[1] + columns).reshape(-1)
         gains, biases = (value[view.index].cpu().double() for value in (color.gains, color.biases))
-        colors = (view.image[taken].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
-        weights = (1.0 - alpha[taken]).cpu().double() + config.least_weight
-        basis = sh_basis(pixel_directions(view.camera, pixels), config.degree)
+        colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
+        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.least_weight
+        basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.degree)
         products += (basis * weights[:, None]).T @ basis
         targets += (basis * weights[:, None]).T @ (colors - 0.5)
         total += float(weights.sum())
