@@ -26,6 +26,7 @@ from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import FrameReport, Session
+from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.motion import MotionConfig
 from structgstream.training.rounding import RoundingConfig, pixel_size
 from worlds import moving_world
@@ -36,7 +37,8 @@ CONFIG = replace(
     TINY,
     codec="compact",
     key_interval_seconds=2 / 30,
-    initial=replace(TINY.initial, iterations=20, schedule_iterations=20, coarse_iterations=10),
+    initial=replace(TINY.initial, iterations=20, schedule_iterations=20, coarse_iterations=10, random_background=True),
+    environment=EnvironmentConfig(enabled=True),
     online=replace(
         TINY.online,
         iterations=8,
@@ -141,6 +143,20 @@ def test_the_header_is_a_fraction_of_its_numbers() -> None:
     header = StreamReader(data).header
     numbers = sum(value.numel() for part in (header.static, header.reference) for value in part.values())
     assert next(scanned(data)).end < 0.5 * 4 * numbers, "most are the MLPs' here, which get ten bits each"
+
+
+def test_an_environment_is_in_the_header_and_in_every_scene() -> None:
+    run(sink := MemorySink(), frames=2)
+    reader = StreamReader(sink.data)
+    coefficients = reader.header.static["environment"]
+    assert coefficients.shape == (9, 3)
+    assert torch.equal(coefficients, (coefficients * 256).round() / 256)
+    for _, scene in reader.scenes():
+        assert scene.environment is not None
+        assert torch.equal(scene.environment, coefficients)
+    for codec in ("compact", "raw"):
+        run(sink := MemorySink(), config=replace(CONFIG, codec=codec, environment=EnvironmentConfig()), frames=1)
+        assert StreamReader(sink.data).scene(0).environment is None
 
 
 def test_what_stands_still_keeps_its_bins() -> None:

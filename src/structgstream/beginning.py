@@ -2,6 +2,7 @@
 """How a stream begins: where frame 0 starts from, and what the frames after it and every receiver need of it."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -19,8 +20,10 @@ from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, scene_of, state_of
 from structgstream.similarity import Similarity
-from structgstream.training.first_bins import Sensitivity, first_bins, regauged, sensitivity_of
+from structgstream.training.environment import fitted_environment
+from structgstream.training.first_bins import Sensitivity, first_bins, float32, regauged, sensitivity_of
 from structgstream.training.rounding import pixel_size
+from structgstream.training.views import training_views
 
 
 def frame_seed(seed: int, index: int) -> int:
@@ -45,6 +48,7 @@ def begun(
     scene: Scene,
     source: FrameSource,
     *,
+    frame: MultiViewFrame,
     config: StreamConfig,
     metadata: Mapping[str, object],
     similarity: Similarity,
@@ -58,6 +62,7 @@ def begun(
     Args:
         scene: as it was fitted.
         source: the capture.
+        frame: its first pictures; only those of training cameras are read.
         config: of the stream.
         metadata: plain JSON values for the header.
         similarity: from the capture's units to the scene's.
@@ -65,6 +70,10 @@ def begun(
     """
     dynamic, rounding = config.online.dynamic, config.online.rounding
     rig = similarity.rig(source.rig)
+    if config.environment.enabled:
+        views = training_views(frame, rig, backend.device)
+        found = fitted_environment(scene, views, config=config.environment, backend=backend)
+        scene = replace(scene, environment=found)
     worth: Sensitivity | None = None
     if config.codec == "compact":
         worth = sensitivity_of(scene, rig, backend=backend, seed=frame_seed(config.seed, 0))
@@ -72,13 +81,15 @@ def begun(
     if "appearance" in dynamic:
         scene = with_appearance(scene, config.online.appearance_rank)
     steps: dict[str, float] = {}
-    init_steps: Mapping[FieldName, float] = {}
+    init_steps: dict[FieldName, float] = {}
     if worth is not None:
         known = rounding.steps(pixel_size(scene.anchors.positions, rig))
         used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
         steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
         voxel_size = config.initial.voxel_size
         scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
+        if scene.environment is not None:
+            init_steps["environment"] = float32(config.environment.step)
         rounded = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
         scene = scene_of(rounded, distance_input=scene.distance_input)
     state = state_of(scene)

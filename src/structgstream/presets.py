@@ -10,6 +10,7 @@ from structgstream.data.points import PointsConfig
 from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig
 from structgstream.training.disturbance import DisturbanceConfig
+from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.losses import LossWeights
@@ -29,6 +30,8 @@ class StreamConfig:
     online: OnlineConfig = field(default_factory=OnlineConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
     """How initial points are made from frame 0 when the capture brings none."""
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    """What is drawn where no camera saw anything."""
     normalised_radius: float = 1.0
     """Largest distance of a training camera to their mean after normalisation; rates and voxel sizes refer to it."""
     key_interval_seconds: float = 1.0
@@ -134,7 +137,12 @@ MOTION = replace(
 
 COMPACT = replace(
     MOTION,
-    initial=replace(MOTION.initial, disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5)),
+    initial=replace(
+        MOTION.initial,
+        disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5),
+        random_background=True,
+    ),
+    environment=EnvironmentConfig(enabled=True),
     codec="compact",
     online=replace(
         MOTION.online,
@@ -152,7 +160,7 @@ COMPACT = replace(
     ),
 )
 """As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks. Frame 0
-is disturbed while it is fitted, so that it does not learn its cameras by heart."""
+is disturbed while it is fitted, so that it does not learn its cameras by heart, and stands before an environment."""
 
 FAST = replace(
     COMPACT,

@@ -169,6 +169,7 @@ class Session:
                 fitted_scene, header = begun(
                     fitted_scene,
                     self._source,
+                    frame=frame,
                     config=self._config,
                     metadata=self._metadata,
                     similarity=self._similarity,

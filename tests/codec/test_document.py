@@ -17,7 +17,7 @@ from vectors.generate import COMPACT_EXPECTED, COMPACT_STREAM
 Row = list[int]
 NAMES = {1: "anchor_positions", 2: "offset_scales", 3: "base_scales", 4: "anchor_offsets", 5: "anchor_features"}
 NAMES |= {6: "opacity_mlp", 7: "color_mlp", 8: "covariance_mlp", 9: "free", 10: "free_births", 11: "camera_color"}
-NAMES |= {12: "appearance", 13: "appearance_basis"}
+NAMES |= {12: "appearance", 13: "appearance_basis", 14: "environment"}
 FREE = [("free_means", 3), ("free_log_scales", 3), ("free_quats", 4), ("free_logit_opacities", 1), ("free_colors", 3)]
 
 
@@ -331,7 +331,7 @@ def read_init(data: bytes, steps: dict[str, float]) -> dict[str, tuple[int, list
         name = NAMES[code]
         rows, shifts = read_anchors(fields, name, shifts)
         found[name] = len(rows[0]), values(rows, steps[name])
-    for code in (6, 7, 8, 13):
+    for code in (6, 7, 8, 13, 14):
         name = NAMES[code]
         n = fields.number(f"{name}.count")
         bins = [signed(v) for v in fields.naturals(f"{name}.value", [0] * n, 1)]

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -27,6 +29,7 @@ NAMES = [row.name for row in STATE_TABLE]
 )
 def test_decoding_gives_the_scene_back_bit_for_bit(anchors: int, free: int, seed: int, dynamic: set, kind: int) -> None:
     scene = with_appearance(random_scene(anchors, free=free, seed=seed, width=8), 3)
+    scene = replace(scene, environment=torch.rand(9, 3))
     header = header_for(scene, dynamic=frozenset(dynamic))
     encoded = SceneEncoder(header).encode(scene, index=3, pts_seconds=0.1, kind=PacketKind(kind))
     receiver = SceneDecoder(unpacked_header(packed_header(header)))

@@ -2,6 +2,7 @@
 """The coded fields of the init record."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -33,7 +34,10 @@ STEPS: dict[FieldName, float] = {name: float(np.float32(0.01 + i / 100)) for i, 
 
 def fields_of(anchors: int = 5, *, seed: int = 0, scale: float = 1.0) -> dict[FieldName, torch.Tensor]:
     """Fields of a small scene with an appearance, on bins."""
-    state = state_of(with_appearance(small_scene(anchors, seed=seed), 2))
+    scene = replace(
+        with_appearance(small_scene(anchors, seed=seed), 2), environment=torch.arange(12.0).reshape(4, 3) - 5
+    )
+    state = state_of(scene)
     return on_bins({name: state[name] * scale for name in CODED}, STEPS)
 
 
@@ -219,6 +223,14 @@ def test_offsets_and_directions_that_do_not_fit() -> None:
     one: dict[FieldName, torch.Tensor] = {**fields, "appearance_basis": fields["appearance_basis"][:1]}
     with pytest.raises(StreamError, match=r"holds 2 numbers of appearance_basis, which do not fit \(2, 2\)"):
         decoded_fields(_unchecked(one), STEPS)
+
+
+def test_an_environment_of_no_whole_rows() -> None:
+    alone = Encoder(Tables())
+    alone.number("environment.count", 4)
+    alone.naturals("environment.value", np.arange(4), np.zeros(4, np.uint16), count=1)
+    with pytest.raises(StreamError, match=r"holds 4 numbers of environment, which do not fit \(1, 3\)"):
+        decoded_fields({**encoded_fields(fields_of(), STEPS), "environment": alone.fields["environment"]}, STEPS)
 
 
 def _unchecked(fields: dict[FieldName, torch.Tensor]) -> dict[FieldName, bytes]:

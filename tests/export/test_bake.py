@@ -10,9 +10,10 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.errors import StreamError
 from structgstream.export.bake import Baking, baked, blend_weights, matrix_quaternions
-from structgstream.export.baked import MAX_DEGREE, BakedGaussians, sh_basis
+from structgstream.export.baked import BakedGaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
+from structgstream.scene.harmonics import MAX_DEGREE, sh_basis
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.scene import Scene
 from structgstream.similarity import Similarity

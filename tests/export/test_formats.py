@@ -19,7 +19,7 @@ from torch import Tensor
 from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.errors import ConfigError, StorageError
-from structgstream.export.baked import Y0, BakedGaussians
+from structgstream.export.baked import BakedGaussians
 from structgstream.export.formats import FORMATS, Format
 from structgstream.export.ply import ply_bytes
 from structgstream.export.splat import splat_bytes
@@ -27,6 +27,7 @@ from structgstream.export.spz import fractional_bits, spz_bytes
 from structgstream.export.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
+from structgstream.scene.harmonics import Y0
 from structgstream.scene.render import render
 
 RIG = arc_rig(4, width=64, height=48)

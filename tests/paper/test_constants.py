@@ -22,6 +22,8 @@ def test_frame_0(name: str) -> None:
     assert initial.growth.start == 1500
     assert initial.distance_input
     assert not initial.camera_color
+    assert not initial.random_background
+    assert not PRESETS[name].environment.enabled
     assert initial.coarse_iterations == 0
 
 

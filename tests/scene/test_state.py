@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import torch
 
 from rigs import random_scene
@@ -32,8 +34,8 @@ def test_size_of_the_covariance_mlp() -> None:
     assert state["free"].shape == (3, FREE_COLUMNS)
 
 
-def test_appearance_is_in_the_state_of_scenes_that_have_one() -> None:
-    scene = with_appearance(random_scene(free=4), 3)
+def test_appearance_and_environment_are_in_the_state_of_scenes_that_have_them() -> None:
+    scene = replace(with_appearance(random_scene(free=4), 3), environment=torch.rand(9, 3))
     state = state_of(scene)
     assert set(state) == {f.name for f in STATE_TABLE}
     assert state["appearance"].shape == (len(scene.anchors), 3)

@@ -61,6 +61,7 @@ COMPACT_INIT_STEPS: dict[FieldName, float] = {
     "covariance_mlp": float(np.float32(0.003)),
     "appearance": 1 / 8,
     "appearance_basis": float(np.float32(0.001)),
+    "environment": float(np.float32(0.004)),
 }
 COLUMNS = {"free_means": 3, "free_log_scales": 3, "free_quats": 4, "free_logit_opacities": 1, "free_colors": 3}
 
@@ -153,6 +154,7 @@ def compact_scene(frame: int) -> Scene:
         "camera_color": numbers(2, 6, salt=11),
         "appearance": valued(whole(COMPACT_ANCHORS, 3, salt=12, most=1) * powers, init_steps["appearance"]),
         "appearance_basis": valued(whole(3, FEATURES, salt=13, most=300), init_steps["appearance_basis"]),
+        "environment": valued(whole(4, 3, salt=14, most=250), init_steps["environment"]),
     }
     return scene_of(state, distance_input=True)
 

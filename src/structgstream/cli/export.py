@@ -128,7 +128,7 @@ def checked_degree(degree: int | None, format: Format) -> int | None:
     Raises:
         UsageError: there is no such degree, or the format cannot hold it.
     """
-    from structgstream.export.baked import MAX_DEGREE
+    from structgstream.scene.harmonics import MAX_DEGREE
 
     if degree is not None and not 0 <= degree <= MAX_DEGREE:
         raise UsageError(f"--sh-degree {degree} is not one of 0 to {MAX_DEGREE}.")

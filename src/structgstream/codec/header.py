@@ -111,7 +111,7 @@ def field_bytes_of(payload: bytes) -> dict[FieldName, int]:
 
 
 def _complete(names: Set[FieldName]) -> bool:
-    optional = names - REQUIRED
+    optional = names - REQUIRED - {"environment"}
     return names >= REQUIRED and (not optional or optional == {"appearance", "appearance_basis"})
 
 

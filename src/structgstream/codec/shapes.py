@@ -23,8 +23,11 @@ SHAPES: Mapping[FieldName, tuple[str | int, ...]] = {
     "camera_color": ("V", 6),
     "appearance": ("M", "R"),
     "appearance_basis": ("R", "D"),
+    "environment": ("E", 3),
 }
 """A number is a size itself; a letter is the same size wherever it stands."""
+ENVIRONMENT_ROWS = (1, 4, 9)
+"""Spherical harmonics up to degree 0, 1 and 2."""
 
 
 def check_shapes(
@@ -38,6 +41,8 @@ def check_shapes(
     sizes: dict[str, int] = {"V": training_cameras}
     for name, value in fields.items():
         _match(name, value, sizes, where)
+    if sizes.get("E", 1) not in ENVIRONMENT_ROWS:
+        raise StreamError(f"{where} has an environment of {sizes['E']} rows; expected 1, 4 or 9.")
     if not {"K", "D"} <= set(sizes):
         return
     if sizes["K"] < 1 or sizes["D"] < 1:

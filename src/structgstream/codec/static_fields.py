@@ -143,7 +143,7 @@ def _coded(
 
 
 def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
-    """Rows of three an offset, and of the features' width in the basis."""
+    """Rows of three an offset and a coefficient of the environment, and of the features' width in the basis."""
     shapes: dict[FieldName, tuple[int, int, int] | tuple[int, int]] = {}
     if (offsets := found.get("anchor_offsets")) is not None:
         shapes["anchor_offsets"] = (len(offsets), offsets.shape[1] // 3, 3)
@@ -152,6 +152,8 @@ def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
         if features is None or appearance is None:
             raise StreamError(f"{_WHERE} holds directions of an appearance without the appearance.")
         shapes["appearance_basis"] = (appearance.shape[1], features.shape[1])
+    if (coefficients := found.get("environment")) is not None:
+        shapes["environment"] = (coefficients.size // 3, 3)
     for name, shape in shapes.items():
         if found[name].size != math.prod(shape):
             raise StreamError(f"{_WHERE} holds {found[name].size} numbers of {name}, which do not fit {shape}.")

@@ -19,10 +19,11 @@ from torch import Tensor
 
 from structgstream.cameras import Camera
 from structgstream.errors import StreamError
-from structgstream.export.baked import BakedGaussians, sh_basis
+from structgstream.export.baked import BakedGaussians
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import Backend
+from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 

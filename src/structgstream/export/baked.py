@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plain Gaussians, as files of 3D Gaussian splatting hold them: one shape, one opacity, colours by direction.
 
-Note [Spherical harmonics]
-~~~~~~~~~~~~~~~~~~~~~~~~~~
-A colour is ``0.5 + sum Y_i c_i``, from below cut off at 0. ``Y`` are the real spherical harmonics with the
-Condon-Shortley phase of the unit direction from the camera to the Gaussian's mean, order by order, each from ``-m`` to
-``m``: what 3D Gaussian splatting (Kerbl et al. 2023) writes to its files and every viewer of them evaluates.
+Colours are those of ``scene/harmonics.py``, Note [Spherical harmonics], from below cut off at 0.
 """
 
 import math
@@ -17,23 +13,8 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from structgstream.scene.harmonics import sh_basis
 from structgstream.similarity import Similarity
-
-Y0 = 0.5 / math.sqrt(math.pi)
-MAX_DEGREE = 2
-
-
-def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Real spherical harmonics ``[N, (degree + 1)^2]`` of unit ``directions`` ``[N, 3]`` up to ``degree`` <= 2."""
-    x, y, z = directions.unbind(1)
-    found = [torch.full_like(x, Y0)]
-    if degree >= 1:
-        a = math.sqrt(3.0 / (4.0 * math.pi))
-        found += [-a * y, a * z, -a * x]
-    if degree >= 2:
-        a, b = math.sqrt(15.0 / (4.0 * math.pi)), math.sqrt(5.0 / (16.0 * math.pi))
-        found += [a * x * y, -a * y * z, b * (3.0 * z * z - 1.0), -a * x * z, 0.5 * a * (x * x - y * y)]
-    return torch.stack(found, dim=1)
 
 
 @dataclass(frozen=True)
@@ -45,7 +26,7 @@ class BakedGaussians:
         quats: ``[N, 4]`` wxyz, unit length, ``w`` not negative.
         scales: ``[N, 3]`` standard deviations, in the unit of ``means``.
         opacities: ``[N]`` in (0, 1).
-        sh: ``[N, (degree + 1)^2, 3]`` sRGB coefficients (Note [Spherical harmonics]).
+        sh: ``[N, (degree + 1)^2, 3]`` sRGB coefficients (``scene/harmonics.py``).
     """
 
     means: Tensor

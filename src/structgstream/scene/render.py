@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene and a camera give a picture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -10,7 +10,9 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
+from structgstream.scene.environment import in_environment
 from structgstream.scene.focus import Focus
+from structgstream.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ def draw(
     *,
     track_screen: bool = False,
     focus: Focus | None = None,
+    background: Tensor | None = None,
 ) -> Rendering:
     """Rasterise a set of Gaussians.
 
@@ -50,6 +53,7 @@ def draw(
         track_screen: keep the view-space positional gradient (see :class:`Rendering`).
         focus: draw only its tiles, onto its picture and among its still Gaussians; the rendering tells of
             ``gaussians`` alone.
+        background: ``[3]`` what is behind them; None for black.
     """
     means, count = gaussians.means, len(gaussians)
     offsets = torch.zeros_like(means[:, :2], requires_grad=True) if track_screen else None
@@ -68,6 +72,7 @@ def draw(
         width=camera.width,
         height=camera.height,
         near=camera.near,
+        background=background,
         screen_offsets=drawn_offsets,
         tiles=None if focus is None else focus.tiles,
         onto=None if focus is None else focus.picture,
@@ -83,6 +88,12 @@ class Drawable(Protocol):
 
 
 def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
-    """Draw ``scene`` as ``camera`` (in the scene's units) sees it, with the mean colour correction: the identity."""
+    """Draw ``scene`` as ``camera`` (in the scene's units) sees it, with the mean colour correction: the identity.
+
+    It is before its environment, if it has one.
+    """
     with torch.no_grad():
-        return draw(scene.gaussians(camera, backend), camera, backend)
+        rendering = draw(scene.gaussians(camera, backend), camera, backend)
+        if not isinstance(scene, Scene) or scene.environment is None:
+            return rendering
+        return replace(rendering, image=in_environment(rendering.image, rendering.alpha, camera, scene.environment))

@@ -12,6 +12,7 @@ from structgstream.kernels.anchor_types import MLPWeights, StructuredGaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
+from structgstream.scene.environment import background
 from structgstream.scene.free import FreeGaussians
 
 
@@ -26,6 +27,7 @@ class Scene:
         camera_color: one row for each training camera of the rig, in rig order.
         appearance_basis: ``[R, D]`` directions in which the anchors' features may change after frame 0.
         distance_input: whether the MLPs see the distance to the camera (the paper: yes; Scaffold-GS: no).
+        environment: ``[(degree + 1)^2, 3]`` what is behind everything (``scene/environment.py``); None for black.
     """
 
     anchors: AnchorCloud
@@ -34,6 +36,7 @@ class Scene:
     camera_color: CameraColor
     appearance_basis: Tensor
     distance_input: bool = True
+    environment: Tensor | None = None
 
     @property
     def features(self) -> Tensor:
@@ -54,6 +57,10 @@ class Scene:
             anchors=replace(anchors, features=self.features, appearance=none),
             appearance_basis=self.appearance_basis[:0],
         )
+
+    def background(self, camera: Camera) -> Tensor | None:
+        """The colour ``[3]`` of the environment where ``camera`` looks; None for black."""
+        return background(self.environment, camera)
 
     def structured(
         self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None

@@ -35,6 +35,7 @@ FieldName = Literal[
     "camera_color",
     "appearance",
     "appearance_basis",
+    "environment",
 ]
 
 
@@ -71,6 +72,7 @@ STATE_TABLE: tuple[StateField, ...] = (
     StateField("camera_color", 11, "-", False),
     StateField("appearance", 12, "-", False, optional=True),
     StateField("appearance_basis", 13, "-", False, optional=True),
+    StateField("environment", 14, "-", False, optional=True),
 )
 
 REQUIRED: frozenset[FieldName] = frozenset(f.name for f in STATE_TABLE if not f.optional)
@@ -91,7 +93,7 @@ def unflatten_head(vector: Tensor, inputs: int, outputs: int, hidden: int) -> He
 
 
 def state_of(scene: Scene) -> dict[FieldName, Tensor]:
-    """The scene as named tensors, one for each row of the table; without appearance when it has none."""
+    """The scene as named tensors, one for each row of the table that it has."""
     anchors, free, color = scene.anchors, scene.free, scene.camera_color
     state: dict[FieldName, Tensor] = {
         "anchor_positions": anchors.positions,
@@ -108,6 +110,8 @@ def state_of(scene: Scene) -> dict[FieldName, Tensor]:
     }
     if len(scene.appearance_basis):
         state |= {"appearance": anchors.appearance, "appearance_basis": scene.appearance_basis}
+    if scene.environment is not None:
+        state["environment"] = scene.environment
     return state
 
 
@@ -139,6 +143,7 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
         camera_color=CameraColor(gains, biases),
         appearance_basis=state.get("appearance_basis", features[:0]),
         distance_input=distance_input,
+        environment=state.get("environment"),
     )
 
 

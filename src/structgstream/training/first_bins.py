@@ -66,7 +66,8 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
         open_scene = scene_of(state, distance_input=scene.distance_input)
         structured, visible = open_scene.structured(rig[name], backend)
         used[visible] |= structured.raw_opacities > 0
-        image = draw(open_scene.dressed(structured), rig[name], backend).image
+        behind = open_scene.background(rig[name])
+        image = draw(open_scene.dressed(structured), rig[name], backend, background=behind).image
         count += image.numel()
         if not image.requires_grad:  # It shows nothing.
             continue

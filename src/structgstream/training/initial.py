@@ -61,6 +61,9 @@ class InitialConfig:
     coarse_scale: float = 0.5
     schedule_iterations: int = 30_000
     """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
+    random_background: bool = False
+    """Whether every iteration has a background of another colour (``training/environment.py``, Note [Honest coverage];
+    paper: black)."""
     disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
@@ -151,6 +154,7 @@ def fit_first_frame(
             track_screen=collects,
             watch=watch,
             disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
+            background=torch.rand(3, generator=generator).to(backend.device) if config.random_background else None,
         )
         gradients, screen_gradient = gradients_of(loss, parameters, watch)
         if iteration > config.iterations - len(views):

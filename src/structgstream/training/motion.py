@@ -203,7 +203,7 @@ def _look(
     difference = float(part.mean())
     wrong_share = 0.0
     if floor is not None and config.residual_threshold > 0.0:
-        missing = residual_of(gaussians, small, scene.camera_color, backend)
+        missing = residual_of(gaussians, small, scene, backend)
         wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
         wrong_share = float(wrong.mean())
         part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))

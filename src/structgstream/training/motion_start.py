@@ -126,9 +126,9 @@ def corrected(
             focus, small = focuses[view.index], view.reduced(scale)
             gaussians = baked.gaussians(view.camera, backend)
             onto = replace(focus, picture=focus.picture.clone())
-            image = as_recorded(
-                draw(gaussians, view.camera, backend, focus=onto).image, moving.camera_color, view.index
-            )
+            behind = moving.background(view.camera)
+            drawn = draw(gaussians, view.camera, backend, focus=onto, background=behind)
+            image = as_recorded(drawn.image, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
             inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)
             # Outside the tiles nothing was drawn: there the picture takes the place of the rendering.

@@ -89,7 +89,8 @@ def _focus(
     at_rest = still.dressed(structured)
     nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
-    rendering = draw(concatenate(in_motion, at_rest), camera, backend, focus=Focus(ring, empty, nothing))
+    drawn, behind = concatenate(in_motion, at_rest), still.background(camera)
+    rendering = draw(drawn, camera, backend, focus=Focus(ring, empty, nothing), background=behind)
     # Anchors were culled as a whole; what reaches no tile is not looked at again.
     return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
 

@@ -115,7 +115,8 @@ def _missing(
         focus = places.get(view.index)
         if focus is not None:
             onto = replace(focus, picture=focus.picture.clone())
-            drawn = draw(moving.gaussians(view.camera, backend), view.camera, backend, focus=onto)
+            gaussians, behind = moving.gaussians(view.camera, backend), moving.background(view.camera)
+            drawn = draw(gaussians, view.camera, backend, focus=onto, background=behind)
             inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)[..., None]
             picture = torch.where(inside, as_recorded(drawn.image, moving.camera_color, view.index), picture)
         found.append(missing_in(picture.clamp(0.0, 1.0), view, floor=floor, config=config))

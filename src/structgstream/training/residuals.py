@@ -52,9 +52,10 @@ def residual(picture: Tensor, image: Tensor) -> Tensor:
     return box_mean((picture - image.to(picture) / 255.0).abs().mean(-1), SMOOTHED_PIXELS)
 
 
-def residual_of(gaussians: Gaussians, view: View, color: CameraColor, backend: Backend) -> Tensor:
-    """The :func:`residual` of drawing ``gaussians`` for ``view``."""
-    return residual(as_recorded(draw(gaussians, view.camera, backend).image, color, view.index), view.image)
+def residual_of(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
+    """The :func:`residual` of drawing ``gaussians``, those of ``scene``, for ``view``."""
+    rendering = draw(gaussians, view.camera, backend, background=scene.background(view.camera))
+    return residual(as_recorded(rendering.image, scene.camera_color, view.index), view.image)
 
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
@@ -64,6 +65,6 @@ def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend
     with torch.no_grad():
         for view in views:
             small = view.reduced(scale)
-            found = residual_of(scene.gaussians(small.camera, backend), small, scene.camera_color, backend)
+            found = residual_of(scene.gaussians(small.camera, backend), small, scene, backend)
             maps[view.index] = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
     return ResidualFloor(scale, maps)

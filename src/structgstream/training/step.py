@@ -60,17 +60,19 @@ def view_loss(
     watch: Stopwatch,
     focus: Focus | None = None,
     disturbed: Callable[[Gaussians], Gaussians] | None = None,
+    background: Tensor | None = None,
 ) -> ViewLoss:
     """Render ``view`` and compare it with its picture (paper, equations for L and L_init), or what ``focus`` names.
 
-    What is drawn is ``disturbed``, if that is given.
+    What is drawn is ``disturbed``, if that is given, before ``background`` ``[3]`` instead of the scene's environment.
     """
     with watch.stage("generate"):
         structured, visible = scene.structured(view.camera, backend, tiles=None if focus is None else focus.tiles)
         gaussians = scene.dressed(structured)
         gaussians = gaussians if disturbed is None else disturbed(gaussians)
     with watch.stage("rasterise"):
-        rendering = draw(gaussians, view.camera, backend, track_screen=track_screen, focus=focus)
+        behind = scene.background(view.camera) if background is None else background
+        rendering = draw(gaussians, view.camera, backend, track_screen=track_screen, focus=focus, background=behind)
     with watch.stage("loss"):
         image, tiles = rendering.image, None if focus is None else focus.tiles
         gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]

@@ -20,6 +20,7 @@ const FIELD_TABLE = [
   ["camera_color", ["V", 6]],
   ["appearance", ["M", "R"]],
   ["appearance_basis", ["R", "D"]],
+  ["environment", ["E", 3]],
 ] as const;
 
 export type FieldName = (typeof FIELD_TABLE)[number][0];
@@ -27,13 +28,16 @@ export type FieldName = (typeof FIELD_TABLE)[number][0];
 /** Every field, in the order of their codes. */
 export const FIELD_NAMES: readonly FieldName[] = FIELD_TABLE.map(([name]) => name);
 
-/** Fields that a scene may do without; it has both or neither. */
-const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis"];
+/** Fields that a scene may do without: of the first two it has both or neither. */
+const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
+
+/** Rows of an environment: spherical harmonics up to degree 0, 1 and 2. */
+const ENVIRONMENT_ROWS: readonly number[] = [1, 4, 9];
 
 /** Whether these are the fields of a scene. */
 export function isScene(names: ReadonlySet<FieldName>): boolean {
-  const optional = OPTIONAL.filter((name) => names.has(name)).length;
-  return FIELD_NAMES.every((name) => names.has(name) || OPTIONAL.includes(name)) && optional !== 1;
+  const whole = FIELD_NAMES.every((name) => names.has(name) || OPTIONAL.includes(name));
+  return whole && names.has("appearance") === names.has("appearance_basis");
 }
 
 /** Numbers of a field, the last dimension fastest; identities are 64-bit integers. */
@@ -78,6 +82,10 @@ export function checkShapes(fields: Fields, facts: ShapeFacts, where: string): v
   for (const [name, expected] of FIELD_TABLE) {
     const value = fields.get(name);
     if (value !== undefined) matchShape(name, value, expected, sizes, where);
+  }
+  const rows = sizes.get("E");
+  if (rows !== undefined && !ENVIRONMENT_ROWS.includes(rows)) {
+    throw new StreamError(`${where} has an environment of ${rows} rows; expected 1, 4 or 9.`);
   }
   const k = sizes.get("K");
   const features = sizes.get("D");

@@ -95,6 +95,9 @@ function decodedBins(
       }
       shape = [appearance.shape[1]!, features.shape[1]!];
       if (bins.length !== shape[0]! * shape[1]!) throw wrongCount(name, bins.length);
+    } else if (name === "environment") {
+      if (bins.length % 3) throw wrongCount(name, bins.length);
+      shape = [bins.length / 3, 3];
     }
     found.set(name, { shape, bins });
   }

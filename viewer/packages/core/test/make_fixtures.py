@@ -63,6 +63,7 @@ def first_state(
     }
     if directions:
         state |= {"appearance": torch.zeros(anchors, directions), "appearance_basis": numbers(directions, features)}
+        state["environment"] = numbers(9, 3) / 4
     return state
 
 

@@ -3,7 +3,7 @@
 
 import { describe, expect, test } from "vitest";
 import { blocksIn } from "../src/blocks.ts";
-import type { FieldName } from "../src/fields.ts";
+import { checkShapes, type FieldName } from "../src/fields.ts";
 import { viewOf } from "../src/records.ts";
 import { decodedFields, MOST_ANCHORS } from "../src/staticFields.ts";
 import { bytesOf, FIXTURES, joined, piecesOf } from "./streams.ts";
@@ -33,6 +33,7 @@ describe.each<[FieldName, number, string]>([
   ["appearance", 256, "columns of appearance"],
   ["color_mlp", 2 ** 20, "numbers of color_mlp"],
   ["appearance_basis", 2 ** 20, "numbers of appearance_basis"],
+  ["environment", 2 ** 20, "numbers of environment"],
 ])("of %s", (name, most, what) => {
   // Counts below 128 are one byte, those here may take more; the first byte is what the fixture has.
   const rest = coded.get(name)!.subarray(1);
@@ -63,6 +64,15 @@ test("fields that need others", () => {
   expect(() => decodedFields(without("appearance"), steps)).toThrow("directions of an appearance without");
   expect(() => decodedFields(new Map(coded).set("camera_color", varint(1)), steps)).toThrow("it has no coding");
   expect(() => decodedFields(coded, new Map())).toThrow("states no step for");
+});
+
+test("an environment has rows of three, one for each harmonic up to degree 0, 1 or 2", () => {
+  const shapes = (rows: number) => () =>
+    checkShapes(new Map([["environment", { shape: [rows, 3], data: new Float32Array(3 * rows) }]]), facts, "It");
+  const facts = { distanceInput: true, trainingCameras: 2 };
+  for (const rows of [1, 4, 9]) expect(shapes(rows)).not.toThrow();
+  for (const rows of [0, 2, 16])
+    expect(shapes(rows)).toThrow(`It has an environment of ${rows} rows; expected 1, 4 or 9.`);
 });
 
 test("few bytes do not make many numbers", () => {

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is behind a scene, where no camera saw anything: a smooth colour by direction."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.scene.harmonics import sh_basis
+
+_INVISIBLE = 1.0 / 512.0
+"""What this share of a background changes is less than half a step of 8 bits."""
+
+
+def environment(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """sRGB ``[..., 3]`` seen in unit ``directions`` ``[..., 3]`` of the scene: ``0.5 + sum Y_i c_i``, within 0 and 1.
+
+    Args:
+        coefficients: ``[(degree + 1)^2, 3]`` (``scene/harmonics.py``, Note [Spherical harmonics]).
+        directions: away from the camera.
+    """
+    degree = math.isqrt(len(coefficients)) - 1
+    return (0.5 + sh_basis(directions, degree) @ coefficients).clamp(0.0, 1.0)
+
+
+def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
+    """One colour ``[3]`` for a whole picture, the environment where ``camera`` looks; None without one.
+
+    What a trainer draws on: a rasteriser has it for nothing, and where surfaces leave a percent of it, it is as good.
+    """
+    if coefficients is None:
+        return None
+    return environment(coefficients, camera.beside(coefficients).viewmat[2, :3])
+
+
+def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
+    """Unit directions ``[N, 3]`` of the centres of ``pixels`` ``[N]``, counted row by row, in the axes of the scene.
+
+    A similarity does not rotate: they are the same in units of the capture and of the scene.
+    """
+    viewmat, K, _ = camera.beside(torch.zeros(0, dtype=torch.float64, device=pixels.device))
+    y = torch.div(pixels, camera.width, rounding_mode="floor")
+    centers = torch.stack([pixels - y * camera.width + 0.5, y + 0.5, torch.ones_like(y)], dim=1)
+    rays = centers @ (torch.linalg.inv(K).T @ viewmat[:3, :3]).to(centers)
+    return rays * rays.square().sum(1, keepdim=True).rsqrt()
+
+
+def in_environment(image: Tensor, alpha: Tensor, camera: Camera, coefficients: Tensor) -> Tensor:
+    """``image`` ``[H, W, 3]``, drawn on black with coverage ``alpha`` ``[H, W]``, before the environment."""
+    rest = 1.0 - alpha.reshape(-1)
+    pixels = (rest > _INVISIBLE).nonzero()[:, 0]
+    behind = environment(coefficients.to(image), pixel_directions(camera, pixels).to(image))
+    return image.reshape(-1, 3).index_add(0, pixels, rest[pixels, None] * behind).reshape(image.shape)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colours by direction: real spherical harmonics of low degree.
+
+Note [Spherical harmonics]
+~~~~~~~~~~~~~~~~~~~~~~~~~~
+A colour is ``0.5 + sum Y_i c_i``. ``Y`` are the real spherical harmonics with the Condon-Shortley phase of a unit
+direction away from the camera, order by order, each from ``-m`` to ``m``: what 3D Gaussian splatting (Kerbl et al.
+2023) writes to its files and every viewer of them evaluates. Their factors are those that make the integral of every
+``Y_i^2`` over the sphere one.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+Y0 = 0.5 / math.sqrt(math.pi)
+MAX_DEGREE = 2
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Real spherical harmonics ``[..., (degree + 1)^2]`` of unit ``directions`` ``[..., 3]`` up to ``degree`` <= 2."""
+    x, y, z = directions.unbind(-1)
+    found = [torch.full_like(x, Y0)]
+    if degree >= 1:
+        a = math.sqrt(3.0 / (4.0 * math.pi))
+        found += [-a * y, a * z, -a * x]
+    if degree >= 2:
+        a, b = math.sqrt(15.0 / (4.0 * math.pi)), math.sqrt(5.0 / (16.0 * math.pi))
+        found += [a * x * y, -a * y * z, b * (3.0 * z * z - 1.0), -a * x * z, 0.5 * a * (x * x - y * y)]
+    return torch.stack(found, dim=-1)

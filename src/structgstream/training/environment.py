@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The environment of a scene (``scene/environment.py``) from the training pictures of frame 0, in closed form.
+
+Note [Honest coverage]
+~~~~~~~~~~~~~~~~~~~~~~
+Before a black background, what is dark is drawn by leaving it out: coverage then does not tell what no camera saw from
+what was dark there, and an environment would shine through dark doors and hair. With a background of another colour in
+every iteration (``InitialConfig.random_background``) only what covers can show a colour, so what is left open is what
+nobody saw.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.backend import Backend
+from structgstream.scene.environment import pixel_directions
+from structgstream.scene.harmonics import sh_basis
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+from structgstream.training.views import View
+
+_STRIDE = 4  # pixels: what is fitted has a few coefficients
+_LEAST_GAIN = 0.1
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """What is drawn behind the scene; it needs honest coverage (Note [Honest coverage])."""
+
+    enabled: bool = False
+    """Whether there is one (paper: no, black)."""
+    degree: int = 2
+    """Of the spherical harmonics, 0 to 2."""
+    smoothness: float = 1e-3
+    """Ridge: of a coefficient of degree l it is l (l + 1) times that of all pixels' mean weight."""
+    least_weight: float = 1e-2
+    """Of a pixel that is covered. Others weigh as much more as they are open: what is there continues nearby."""
+    step: float = 1 / 256
+    """What the coefficients are whole multiples of, in streams with the codec ``compact``."""
+
+
+def fitted_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
+    """Coefficients ``[(degree + 1)^2, 3]`` of the colours in the pictures' directions, by least squares.
+
+    Args:
+        scene: frame 0; its coverage tells where pixels weigh, its colour correction what the mean camera would show.
+        views: the training pictures.
+        config: of the fit.
+        backend: what computes.
+    """
+    count = (config.degree + 1) ** 2
+    products = torch.zeros(count, count, dtype=torch.float64)
+    targets = torch.zeros(count, 3, dtype=torch.float64)
+    total, color = 0.0, scene.camera_color
+    for view in views:
+        with torch.no_grad():
+            alpha = draw(scene.gaussians(view.camera, backend), view.camera, backend).alpha
+        rows, columns = (torch.arange(0, size, _STRIDE, device=alpha.device) for size in alpha.shape)
+        pixels = (rows[:, None] * alpha.shape[1] + columns).reshape(-1)
+        gains, biases = (value[view.index].cpu().double() for value in (color.gains, color.biases))
+        colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
+        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.least_weight
+        basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.degree)
+        products += (basis * weights[:, None]).T @ basis
+        targets += (basis * weights[:, None]).T @ (colors - 0.5)
+        total += float(weights.sum())
+    degrees = torch.tensor([degree for degree in range(config.degree + 1) for _ in range(2 * degree + 1)])
+    ridge = config.smoothness * total / (4.0 * torch.pi) * (degrees * (degrees + 1)).double()
+    found = torch.linalg.solve(products + ridge.diag(), targets)
+    return found.to(scene.anchors.positions)

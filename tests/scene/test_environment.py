@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is behind a scene."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rigs import arc_rig, random_scene
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.environment import background, environment, pixel_directions
+from structgstream.scene.harmonics import sh_basis
+from structgstream.scene.render import draw, render
+
+BACKEND, CAMERA = reference_backend(), arc_rig()["cam01"]
+
+
+def sphere(count: int = 40_000) -> torch.Tensor:
+    """Directions that cover the sphere evenly (Fibonacci's lattice)."""
+    z = 1.0 - (2.0 * torch.arange(count, dtype=torch.float64) + 1.0) / count
+    angle = torch.pi * (3.0 - 5.0**0.5) * torch.arange(count, dtype=torch.float64)
+    ring = (1.0 - z * z).sqrt()
+    return torch.stack([ring * angle.cos(), ring * angle.sin(), z], dim=1)
+
+
+def test_the_harmonics_are_orthonormal() -> None:
+    basis = sh_basis(sphere(), 2)
+    products = basis.T @ basis * (4.0 * torch.pi / len(basis))
+    torch.testing.assert_close(products, torch.eye(9, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("rows", [1, 4, 9])
+def test_colours_are_within_bounds_and_constant_without_coefficients(rows: int) -> None:
+    directions = sphere(50)
+    none = torch.zeros(rows, 3, dtype=torch.float64)
+    assert torch.equal(environment(none, directions), torch.full((50, 3), 0.5, dtype=torch.float64))
+    colors = environment(none + 9.0, directions)
+    assert 0.0 <= colors.min() <= colors.max() == 1.0
+
+
+def test_directions_are_those_of_what_a_pixel_shows() -> None:
+    pixels = torch.tensor([[0, 0], [31, 47], [16, 24]])  # rows and columns
+    points = CAMERA.center + 3.0 * pixel_directions(CAMERA, pixels @ torch.tensor([48, 1]))
+    seen = points @ CAMERA.viewmat[:3, :3].T + CAMERA.viewmat[:3, 3]
+    shown = (seen @ CAMERA.K.T)[:, :2] / seen[:, 2:]
+    torch.testing.assert_close(shown, pixels.flip(1).double() + 0.5, atol=1e-4, rtol=0)
+
+
+def test_it_is_seen_through_what_coverage_leaves() -> None:
+    scene, coefficients = random_scene(free=2), torch.randn(9, 3, generator=torch.Generator().manual_seed(0)) / 4
+    black, behind = render(scene, CAMERA, BACKEND), render(replace(scene, environment=coefficients), CAMERA, BACKEND)
+    pixels = torch.arange(32 * 48)
+    colors = environment(coefficients, pixel_directions(CAMERA, pixels)).reshape(32, 48, 3)
+    expected = black.image + (1.0 - black.alpha[..., None]) * colors
+    torch.testing.assert_close(behind.image, expected, atol=0.5 / 255, rtol=0)
+    assert torch.equal(behind.alpha, black.alpha)
+    assert (behind.image - black.image).max() > 0.2
+
+
+def test_a_smooth_one_is_nearly_one_colour_for_a_picture() -> None:
+    """What a trainer draws on (``background``) is what a viewer sees, where coverage leaves a few percent."""
+    scene = replace(random_scene(free=2), environment=torch.tensor([[0.2] * 3, [0.1] * 3, [-0.1] * 3, [0.05] * 3]))
+    color = scene.background(CAMERA)
+    assert color is not None
+    trained = draw(scene.gaussians(CAMERA, BACKEND), CAMERA, BACKEND, background=color)
+    covered = trained.alpha > 0.9
+    assert covered.any()
+    shown = render(scene, CAMERA, BACKEND).image
+    torch.testing.assert_close(trained.image[covered], shown[covered], atol=1 / 255, rtol=0)
+    assert background(None, CAMERA) is None
