@@ -14,7 +14,7 @@ CONFIG = GrowthConfig(collect_from=0, start=0, interval=5, eligible_count=0, pru
 def prepared():
     scene = random_scene(30)
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
-    densifier = Densifier.of(scene, config=CONFIG, voxel_size=0.01)
+    densifier = Densifier.of(scene, config=CONFIG, iterations=1000, voxel_size=0.01)
     adam = Adam(reference_backend())
     gradients: dict[ParameterName, torch.Tensor] = {
         name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS
@@ -26,9 +26,21 @@ def prepared():
 def test_schedule() -> None:
     densifier = prepared()[2]
     assert [i for i in range(12) if densifier.due(i)] == [5, 10]
-    late = Densifier.of(random_scene(3), config=GrowthConfig(start=5, stop=9, interval=3), voxel_size=0.01)
+    late = scheduled(GrowthConfig(start=5, stop=9, interval=3), iterations=20)
     assert [i for i in range(20) if late.due(i)] == [6, 9]
     assert not late.collects(500)
+
+
+def scheduled(config: GrowthConfig, *, iterations: int) -> Densifier:
+    return Densifier.of(random_scene(3), config=config, iterations=iterations, voxel_size=0.01)
+
+
+def test_nothing_grows_that_is_not_fitted() -> None:
+    paper = scheduled(GrowthConfig(), iterations=4000)
+    due = [i for i in range(4001) if paper.due(i)]
+    assert (due[0], due[-1], len(due)) == (1600, 3900, 24)
+    assert paper.collects(3900)
+    assert not paper.collects(3901)  # Nobody would ask.
 
 
 def test_every_table_keeps_its_rows_in_step() -> None:
@@ -40,6 +52,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
     grown, pruned = densifier.apply(scene, parameters, adam, torch.Generator().manual_seed(0))
     assert pruned == 4
     assert grown > 0
+    assert (densifier.grown, densifier.pruned) == (grown, pruned)
     rows = 30 - 4 + grown
     for name in ANCHOR_ROWS:
         assert parameters.values[name].shape[0] == rows

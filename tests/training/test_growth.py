@@ -75,6 +75,28 @@ def test_the_cap_holds() -> None:
     assert len(grown(anchors, torch.ones(n), torch.full((n,), 100.0), config=config)) == 3
 
 
+def test_the_cap_keeps_the_strongest_wherever_they_lie() -> None:
+    anchors = random_scene(60).anchors
+    n = slots(anchors)
+    gradient = torch.linspace(1.0, 3.0, n)  # The last anchors pull most, and no order of cells follows from it.
+    count = torch.full((n,), 100.0)
+    every = grown(anchors, gradient, count)
+    few = grown(anchors, gradient, count, config=GrowthConfig(max_anchors=60 + 7))
+    assert len(few) == 7 < len(every)
+    assert few.strengths.min() >= every.strengths.sort(descending=True).values[6]
+    left = every.strengths.sort(descending=True).values[7:]
+    assert few.strengths.min() >= left.max()
+    rows = [int((every.positions == position).all(1).nonzero()[0, 0]) for position in few.positions]
+    assert torch.equal(every.features[rows], few.features)
+    assert len(grown(anchors, gradient, count, config=GrowthConfig(max_anchors=50))) == 0
+
+
+def test_the_last_interval_is_left_to_what_grew_before_it() -> None:
+    assert GrowthConfig().last(4000) == 3900  # The paper ends while Scaffold-GS still grows.
+    assert GrowthConfig().last(30_000) == 15_000
+    assert GrowthConfig(stop=50, interval=20).last(60) == 40
+
+
 def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
     statistics = OpacityStatistics(3, torch.device("cpu"))
     none = torch.zeros(0)

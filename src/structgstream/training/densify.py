@@ -21,26 +21,29 @@ class Densifier:
     """
 
     config: GrowthConfig
+    iterations: int
     voxel_size: float
     offsets_per_anchor: int
     gradients: GradientStatistics
     opacities: OpacityStatistics
+    grown: int = 0
+    pruned: int = 0
 
     @classmethod
-    def of(cls, scene: Scene, *, config: GrowthConfig, voxel_size: float) -> "Densifier":
-        """Empty statistics for ``scene``."""
+    def of(cls, scene: Scene, *, config: GrowthConfig, iterations: int, voxel_size: float) -> "Densifier":
+        """Empty statistics for ``scene``, which is fitted in so many ``iterations``."""
         m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
         device = scene.anchors.positions.device
-        return cls(config, voxel_size, k, GradientStatistics(m * k, device), OpacityStatistics(m, device))
+        return cls(config, iterations, voxel_size, k, GradientStatistics(m * k, device), OpacityStatistics(m, device))
 
     def collects(self, iteration: int) -> bool:
         """Whether statistics are wanted at this iteration."""
-        return self.config.collect_from < iteration <= self.config.stop
+        return self.config.collect_from < iteration <= self.config.last(self.iterations)
 
     def due(self, iteration: int) -> bool:
         """Whether anchors change after this iteration."""
         c = self.config
-        return c.start < iteration <= c.stop and iteration % c.interval == 0
+        return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
 
     def apply(self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator) -> tuple[int, int]:
         """Grow, then prune; returns how many anchors were added and removed."""
@@ -78,4 +81,6 @@ class Densifier:
             more = len(new) * k if statistics is self.gradients else len(new)
             for name, values in vars(statistics).items():
                 setattr(statistics, name, torch.cat([values[rows], values.new_zeros(more)]))
-        return len(new), int(remove.sum())
+        removed = int(remove.sum())
+        self.grown, self.pruned = self.grown + len(new), self.pruned + removed
+        return len(new), removed

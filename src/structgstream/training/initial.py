@@ -131,7 +131,9 @@ def fit_first_frame(
         trained -= {"camera_gains", "camera_biases"}
     parameters = Parameters.of(template, trained=frozenset(trained))
     adam = Adam(backend)
-    densifier = Densifier.of(template, config=config.growth, voxel_size=config.voxel_size)
+    densifier = Densifier.of(
+        template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size
+    )
     extent = rig_extent(rig)
     coarse = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
     order = shuffled_views(coarse, generator)
@@ -170,6 +172,8 @@ def fit_first_frame(
         scene=detached(parameters.scene(template)),
         iterations=config.iterations,
         train_psnr=last_pass.psnr,
+        grown=densifier.grown,
+        removed=densifier.pruned,
         seconds=watch.seconds,
         losses=last_pass.terms,
     )
