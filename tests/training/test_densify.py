@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import torch
 
 from rigs import arc_rig, random_scene
@@ -81,3 +83,20 @@ def test_statistics_follow_renderings() -> None:
     assert densifier.opacities.visits[visible].eq(1.0).all()
     expected = torch.zeros(30).index_add_(0, structured.ids // 5, structured.opacities)
     assert torch.allclose(densifier.opacities.opacity, expected, atol=1e-6)
+
+
+def test_who_hardly_contributes_goes_from_every_table() -> None:
+    _, parameters, densifier, adam = prepared()
+    config = replace(CONFIG, least_contribution=0.2, contribution_at=(7,))
+    densifier = replace(densifier, config=config)
+    assert [i for i in range(20) if densifier.judges(i)] == [7]
+    assert not replace(densifier, config=CONFIG).judges(7)
+    shares = torch.ones(30)
+    shares[:6] = 0.1
+    assert densifier.judge(shares, parameters, adam) == densifier.pruned == 6
+    assert densifier.grown == 0
+    for name in ANCHOR_ROWS:
+        assert len(parameters.values[name]) == len(adam.first[name]) == 24
+        assert parameters.values[name].requires_grad
+    assert densifier.opacities.visits.shape == (24,)
+    assert densifier.gradients.count.shape == (120,)

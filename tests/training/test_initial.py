@@ -9,8 +9,11 @@ from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import state_of
+from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
+from structgstream.training.seeding import voxel_centers
+from structgstream.training.solidity import SolidityConfig
 from worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
@@ -67,6 +70,23 @@ def test_exposures_are_learned_with_their_gauge() -> None:
 def test_small_pictures_first() -> None:
     world = moving_world(1)
     assert fit(world, config=replace(QUICK, coarse_iterations=80)).train_psnr > 15.0
+
+
+def test_solid_surfaces_and_few_anchors() -> None:
+    world = moving_world(1)
+    config = replace(
+        QUICK,
+        disturbance=DisturbanceConfig(view_noise=0.1),
+        solidity=SolidityConfig(weight=0.05),
+        growth=replace(QUICK.growth, least_contribution=0.3, contribution_at=(60,)),
+    )
+    result = fit(world, config=config)
+    assert result.train_psnr > 15.0
+    assert result.removed > 0
+    assert result.losses["depth_spread"] > 0.0
+    assert len(result.scene.anchors) == len(voxel_centers(world.scene.anchors.positions, 0.05)) + (
+        result.grown - result.removed
+    )
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:

@@ -88,9 +88,7 @@ def drawn(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: st
     write_byte_plot(path, rows, parts_of(reader, rows), title=f"{name}: {frames}, {rate(rows, reader.header.fps)}")
 
 
-def described(
-    reader: "StreamReader", rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]
-) -> dict[str, Any]:
+def described(reader: "StreamReader", rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``, ...).
 
     ``changes`` of a packet are the anchors and free Gaussians that came and went, as far as the run's ``log`` says so.

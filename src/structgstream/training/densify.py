@@ -73,14 +73,39 @@ class Densifier:
             "anchor_features": new.features,
             "appearance": new.positions.new_zeros(len(new), 0),
         }
-        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
-        adam.replace_rows(ANCHOR_ROWS, keep=keep, added=len(new))
+        self._replace(parameters, adam, keep=keep, added=added, count=len(new))
         parameters.values["base_scales"].detach().clamp_(max=0.05)
+        return len(new), int(remove.sum())
+
+    def judges(self, iteration: int) -> bool:
+        """Whether contributions decide after this iteration who stays."""
+        return self.config.least_contribution > 0.0 and iteration in self.config.contribution_at
+
+    def judge(self, contributions: Tensor, parameters: Parameters, adam: Adam) -> int:
+        """Remove the anchors whose ``contributions`` ``[M]`` (shares of the mean) are too small; tells how many."""
+        keep = contributions >= self.config.least_contribution
+        added: dict[ParameterName, Tensor] = {
+            name: values.detach()[:0] for name, values in parameters.values.items() if name in ANCHOR_ROWS
+        }
+        self._replace(parameters, adam, keep=keep, added=added, count=0)
+        return int((~keep).sum())
+
+    def _replace(
+        self,
+        parameters: Parameters,
+        adam: Adam,
+        *,
+        keep: Tensor,
+        added: dict[ParameterName, Tensor],
+        count: int,
+    ) -> None:
+        """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor."""
+        k = self.offsets_per_anchor
+        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
+        adam.replace_rows(ANCHOR_ROWS, keep=keep, added=count)
         for statistics in (self.gradients, self.opacities):
             rows = keep.repeat_interleave(k) if statistics is self.gradients else keep
-            more = len(new) * k if statistics is self.gradients else len(new)
+            more = count * k if statistics is self.gradients else count
             for name, values in vars(statistics).items():
                 setattr(statistics, name, torch.cat([values[rows], values.new_zeros(more)]))
-        removed = int(remove.sum())
-        self.grown, self.pruned = self.grown + len(new), self.pruned + removed
-        return len(new), removed
+        self.grown, self.pruned = self.grown + count, self.pruned + int((~keep).sum())

@@ -32,6 +32,11 @@ class GrowthConfig:
     """An anchor is judged once it was visited more often than this."""
     prune_opacity: float = 0.005
     """An anchor goes when its opacity, summed over its Gaussians, averages less than this a visit."""
+    least_contribution: float = 0.0
+    """At ``contribution_at`` an anchor goes that contributes less to the training pictures than this share of what an
+    average anchor does (Scaffold-GS: 0, none)."""
+    contribution_at: tuple[int, ...] = ()
+    """The iterations after which contributions are looked at."""
     max_anchors: int = 1_000_000
     """No anchor is added beyond this number; those with the largest gradients come first."""
 

@@ -9,17 +9,21 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
-from structgstream.training.disturbance import DisturbanceConfig, disturbance_at
+from structgstream.training.disturbance import DisturbanceConfig, disturbance_at, disturbed_center
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, Rate, constant
 from structgstream.training.parameters import ParameterName, Parameters, detached
 from structgstream.training.result import FitResult, Step, StepListener
 from structgstream.training.seeding import seeded_scene
+from structgstream.training.solidity import SolidityConfig
 from structgstream.training.step import LastPass, gradients_of, view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import reduced, shuffled_views, training_views
+
+_JUDGED_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of them will do.
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,7 @@ class InitialConfig:
     schedule_iterations: int = 30_000
     """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
     disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    solidity: SolidityConfig = field(default_factory=SolidityConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
@@ -131,9 +136,7 @@ def fit_first_frame(
         trained -= {"camera_gains", "camera_biases"}
     parameters = Parameters.of(template, trained=frozenset(trained))
     adam = Adam(backend)
-    densifier = Densifier.of(
-        template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size
-    )
+    densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
     extent = rig_extent(rig)
     coarse = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
     order = shuffled_views(coarse, generator)
@@ -153,6 +156,16 @@ def fit_first_frame(
             track_screen=collects,
             watch=watch,
             disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
+            seen_from=disturbed_center(
+                view.camera.beside(scene.anchors.positions).center,
+                extent / 1.1,
+                iteration,
+                config.iterations,
+                config.disturbance,
+                generator,
+            ),
+            spread_weight=config.solidity.weight_at(iteration, config.iterations),
+            spread_scale=config.solidity.scale,
         )
         gradients, screen_gradient = gradients_of(loss, parameters, watch)
         if iteration > config.iterations - len(views):
@@ -165,6 +178,11 @@ def fit_first_frame(
                 densifier.opacities.add(loss.structured, loss.visible)
                 if densifier.due(iteration):
                     densifier.apply(scene, parameters, adam, generator)
+        if densifier.judges(iteration):
+            with watch.stage("densify"), torch.no_grad():
+                cameras = [other.camera for other in views]
+                shares = contributions(parameters.scene(template), cameras, scale=_JUDGED_SCALE, backend=backend)
+                densifier.judge(shares, parameters, adam)
         if on_step is not None:
             anchors = parameters.values["anchor_positions"].shape[0]
             on_step(Step(iteration, config.iterations, float(loss.total.detach()), anchors, 0))
