@@ -51,7 +51,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
     densifier.gradients.count.fill_(1.0)
     densifier.opacities.visits.fill_(1.0)
     densifier.opacities.opacity[:] = torch.where(torch.arange(30) < 4, 0.0, 1.0)
-    grown, pruned = densifier.apply(scene, parameters, adam, torch.Generator().manual_seed(0))
+    grown, pruned = densifier.apply(scene, parameters, adam, torch.Generator().manual_seed(0), iteration=5)
     assert pruned == 4
     assert grown > 0
     assert (densifier.grown, densifier.pruned) == (grown, pruned)
@@ -72,7 +72,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
 def test_base_scales_are_bounded() -> None:
     scene, parameters, densifier, adam = prepared()
     parameters.values["base_scales"].detach().fill_(3.0)
-    densifier.apply(scene, parameters, adam, torch.Generator())
+    densifier.apply(scene, parameters, adam, torch.Generator(), iteration=5)
     assert parameters.values["base_scales"].max() <= 0.05
 
 

@@ -47,6 +47,15 @@ def test_anchors_grow_where_points_are_missing() -> None:
     assert len(result.scene.anchors) > 12
 
 
+def test_coarse_seeds_lie_on_the_fine_grid() -> None:
+    world = moving_world(1)
+    config = replace(QUICK, iterations=20, seed_voxels=3)
+    anchors = fit(world, config=config).scene.anchors
+    assert len(anchors) == len(voxel_centers(world.scene.anchors.positions, 0.15)) < 60
+    cells = anchors.positions / QUICK.voxel_size
+    assert torch.allclose(cells, cells.round(), atol=1e-3)
+
+
 def test_anchors_do_not_move_in_frame_0() -> None:
     world = moving_world(1)
     config = replace(QUICK, iterations=30)

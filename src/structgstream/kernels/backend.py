@@ -35,6 +35,7 @@ class Backend:
         blending_weights: see ``kernels.reference_raster.blending_weights``.
         l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
         volume: ``(scales, opacities) -> (sum, count)``, see ``kernels.reference_volume.volume``.
+        excess: ``(offsets, log_scales, limit) -> sum``, see ``kernels.reference_excess.excess``.
         changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
         visible_anchors: see ``kernels.reference_anchors.visible_anchors``.
         generate_structured: see ``kernels.reference_anchors.generate_structured``.
@@ -47,6 +48,7 @@ class Backend:
     blending_weights: Callable[..., Tensor]
     l1_ssim: Callable[..., tuple[Tensor, Tensor]]
     volume: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    excess: Callable[[Tensor, Tensor, float], Tensor]
     changed_pixels: Callable[..., Tensor]
     visible_anchors: Callable[..., Tensor]
     generate_structured: Callable[..., StructuredGaussians]
@@ -59,6 +61,7 @@ def reference_backend() -> Backend:
         reference_adam,
         reference_anchors,
         reference_change,
+        reference_excess,
         reference_raster,
         reference_ssim,
         reference_volume,
@@ -71,6 +74,7 @@ def reference_backend() -> Backend:
         blending_weights=partial(reference_raster.blending_weights, reference_raster.rasterize),
         l1_ssim=reference_ssim.l1_ssim,
         volume=reference_volume.volume,
+        excess=reference_excess.excess,
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,
         generate_structured=reference_anchors.generate_structured,
@@ -84,7 +88,7 @@ def cpu_backend() -> Backend:
     Raises:
         BackendError: the native library was not built or cannot be loaded.
     """
-    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_change, cpu_raster, cpu_ssim, cpu_volume
+    from structgstream.kernels import cpu_adam, cpu_anchors, cpu_change, cpu_excess, cpu_raster, cpu_ssim, cpu_volume
     from structgstream.kernels._load import native_library
 
     native_library()
@@ -95,6 +99,7 @@ def cpu_backend() -> Backend:
         blending_weights=cpu_raster.blending_weights,
         l1_ssim=cpu_ssim.l1_ssim,
         volume=cpu_volume.volume,
+        excess=cpu_excess.excess,
         changed_pixels=cpu_change.changed_pixels,
         visible_anchors=cpu_anchors.visible_anchors,
         generate_structured=cpu_anchors.generate_structured,
@@ -114,6 +119,7 @@ def cuda_backend() -> Backend:
         cuda_ssim,
         reference_anchors,
         reference_change,
+        reference_excess,
         reference_raster,
         reference_ssim,
         reference_volume,
@@ -133,6 +139,7 @@ def cuda_backend() -> Backend:
         blending_weights=partial(reference_raster.blending_weights, rasterize),
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         volume=reference_volume.volume,
+        excess=reference_excess.excess,
         changed_pixels=reference_change.changed_pixels,
         visible_anchors=reference_anchors.visible_anchors,
         generate_structured=cuda_anchors.generate_structured,

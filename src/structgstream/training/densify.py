@@ -24,6 +24,7 @@ class Densifier:
     iterations: int
     voxel_size: float
     offsets_per_anchor: int
+    seeds: int
     gradients: GradientStatistics
     opacities: OpacityStatistics
     grown: int = 0
@@ -34,7 +35,9 @@ class Densifier:
         """Empty statistics for ``scene``, which is fitted in so many ``iterations``."""
         m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
         device = scene.anchors.positions.device
-        return cls(config, iterations, voxel_size, k, GradientStatistics(m * k, device), OpacityStatistics(m, device))
+        return cls(
+            config, iterations, voxel_size, k, m, GradientStatistics(m * k, device), OpacityStatistics(m, device)
+        )
 
     def collects(self, iteration: int) -> bool:
         """Whether statistics are wanted at this iteration."""
@@ -45,8 +48,10 @@ class Densifier:
         c = self.config
         return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
 
-    def apply(self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator) -> tuple[int, int]:
-        """Grow, then prune; returns how many anchors were added and removed."""
+    def apply(
+        self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator, *, iteration: int
+    ) -> tuple[int, int]:
+        """Grow, then prune, after ``iteration``; returns how many anchors were added and removed."""
         k = self.offsets_per_anchor
         new = grow(
             scene.anchors,
@@ -54,6 +59,7 @@ class Densifier:
             count=self.gradients.count,
             voxel_size=self.voxel_size,
             config=self.config,
+            most=self.config.room_at(iteration, self.seeds),
             generator=generator,
         )
         eligible = self.gradients.count > self.config.eligible_count

@@ -39,6 +39,18 @@ class GrowthConfig:
     """The iterations after which contributions are looked at."""
     max_anchors: int = 1_000_000
     """No anchor is added beyond this number; those with the largest gradients come first."""
+    room_until: int = 0
+    """Their number may rise evenly from ``start`` to this iteration; 0: there is room for all from the beginning."""
+
+    def room_at(self, iteration: int, seeds: int) -> int:
+        """How many anchors there may be after ``iteration``, when there were ``seeds`` at first.
+
+        Few at first cost little while pictures are still coarse, and what comes late comes where it is missed most.
+        """
+        if iteration >= self.room_until:
+            return self.max_anchors
+        share = max(0.0, (iteration - self.start) / (self.room_until - self.start))
+        return min(self.max_anchors, seeds + round(share * max(0, self.max_anchors - seeds)))
 
     def last(self, iterations: int) -> int:
         """The iteration after which anchors no longer change, in a fit of ``iterations``.
@@ -98,6 +110,7 @@ def grow(
     count: Tensor,
     voxel_size: float,
     config: GrowthConfig,
+    most: int,
     generator: torch.Generator,
 ) -> NewAnchors:
     """Propose anchors where Gaussians pull hard.
@@ -108,6 +121,7 @@ def grow(
         count: ``[M * K]`` how often each Gaussian was drawn.
         voxel_size: the finest cell, scene units.
         config: thresholds.
+        most: at most so many anchors in the end, present ones counted.
         generator: for the random thinning.
 
     Three levels of cells (16, 4, 1 voxels); the finer ones only when a coarser one has added something in this call.
@@ -159,7 +173,7 @@ def grow(
         torch.cat([new.cell_sizes for new in added]),
         torch.cat([new.features for new in added]),
         torch.cat([new.strengths for new in added]),
-    ).strongest(config.max_anchors - len(anchors))
+    ).strongest(most - len(anchors))
 
 
 def prunable(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:

@@ -52,6 +52,9 @@ class InitialConfig:
     """Paper: 4000."""
     voxel_size: float = 0.005
     """The paper's eps, in units of the normalised scene."""
+    seed_voxels: int = 1
+    """Points become one anchor for so many voxels along each axis (paper: 1); growth adds those between where pictures
+    need them."""
     offsets_per_anchor: int = 5
     """The paper's k."""
     feature_width: int = 32
@@ -123,7 +126,7 @@ def fit_first_frame(
     template = seeded_scene(
         points,
         cameras=len(views),
-        voxel_size=config.voxel_size,
+        voxel_size=config.voxel_size * config.seed_voxels,
         offsets_per_anchor=config.offsets_per_anchor,
         feature_width=config.feature_width,
         hidden_width=config.hidden_width,
@@ -177,7 +180,7 @@ def fit_first_frame(
                 densifier.gradients.add(loss.rendering, screen_gradient)
                 densifier.opacities.add(loss.structured, loss.visible)
                 if densifier.due(iteration):
-                    densifier.apply(scene, parameters, adam, generator)
+                    densifier.apply(scene, parameters, adam, generator, iteration=iteration)
         if densifier.judges(iteration):
             with watch.stage("densify"), torch.no_grad():
                 cameras = [other.camera for other in views]

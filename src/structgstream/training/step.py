@@ -92,7 +92,9 @@ def view_loss(
             )
             total = total + weights.volume * terms["volume"]
         if weights.offset_distance:
-            terms["offset_distance"] = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights)
+            terms["offset_distance"] = offset_distance(
+                scene.anchors, voxel_size=voxel_size, weights=weights, backend=backend
+            )
             total = total + weights.offset_distance * terms["offset_distance"]
     if spread_weight:
         with watch.stage("rasterise"):
