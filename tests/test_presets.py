@@ -34,5 +34,6 @@ def test_configurations_are_values() -> None:
 def test_schedules_fit_their_length(name: str) -> None:
     initial, online = PRESETS[name].initial, PRESETS[name].online
     assert initial.coarse_iterations < initial.iterations
-    assert initial.growth.collect_from <= initial.growth.start < initial.growth.stop
+    assert initial.growth.collect_from <= initial.growth.start < initial.growth.last(initial.iterations)
+    assert all(at < initial.iterations for at in initial.growth.contribution_at)
     assert online.patching.iteration < online.iterations

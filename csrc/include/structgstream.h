@@ -98,6 +98,13 @@ void sgs_anchors_backward(
 double sgs_volume(const float* scales, const float* opacities, int64_t count, int64_t* drawn);
 void sgs_volume_backward(const float* scales, int64_t count, float scale, float* gradient);
 
+/* How far |offsets [M,each,3] * scales [M,3]| go beyond `limit`, summed, returned; gradients of `factor` times the sum by
+ * the offsets and by the logarithms of the scales. */
+double sgs_excess(const float* offsets, const float* scales, int64_t anchors, int64_t each, float limit);
+void sgs_excess_backward(
+    const float* offsets, const float* scales, int64_t anchors, int64_t each, float limit, float factor,
+    float* offset_gradient, float* log_scale_gradient);
+
 /* Adam, in place. rows: null, or `count` row numbers (int64) of `width` numbers each. */
 void sgs_adam_step(
     float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,

@@ -121,7 +121,7 @@ RIG = StreamConfig(
         camera_color=True,
         coarse_iterations=2500,
         rates=decayed(InitialRates(), 0.05),
-        growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=45_000),
+        growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=120_000),
         losses=LossWeights(offset_distance=0.005),
     ),
     online=OnlineConfig(patching=PatchingConfig(max_free=100_000)),
@@ -176,7 +176,7 @@ FAST = replace(
             interval=100,
             eligible_count=20,
             prune_visits=40,
-            max_anchors=40_000,
+            max_anchors=80_000,
         ),
     ),
 )

@@ -32,6 +32,8 @@ from structgstream.training.views import training_views
 class FrameReport:
     """What happened to one frame.
 
+    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors.
+
     Peaks of memory are by stage: ``read``, ``fit``, and ``store`` for encoding and writing. ``peak_memory_kind`` says
     whether they are each stage's own (Note [Peaks]); ``peak_device_bytes`` has the GPU's, when there is one.
     ``cpu_seconds`` is the time of all the process's threads together, which other processes do not lengthen.
@@ -48,6 +50,8 @@ class FrameReport:
     free: int
     spawned: int
     pruned: int
+    grown: int = 0
+    removed: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)
     peak_memory_bytes: Mapping[str, int] = field(default_factory=dict)
     peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
@@ -208,6 +212,8 @@ class Session:
                 spawned=fit.spawned,
                 pruned=fit.pruned,
                 counts=dict(fit.counts),
+                grown=fit.grown,
+                removed=fit.removed,
                 seconds={
                     "read": read - started,
                     **fit.seconds,

@@ -12,6 +12,7 @@ from streams import compact_header, header_for, moved, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
+from structgstream.evaluation.run_log import append_log, begin_log
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 
@@ -123,3 +124,21 @@ def test_damage_is_told_and_what_follows_it_is_listed(
     content = json.loads((tmp_path / "i.json").read_text())
     assert content["header"]["damage"] == [{"offset": lost.offset, "first": 4, "end": 6}]
     assert [packet["index"] for packet in content["packets"]] == listed
+
+
+def test_what_came_and_went_is_told_where_the_log_is(
+    streams: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stream = tmp_path / "logged.sgs"
+    stream.write_bytes(streams["raw"].read_bytes())
+    assert not any(words[:1] == ["came,"] for words in shown([str(stream)], capsys))
+    begin_log(stream)
+    append_log(stream, {"index": 0, "grown": 1_200, "removed": 30, "spawned": 0, "pruned": 0})
+    append_log(stream, {"index": 2, "grown": 0, "removed": 0, "spawned": 5, "pruned": 4})
+    output = tmp_path / "out.json"
+    lines = shown([str(stream), "--json", str(output)], capsys)
+    told = " ".join(next(words for words in lines if words[:1] == ["came,"]))
+    assert "anchors (+1,200 -30), free Gaussians (+5 -4)" in told
+    packets = json.loads(output.read_text())["packets"]
+    assert packets[0]["changes"] == {"grown": 1_200, "removed": 30, "spawned": 0, "pruned": 0}
+    assert packets[1]["changes"] == {}

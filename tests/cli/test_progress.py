@@ -48,7 +48,14 @@ def test_a_line_for_each_frame() -> None:
     with display(20, done=1, console=out) as shown:
         shown.step(Step(1, 100, 0.5, 34_512, 0))
         shown.frame(REPORT)
-    assert text(out) == "frame  2/20  train 31.20 dB   812.3 kB     5.1 s  34,512 anchors  2,301 free\n"
+    assert text(out) == "frame  2/20  train 31.20 dB   812.3 kB     5.1 s  34,512 anchors  2,301 free (+5 -1)\n"
+
+
+def test_a_line_tells_how_many_anchors_came_and_went() -> None:
+    out = console(terminal=False)
+    with display(20, console=out) as shown:
+        shown.frame(replace(REPORT, index=0, free=0, spawned=0, pruned=0, grown=1_812, removed=40))
+    assert text(out).endswith("34,512 anchors (+1,812 -40)  0 free\n")
 
 
 def test_a_line_tells_how_many_anchors_moved_when_not_all_could() -> None:

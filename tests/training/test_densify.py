@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import torch
 
 from rigs import arc_rig, random_scene
@@ -14,7 +16,7 @@ CONFIG = GrowthConfig(collect_from=0, start=0, interval=5, eligible_count=0, pru
 def prepared():
     scene = random_scene(30)
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
-    densifier = Densifier.of(scene, config=CONFIG, voxel_size=0.01)
+    densifier = Densifier.of(scene, config=CONFIG, iterations=1000, voxel_size=0.01)
     adam = Adam(reference_backend())
     gradients: dict[ParameterName, torch.Tensor] = {
         name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS
@@ -26,9 +28,21 @@ def prepared():
 def test_schedule() -> None:
     densifier = prepared()[2]
     assert [i for i in range(12) if densifier.due(i)] == [5, 10]
-    late = Densifier.of(random_scene(3), config=GrowthConfig(start=5, stop=9, interval=3), voxel_size=0.01)
+    late = scheduled(GrowthConfig(start=5, stop=9, interval=3), iterations=20)
     assert [i for i in range(20) if late.due(i)] == [6, 9]
     assert not late.collects(500)
+
+
+def scheduled(config: GrowthConfig, *, iterations: int) -> Densifier:
+    return Densifier.of(random_scene(3), config=config, iterations=iterations, voxel_size=0.01)
+
+
+def test_nothing_grows_that_is_not_fitted() -> None:
+    paper = scheduled(GrowthConfig(), iterations=4000)
+    due = [i for i in range(4001) if paper.due(i)]
+    assert (due[0], due[-1], len(due)) == (1600, 3900, 24)
+    assert paper.collects(3900)
+    assert not paper.collects(3901)  # Nobody would ask.
 
 
 def test_every_table_keeps_its_rows_in_step() -> None:
@@ -37,9 +51,10 @@ def test_every_table_keeps_its_rows_in_step() -> None:
     densifier.gradients.count.fill_(1.0)
     densifier.opacities.visits.fill_(1.0)
     densifier.opacities.opacity[:] = torch.where(torch.arange(30) < 4, 0.0, 1.0)
-    grown, pruned = densifier.apply(scene, parameters, adam, torch.Generator().manual_seed(0))
+    grown, pruned = densifier.apply(scene, parameters, adam, torch.Generator().manual_seed(0), iteration=5)
     assert pruned == 4
     assert grown > 0
+    assert (densifier.grown, densifier.pruned) == (grown, pruned)
     rows = 30 - 4 + grown
     for name in ANCHOR_ROWS:
         assert parameters.values[name].shape[0] == rows
@@ -57,7 +72,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
 def test_base_scales_are_bounded() -> None:
     scene, parameters, densifier, adam = prepared()
     parameters.values["base_scales"].detach().fill_(3.0)
-    densifier.apply(scene, parameters, adam, torch.Generator())
+    densifier.apply(scene, parameters, adam, torch.Generator(), iteration=5)
     assert parameters.values["base_scales"].max() <= 0.05
 
 
@@ -68,3 +83,20 @@ def test_statistics_follow_renderings() -> None:
     assert densifier.opacities.visits[visible].eq(1.0).all()
     expected = torch.zeros(30).index_add_(0, structured.ids // 5, structured.opacities)
     assert torch.allclose(densifier.opacities.opacity, expected, atol=1e-6)
+
+
+def test_who_hardly_contributes_goes_from_every_table() -> None:
+    _, parameters, densifier, adam = prepared()
+    config = replace(CONFIG, least_contribution=0.2, contribution_at=(7,))
+    densifier = replace(densifier, config=config)
+    assert [i for i in range(20) if densifier.judges(i)] == [7]
+    assert not replace(densifier, config=CONFIG).judges(7)
+    shares = torch.ones(30)
+    shares[:6] = 0.1
+    assert densifier.judge(shares, parameters, adam) == densifier.pruned == 6
+    assert densifier.grown == 0
+    for name in ANCHOR_ROWS:
+        assert len(parameters.values[name]) == len(adam.first[name]) == 24
+        assert parameters.values[name].requires_grad
+    assert densifier.opacities.visits.shape == (24,)
+    assert densifier.gradients.count.shape == (120,)

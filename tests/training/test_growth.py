@@ -13,13 +13,14 @@ VOXEL = 0.01
 DEFAULT = GrowthConfig()
 
 
-def grown(anchors, gradient, count, *, config=DEFAULT, seed=0):
+def grown(anchors, gradient, count, *, config=DEFAULT, most=10**6, seed=0):
     return grow(
         anchors,
         mean_gradient=gradient,
         count=count,
         voxel_size=VOXEL,
         config=config,
+        most=most,
         generator=torch.Generator().manual_seed(seed),
     )
 
@@ -71,8 +72,36 @@ def test_features_are_the_largest_of_the_parents() -> None:
 def test_the_cap_holds() -> None:
     anchors = random_scene(60).anchors
     n = slots(anchors)
-    config = GrowthConfig(max_anchors=63)
-    assert len(grown(anchors, torch.ones(n), torch.full((n,), 100.0), config=config)) == 3
+    assert len(grown(anchors, torch.ones(n), torch.full((n,), 100.0), most=63)) == 3
+
+
+def test_the_cap_keeps_the_strongest_wherever_they_lie() -> None:
+    anchors = random_scene(60).anchors
+    n = slots(anchors)
+    gradient = torch.linspace(1.0, 3.0, n)  # The last anchors pull most, and no order of cells follows from it.
+    count = torch.full((n,), 100.0)
+    every = grown(anchors, gradient, count)
+    few = grown(anchors, gradient, count, most=67)
+    assert len(few) == 7 < len(every)
+    assert few.strengths.min() >= every.strengths.sort(descending=True).values[6]
+    left = every.strengths.sort(descending=True).values[7:]
+    assert few.strengths.min() >= left.max()
+    rows = [int((every.positions == position).all(1).nonzero()[0, 0]) for position in few.positions]
+    assert torch.equal(every.features[rows], few.features)
+    assert len(grown(anchors, gradient, count, most=50)) == 0
+
+
+def test_room_for_anchors_comes_little_by_little() -> None:
+    config = GrowthConfig(start=100, room_until=500, max_anchors=5_000)
+    assert [config.room_at(at, 1_000) for at in (50, 100, 200, 500, 900)] == [1_000, 1_000, 2_000, 5_000, 5_000]
+    assert config.room_at(200, 9_000) == 5_000  # More seeds than there may be: none is added.
+    assert GrowthConfig(max_anchors=5_000).room_at(0, 1_000) == 5_000
+
+
+def test_the_last_interval_is_left_to_what_grew_before_it() -> None:
+    assert GrowthConfig().last(4000) == 3900  # The paper ends while Scaffold-GS still grows.
+    assert GrowthConfig().last(30_000) == 15_000
+    assert GrowthConfig(stop=50, interval=20).last(60) == 40
 
 
 def test_transparent_anchors_go_once_they_were_seen_enough() -> None:

@@ -9,8 +9,11 @@ from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import state_of
+from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
+from structgstream.training.seeding import voxel_centers
+from structgstream.training.solidity import SolidityConfig
 from worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
@@ -44,6 +47,15 @@ def test_anchors_grow_where_points_are_missing() -> None:
     assert len(result.scene.anchors) > 12
 
 
+def test_coarse_seeds_lie_on_the_fine_grid() -> None:
+    world = moving_world(1)
+    config = replace(QUICK, iterations=20, seed_voxels=3)
+    anchors = fit(world, config=config).scene.anchors
+    assert len(anchors) == len(voxel_centers(world.scene.anchors.positions, 0.15)) < 60
+    cells = anchors.positions / QUICK.voxel_size
+    assert torch.allclose(cells, cells.round(), atol=1e-3)
+
+
 def test_anchors_do_not_move_in_frame_0() -> None:
     world = moving_world(1)
     config = replace(QUICK, iterations=30)
@@ -67,6 +79,23 @@ def test_exposures_are_learned_with_their_gauge() -> None:
 def test_small_pictures_first() -> None:
     world = moving_world(1)
     assert fit(world, config=replace(QUICK, coarse_iterations=80)).train_psnr > 15.0
+
+
+def test_solid_surfaces_and_few_anchors() -> None:
+    world = moving_world(1)
+    config = replace(
+        QUICK,
+        disturbance=DisturbanceConfig(view_noise=0.1),
+        solidity=SolidityConfig(weight=0.05),
+        growth=replace(QUICK.growth, least_contribution=0.3, contribution_at=(60,)),
+    )
+    result = fit(world, config=config)
+    assert result.train_psnr > 15.0
+    assert result.removed > 0
+    assert result.losses["depth_spread"] > 0.0
+    assert len(result.scene.anchors) == len(voxel_centers(world.scene.anchors.positions, 0.05)) + (
+        result.grown - result.removed
+    )
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:

@@ -45,9 +45,12 @@ def test_offset_distance_counts_what_is_beyond_two_voxels(reading: Literal["scal
     eps = 0.03
     expected = np.where(length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0).sum()  # theta(O - 2 eps) ||O - 2 eps||
     weights = LossWeights(offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum")
-    assert offset_distance(anchors, voxel_size=eps, weights=weights).item() == pytest.approx(expected, rel=1e-5)
+    assert offset_distance(
+        anchors, voxel_size=eps, weights=weights, backend=reference_backend()
+    ).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_offsets_within_two_voxels_cost_nothing() -> None:
     anchors = random_scene().anchors
-    assert offset_distance(anchors, voxel_size=10.0, weights=LossWeights(offset_distance=1.0)).item() == 0.0
+    weights = LossWeights(offset_distance=1.0)
+    assert offset_distance(anchors, voxel_size=10.0, weights=weights, backend=reference_backend()).item() == 0.0

@@ -36,12 +36,13 @@ def ones(parameters: Parameters) -> dict[ParameterName, torch.Tensor]:
     return {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
 
 
-def patch(*, room: int) -> tuple[Parameters, Adam, torch.Tensor, int]:
+def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[Parameters, Adam, torch.Tensor, int]:
     parameters = Parameters.of(SCENE, trained=parameters_of_fields({"free"}))
     adam = Adam(BACKEND)
     adam.step(parameters, ones(parameters), dict.fromkeys(FREE_ROWS, 0.0))
     statistics = GradientStatistics(SLOTS + 3, CPU)
     statistics.total[SLOTS] = 1.0  # Two free ones have large gradients, ...
+    statistics.total[SLOTS + 1] = dying_gradient
     statistics.total[SLOTS + 2] = 2.0  # ... the last the largest.
     statistics.count[SLOTS:] = 1.0
     keep, born = patched(
@@ -69,6 +70,13 @@ def test_the_faint_die_and_children_follow_those_that_stay() -> None:
     torch.testing.assert_close(parameters.values["free_colors"][2:], torch.tensor([[0.2, 0.4, 0.6]] * 2))
     # Moments have gone the same way: another step takes them all.
     adam.step(parameters, ones(parameters), dict.fromkeys(FREE_ROWS, 0.1))
+
+
+def test_who_dies_has_no_children() -> None:
+    parameters, _, keep, born = patch(room=10, dying_gradient=3.0)
+    assert keep.tolist() == [True, False, True]
+    assert born == 2
+    assert len(parameters.births) == 4
 
 
 def test_no_more_are_born_than_there_is_room_for_and_the_largest_gradient_comes_first() -> None:

@@ -2,7 +2,7 @@
 """``structgstream inspect``."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
     from structgstream.evaluation.byte_count import Row
 
+CHANGES = ("grown", "removed", "spawned", "pruned")
 PICTURES = (".png", ".svg", ".pdf")
 
 
@@ -51,10 +52,11 @@ def main(arguments: list[str]) -> None:
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.byte_count import rows_of
     from structgstream.evaluation.report import write_json
+    from structgstream.evaluation.run_log import read_log
 
     with open_stream(options.stream) as reader:
         rows = rows_of(reader)
-        content = described(reader, rows)
+        content = described(reader, rows, log=read_log(options.stream))
         if options.json is not None:
             write_json(options.json, content)
         if plot is not None:
@@ -64,7 +66,7 @@ def main(arguments: list[str]) -> None:
         console.print_json(json.dumps(content["header"]["config"]))
         return
     packets = packet_table(rows, every=options.all_packets)
-    for part in (facts(content["header"], rows), header_table(content["header"]), packets):
+    for part in (facts(content["header"], rows, packets=content["packets"]), header_table(content["header"]), packets):
         console.print(part)
         console.print()
     if plot is not None:
@@ -86,8 +88,11 @@ def drawn(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: st
     write_byte_plot(path, rows, parts_of(reader, rows), title=f"{name}: {frames}, {rate(rows, reader.header.fps)}")
 
 
-def described(reader: "StreamReader", rows: "Sequence[Row]") -> dict[str, Any]:
-    """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``, ...)."""
+def described(reader: "StreamReader", rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``, ...).
+
+    ``changes`` of a packet are the anchors and free Gaussians that came and went, as far as the run's ``log`` says so.
+    """
     from structgstream.evaluation.byte_count import REST
 
     header = reader.header
@@ -115,6 +120,7 @@ def described(reader: "StreamReader", rows: "Sequence[Row]") -> dict[str, Any]:
             "offset": row.offset,
             "bytes": row.bytes,
             "fields": {name: size for name, size in row.sizes.items() if name != REST},
+            "changes": {name: log.get(row.index, {})[name] for name in CHANGES if name in log.get(row.index, {})},
         }
         for row in rows
     ]

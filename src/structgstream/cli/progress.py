@@ -48,8 +48,14 @@ def summary(report: "FrameReport", frames: int) -> str:
     return (
         f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
-        f"{report.anchors:,} anchors{moving}  {report.free:,} free"
+        f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
+        f"{report.free:,} free{change(report.spawned, report.pruned)}"
     )
+
+
+def change(came: int, went: int) -> str:
+    """How many came and went, in brackets; nothing when none did."""
+    return f" (+{came:,} -{went:,})" if came or went else ""
 
 
 def human_bytes(count: float) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import change, human_bytes
 from structgstream.cli.tables import SHOWN_FRAMES, columns, grid, plain
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ SMALL_BYTES = 100_000  # when all packets are below, their bytes are told one by
 SHORT = {"anchor_positions": "positions", "covariance_mlp": "cov. mlp", "the rest": "rest"}  # 80 characters a line
 
 
-def facts(header: Mapping[str, Any], rows: "Sequence[Row]") -> Table:
-    """What the stream is: where it comes from, its length, size and rate, and whether it is whole."""
+def facts(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence[Mapping[str, Any]]) -> Table:
+    """What the stream is: where it comes from, its length, size and rate, what came and went, whether it is whole."""
     cameras = header["cameras"]
     held_out = [name for name, camera in cameras.items() if camera["held_out"]]
     sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
@@ -32,6 +32,13 @@ def facts(header: Mapping[str, Any], rows: "Sequence[Row]") -> Table:
     if rows:
         table.add_row("rate", rate(rows, header["fps"]))
     table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
+    changes = [packet["changes"] for packet in packets if packet["changes"]]
+    if changes:
+        grown, removed, spawned, pruned = (
+            sum(one.get(name, 0) for one in changes) for name in ("grown", "removed", "spawned", "pruned")
+        )
+        anchors, free = change(grown, removed) or " (none)", change(spawned, pruned) or " (none)"
+        table.add_row("came, went", f"anchors{anchors}, free Gaussians{free}, says the log")
     state = "damaged" if header["damage"] else "not finished"
     table.add_row("state", "complete" if header["complete"] else f"{state}: {header['cut_reason']}")
     return table

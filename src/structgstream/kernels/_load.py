@@ -34,6 +34,7 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
         getattr(library, name).restype = ctypes.c_void_p
     library.sgs_anchors_visible.restype = ctypes.c_int64
     library.sgs_volume.restype = ctypes.c_double
+    library.sgs_excess.restype = ctypes.c_double
     return library, None
 
 

@@ -37,6 +37,7 @@ class Backend:
         blending_weights: see ``kernels.reference_raster.blending_weights``.
         l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
         volume: ``(scales, opacities) -> (sum, count)``, see ``kernels.reference_volume.volume``.
+        excess: ``(offsets, log_scales, limit) -> sum``, see ``kernels.reference_excess.excess``.
         changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
         lift: see ``kernels.reference_lift.lift``.
         sweep: see ``kernels.reference_sweep.sweep``.
@@ -51,6 +52,7 @@ class Backend:
     blending_weights: Callable[..., Tensor]
     l1_ssim: Callable[..., tuple[Tensor, Tensor]]
     volume: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    excess: Callable[[Tensor, Tensor, float], Tensor]
     changed_pixels: Callable[..., Tensor]
     lift: Callable[..., Lifted]
     sweep: Callable[..., Swept]
@@ -65,6 +67,7 @@ def reference_backend() -> Backend:
         reference_adam,
         reference_anchors,
         reference_change,
+        reference_excess,
         reference_lift,
         reference_raster,
         reference_ssim,
@@ -79,6 +82,7 @@ def reference_backend() -> Backend:
         blending_weights=partial(reference_raster.blending_weights, reference_raster.rasterize),
         l1_ssim=reference_ssim.l1_ssim,
         volume=reference_volume.volume,
+        excess=reference_excess.excess,
         changed_pixels=reference_change.changed_pixels,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
@@ -98,6 +102,7 @@ def cpu_backend() -> Backend:
         cpu_adam,
         cpu_anchors,
         cpu_change,
+        cpu_excess,
         cpu_lift,
         cpu_raster,
         cpu_ssim,
@@ -114,6 +119,7 @@ def cpu_backend() -> Backend:
         blending_weights=cpu_raster.blending_weights,
         l1_ssim=cpu_ssim.l1_ssim,
         volume=cpu_volume.volume,
+        excess=cpu_excess.excess,
         changed_pixels=cpu_change.changed_pixels,
         lift=cpu_lift.lift,
         sweep=cpu_sweep.sweep,
@@ -135,6 +141,7 @@ def cuda_backend() -> Backend:
         cuda_ssim,
         reference_anchors,
         reference_change,
+        reference_excess,
         reference_lift,
         reference_raster,
         reference_ssim,
@@ -156,6 +163,7 @@ def cuda_backend() -> Backend:
         blending_weights=partial(reference_raster.blending_weights, rasterize),
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         volume=reference_volume.volume,
+        excess=reference_excess.excess,
         changed_pixels=reference_change.changed_pixels,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,

@@ -63,11 +63,12 @@ class Scene:
         return background(self.environment, camera)
 
     def structured(
-        self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None
+        self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None, seen_from: Tensor | None = None
     ) -> tuple[StructuredGaussians, Tensor]:
         """The structured Gaussians that ``camera`` may see, and the visible anchors ``[m]`` they belong to.
 
-        With ``tiles`` (``kernels.raster_types``), those that may show in these tiles.
+        With ``tiles`` (``kernels.raster_types``), those that may show in these tiles. They look as from ``seen_from``
+        ``[3]``, which is where the camera is unless given.
         """
         anchors = self.anchors
         matrices = camera.beside(anchors.positions)
@@ -90,7 +91,7 @@ class Scene:
             anchors.offsets,
             self.features,
             self.mlps,
-            matrices.center,
+            matrices.center if seen_from is None else seen_from,
             visible,
             distance_input=self.distance_input,
         )

@@ -21,29 +21,37 @@ class Densifier:
     """
 
     config: GrowthConfig
+    iterations: int
     voxel_size: float
     offsets_per_anchor: int
+    seeds: int
     gradients: GradientStatistics
     opacities: OpacityStatistics
+    grown: int = 0
+    pruned: int = 0
 
     @classmethod
-    def of(cls, scene: Scene, *, config: GrowthConfig, voxel_size: float) -> "Densifier":
-        """Empty statistics for ``scene``."""
+    def of(cls, scene: Scene, *, config: GrowthConfig, iterations: int, voxel_size: float) -> "Densifier":
+        """Empty statistics for ``scene``, which is fitted in so many ``iterations``."""
         m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
         device = scene.anchors.positions.device
-        return cls(config, voxel_size, k, GradientStatistics(m * k, device), OpacityStatistics(m, device))
+        return cls(
+            config, iterations, voxel_size, k, m, GradientStatistics(m * k, device), OpacityStatistics(m, device)
+        )
 
     def collects(self, iteration: int) -> bool:
         """Whether statistics are wanted at this iteration."""
-        return self.config.collect_from < iteration <= self.config.stop
+        return self.config.collect_from < iteration <= self.config.last(self.iterations)
 
     def due(self, iteration: int) -> bool:
         """Whether anchors change after this iteration."""
         c = self.config
-        return c.start < iteration <= c.stop and iteration % c.interval == 0
+        return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
 
-    def apply(self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator) -> tuple[int, int]:
-        """Grow, then prune; returns how many anchors were added and removed."""
+    def apply(
+        self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator, *, iteration: int
+    ) -> tuple[int, int]:
+        """Grow, then prune, after ``iteration``; returns how many anchors were added and removed."""
         k = self.offsets_per_anchor
         new = grow(
             scene.anchors,
@@ -51,6 +59,7 @@ class Densifier:
             count=self.gradients.count,
             voxel_size=self.voxel_size,
             config=self.config,
+            most=self.config.room_at(iteration, self.seeds),
             generator=generator,
         )
         eligible = self.gradients.count > self.config.eligible_count
@@ -70,12 +79,39 @@ class Densifier:
             "anchor_features": new.features,
             "appearance": new.positions.new_zeros(len(new), 0),
         }
-        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
-        adam.replace_rows(ANCHOR_ROWS, keep=keep, added=len(new))
+        self._replace(parameters, adam, keep=keep, added=added, count=len(new))
         parameters.values["base_scales"].detach().clamp_(max=0.05)
+        return len(new), int(remove.sum())
+
+    def judges(self, iteration: int) -> bool:
+        """Whether contributions decide after this iteration who stays."""
+        return self.config.least_contribution > 0.0 and iteration in self.config.contribution_at
+
+    def judge(self, contributions: Tensor, parameters: Parameters, adam: Adam) -> int:
+        """Remove the anchors whose ``contributions`` ``[M]`` (shares of the mean) are too small; tells how many."""
+        keep = contributions >= self.config.least_contribution
+        added: dict[ParameterName, Tensor] = {
+            name: values.detach()[:0] for name, values in parameters.values.items() if name in ANCHOR_ROWS
+        }
+        self._replace(parameters, adam, keep=keep, added=added, count=0)
+        return int((~keep).sum())
+
+    def _replace(
+        self,
+        parameters: Parameters,
+        adam: Adam,
+        *,
+        keep: Tensor,
+        added: dict[ParameterName, Tensor],
+        count: int,
+    ) -> None:
+        """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor."""
+        k = self.offsets_per_anchor
+        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
+        adam.replace_rows(ANCHOR_ROWS, keep=keep, added=count)
         for statistics in (self.gradients, self.opacities):
             rows = keep.repeat_interleave(k) if statistics is self.gradients else keep
-            more = len(new) * k if statistics is self.gradients else len(new)
+            more = count * k if statistics is self.gradients else count
             for name, values in vars(statistics).items():
                 setattr(statistics, name, torch.cat([values[rows], values.new_zeros(more)]))
-        return len(new), int(remove.sum())
+        self.grown, self.pruned = self.grown + count, self.pruned + int((~keep).sum())

@@ -22,7 +22,11 @@ class DisturbanceConfig:
     noise_scales: float = 0.0
     """Means are shifted by normal noise of so many standard deviations of their Gaussian (paper: 0)."""
     until_share: float = 1.0
-    """Disturbances fade out linearly until this share of the iterations."""
+    """These two fade out linearly until this share of the iterations."""
+    view_noise: float = 0.0
+    """Anchors look as from a place beside the camera: normal noise of so many rig radii (paper: 0)."""
+    view_noise_left: float = 1.0
+    """The share of it that is left, falling linearly, at the last iteration; 1: it stays the same."""
 
 
 class Disturbance:
@@ -53,6 +57,33 @@ class Disturbance:
 
     def _drawn(self, count: int, like: Tensor) -> Tensor:
         return torch.rand(count, generator=self._generator).to(like)
+
+
+def disturbed_center(
+    center: Tensor,
+    radius: float,
+    iteration: int,
+    iterations: int,
+    config: DisturbanceConfig,
+    generator: torch.Generator,
+) -> Tensor | None:
+    """From where the anchors are looked at in ``iteration`` of ``iterations``, ``[3]``; None for the camera itself.
+
+    What the MLPs see of the camera is disturbed, not the projection: looks may then depend on the direction only as
+    slowly as the noise is wide, and cannot tell one training camera from the next.
+
+    Args:
+        center: where the camera is, ``[3]``.
+        radius: of the rig, scene units.
+        iteration: from 1 on.
+        iterations: of the fit.
+        config: how much.
+        generator: what is drawn comes from it.
+    """
+    if not config.view_noise:
+        return None
+    left = 1.0 + (config.view_noise_left - 1.0) * iteration / max(1, iterations)
+    return center + config.view_noise * left * radius * torch.randn(3, generator=generator).to(center)
 
 
 def disturbance_at(

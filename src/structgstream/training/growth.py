@@ -19,7 +19,7 @@ class GrowthConfig:
     start: int = 1500
     """Anchors change after this iteration (paper: densification starts at 1500)."""
     stop: int = 15_000
-    """Anchors change until this iteration."""
+    """Anchors change until this iteration, and never within the last ``interval`` of a fit (:meth:`last`)."""
     interval: int = 100
     """Iterations between changes."""
     grad_threshold: float = 2e-4
@@ -32,8 +32,33 @@ class GrowthConfig:
     """An anchor is judged once it was visited more often than this."""
     prune_opacity: float = 0.005
     """An anchor goes when its opacity, summed over its Gaussians, averages less than this a visit."""
+    least_contribution: float = 0.0
+    """At ``contribution_at`` an anchor goes that contributes less to the training pictures than this share of what an
+    average anchor does (Scaffold-GS: 0, none)."""
+    contribution_at: tuple[int, ...] = ()
+    """The iterations after which contributions are looked at."""
     max_anchors: int = 1_000_000
-    """No anchor is added beyond this number."""
+    """No anchor is added beyond this number; those with the largest gradients come first."""
+    room_until: int = 0
+    """Their number may rise evenly from ``start`` to this iteration; 0: there is room for all from the beginning."""
+
+    def room_at(self, iteration: int, seeds: int) -> int:
+        """How many anchors there may be after ``iteration``, when there were ``seeds`` at first.
+
+        Few at first cost little while pictures are still coarse, and what comes late comes where it is missed most.
+        """
+        if iteration >= self.room_until:
+            return self.max_anchors
+        share = max(0.0, (iteration - self.start) / (self.room_until - self.start))
+        return min(self.max_anchors, seeds + round(share * max(0, self.max_anchors - seeds)))
+
+    def last(self, iterations: int) -> int:
+        """The iteration after which anchors no longer change, in a fit of ``iterations``.
+
+        What is added must be fitted too: a whole interval is left for that. Scaffold-GS, which stops growing half way
+        through its 30,000 iterations, never meets this; the paper ends at 4,000, in the midst of the growing.
+        """
+        return min(self.stop, iterations - self.interval)
 
 
 class OpacityStatistics:
@@ -51,14 +76,25 @@ class OpacityStatistics:
 
 @dataclass(frozen=True)
 class NewAnchors:
-    """Anchors to append: positions ``[A, 3]``, one cell size each ``[A]``, features ``[A, D]``."""
+    """Anchors to append: positions ``[A, 3]``, one cell size each ``[A]``, features ``[A, D]``.
+
+    ``strengths`` ``[A]`` are the largest mean gradients that asked for them, in thresholds of their level.
+    """
 
     positions: Tensor
     cell_sizes: Tensor
     features: Tensor
+    strengths: Tensor
 
     def __len__(self) -> int:
         return self.positions.shape[0]
+
+    def strongest(self, count: int) -> "NewAnchors":
+        """At most ``count`` of them, in their order; of equals the first."""
+        if len(self) <= count:
+            return self
+        rows = self.strengths.argsort(descending=True, stable=True)[: max(count, 0)].sort().values
+        return NewAnchors(self.positions[rows], self.cell_sizes[rows], self.features[rows], self.strengths[rows])
 
 
 def cell_keys(points: Tensor, cell: float, origin: Tensor, extent: Tensor) -> Tensor:
@@ -74,6 +110,7 @@ def grow(
     count: Tensor,
     voxel_size: float,
     config: GrowthConfig,
+    most: int,
     generator: torch.Generator,
 ) -> NewAnchors:
     """Propose anchors where Gaussians pull hard.
@@ -84,23 +121,25 @@ def grow(
         count: ``[M * K]`` how often each Gaussian was drawn.
         voxel_size: the finest cell, scene units.
         config: thresholds.
+        most: at most so many anchors in the end, present ones counted.
         generator: for the random thinning.
 
     Three levels of cells (16, 4, 1 voxels); the finer ones only when a coarser one has added something in this call.
-    A cell that already holds an anchor, old or proposed, is left alone.
+    A cell that already holds an anchor, old or proposed, is left alone. Where there is not room for all, those stay
+    whose gradients exceed their level's threshold most.
     """
     k = anchors.offsets_per_anchor
     eligible = count > config.eligible_count
     means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(-1, 3)
     added: list[NewAnchors] = []
     occupied = anchors.positions
-    room = config.max_anchors - len(anchors)
     for level in range(config.levels):
         if level > 0 and not added:
             break
         thinned = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
-        chosen = (eligible & (mean_gradient >= config.grad_threshold * 2**level) & thinned).nonzero()[:, 0]
-        if chosen.numel() == 0 or room <= 0:
+        threshold = config.grad_threshold * 2**level
+        chosen = (eligible & (mean_gradient >= threshold) & thinned).nonzero()[:, 0]
+        if chosen.numel() == 0:
             continue
         cell = voxel_size * 16 / 4**level
         everything = (torch.cat([means[chosen], occupied]) / cell).round().to(torch.int64)
@@ -114,25 +153,27 @@ def grow(
         parents = anchors.features[chosen[fresh] // k]
         features = parents.new_full((unique.numel(), parents.shape[1]), -torch.inf)
         features.scatter_reduce_(0, parent_cell[:, None].expand_as(parents), parents, reduce="amax")
+        strengths = mean_gradient.new_zeros(unique.numel())
+        strengths.scatter_reduce_(0, parent_cell, mean_gradient[chosen[fresh]] / threshold, reduce="amax")
         cells = torch.stack(
             [unique // (extent[1] * extent[2]), unique // extent[2] % extent[1], unique % extent[2]], dim=1
         )
         positions = (cells + origin).to(means) * cell
-        positions, features = positions[:room], features[:room]
-        room -= positions.shape[0]
-        added.append(NewAnchors(positions, positions.new_full((positions.shape[0],), cell), features))
+        added.append(NewAnchors(positions, positions.new_full((positions.shape[0],), cell), features, strengths))
         occupied = torch.cat([occupied, positions])
     if not added:
         return NewAnchors(
             means.new_zeros(0, 3),
             means.new_zeros(0),
             anchors.features.new_zeros(0, anchors.features.shape[1]),
+            means.new_zeros(0),
         )
     return NewAnchors(
         torch.cat([new.positions for new in added]),
         torch.cat([new.cell_sizes for new in added]),
         torch.cat([new.features for new in added]),
-    )
+        torch.cat([new.strengths for new in added]),
+    ).strongest(most - len(anchors))
 
 
 def prunable(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:

@@ -9,17 +9,21 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
-from structgstream.training.disturbance import DisturbanceConfig, disturbance_at
+from structgstream.training.disturbance import DisturbanceConfig, disturbance_at, disturbed_center
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, Rate, constant
 from structgstream.training.parameters import ParameterName, Parameters, detached
 from structgstream.training.result import FitResult, Step, StepListener
 from structgstream.training.seeding import seeded_scene
+from structgstream.training.solidity import SolidityConfig
 from structgstream.training.step import LastPass, gradients_of, view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import reduced, shuffled_views, training_views
+
+_JUDGED_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of them will do.
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,9 @@ class InitialConfig:
     """Paper: 4000."""
     voxel_size: float = 0.005
     """The paper's eps, in units of the normalised scene."""
+    seed_voxels: int = 1
+    """Points become one anchor for so many voxels along each axis (paper: 1); growth adds those between where pictures
+    need them."""
     offsets_per_anchor: int = 5
     """The paper's k."""
     feature_width: int = 32
@@ -65,6 +72,7 @@ class InitialConfig:
     """Whether every iteration has a background of another colour (``training/environment.py``, Note [Honest coverage];
     paper: black)."""
     disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    solidity: SolidityConfig = field(default_factory=SolidityConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
@@ -121,7 +129,7 @@ def fit_first_frame(
     template = seeded_scene(
         points,
         cameras=len(views),
-        voxel_size=config.voxel_size,
+        voxel_size=config.voxel_size * config.seed_voxels,
         offsets_per_anchor=config.offsets_per_anchor,
         feature_width=config.feature_width,
         hidden_width=config.hidden_width,
@@ -134,7 +142,7 @@ def fit_first_frame(
         trained -= {"camera_gains", "camera_biases"}
     parameters = Parameters.of(template, trained=frozenset(trained))
     adam = Adam(backend)
-    densifier = Densifier.of(template, config=config.growth, voxel_size=config.voxel_size)
+    densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
     extent = rig_extent(rig)
     coarse = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
     order = shuffled_views(coarse, generator)
@@ -155,6 +163,16 @@ def fit_first_frame(
             watch=watch,
             disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
             background=torch.rand(3, generator=generator).to(backend.device) if config.random_background else None,
+            seen_from=disturbed_center(
+                view.camera.beside(scene.anchors.positions).center,
+                extent / 1.1,
+                iteration,
+                config.iterations,
+                config.disturbance,
+                generator,
+            ),
+            spread_weight=config.solidity.weight_at(iteration, config.iterations),
+            spread_scale=config.solidity.scale,
         )
         gradients, screen_gradient = gradients_of(loss, parameters, watch)
         if iteration > config.iterations - len(views):
@@ -166,7 +184,12 @@ def fit_first_frame(
                 densifier.gradients.add(loss.rendering, screen_gradient)
                 densifier.opacities.add(loss.structured, loss.visible)
                 if densifier.due(iteration):
-                    densifier.apply(scene, parameters, adam, generator)
+                    densifier.apply(scene, parameters, adam, generator, iteration=iteration)
+        if densifier.judges(iteration):
+            with watch.stage("densify"), torch.no_grad():
+                cameras = [other.camera for other in views]
+                shares = contributions(parameters.scene(template), cameras, scale=_JUDGED_SCALE, backend=backend)
+                densifier.judge(shares, parameters, adam)
         if on_step is not None:
             anchors = parameters.values["anchor_positions"].shape[0]
             on_step(Step(iteration, config.iterations, float(loss.total.detach()), anchors, 0))
@@ -174,6 +197,8 @@ def fit_first_frame(
         scene=detached(parameters.scene(template)),
         iterations=config.iterations,
         train_psnr=last_pass.psnr,
+        grown=densifier.grown,
+        removed=densifier.pruned,
         seconds=watch.seconds,
         losses=last_pass.terms,
     )

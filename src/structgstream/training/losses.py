@@ -40,15 +40,17 @@ def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum
     return total / drawn.clamp(min=1) if reduction == "mean" else total
 
 
-def offset_distance(anchors: AnchorCloud, *, voxel_size: float, weights: LossWeights) -> Tensor:
+def offset_distance(anchors: AnchorCloud, *, voxel_size: float, weights: LossWeights, backend: Backend) -> Tensor:
     """L_dist: how far Gaussians stray from their anchors beyond two voxels.
 
     theta(x) x is a hinge: only the part above ``2 * voxel_size`` (the paper's eps) counts.
     """
+    if weights.offset_distance_reading == "scaled":
+        total = backend.excess(anchors.offsets, anchors.log_offset_scales, 2.0 * voxel_size)
+        return total / max(1, anchors.offsets.numel()) if weights.offset_distance_reduction == "mean" else total
     if weights.offset_distance_reading == "raw":
         length = anchors.offsets.abs()
     else:
-        length = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
-        length = length.norm(dim=-1) if weights.offset_distance_reading == "norm" else length.abs()
+        length = (anchors.offsets * anchors.log_offset_scales.exp()[:, None]).norm(dim=-1)
     excess = torch.relu(length - 2.0 * voxel_size)
     return excess.mean() if weights.offset_distance_reduction == "mean" else excess.sum()

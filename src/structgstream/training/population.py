@@ -52,9 +52,11 @@ def patched(
     """
     current = parameters.scene(scene)
     keep = surviving(current.free, config)
+    drawn = statistics.count.clone()
+    drawn[len(drawn) - len(keep) :][~keep] = 0.0  # Those that die have no children.
     ids = parents_of(
         statistics.mean(),
-        statistics.count,
+        drawn,
         room=room - int(keep.sum()),
         config=config,
         generator=generator,

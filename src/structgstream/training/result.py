@@ -31,6 +31,8 @@ class FitResult:
         train_psnr: mean over training cameras of the PSNR of the last rendering of each during optimisation, dB, over
             the pixels that were drawn; NaN when there was nothing to do.
         moving: anchors that were free to move.
+        grown: anchors added while frame 0 was fitted.
+        removed: anchors taken away while frame 0 was fitted.
         spawned: free Gaussians added in this frame.
         pruned: free Gaussians removed in this frame.
         counts: how often each further mechanism acted, by its name.
@@ -42,6 +44,8 @@ class FitResult:
     iterations: int
     train_psnr: float
     moving: int = 0
+    grown: int = 0
+    removed: int = 0
     spawned: int = 0
     pruned: int = 0
     counts: Mapping[str, int] = field(default_factory=dict)

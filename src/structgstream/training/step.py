@@ -17,6 +17,7 @@ from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
 from structgstream.training.losses import LossWeights, offset_distance, volume
 from structgstream.training.parameters import ParameterName, Parameters
+from structgstream.training.solidity import depth_spread
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View
 
@@ -61,20 +62,26 @@ def view_loss(
     focus: Focus | None = None,
     disturbed: Callable[[Gaussians], Gaussians] | None = None,
     background: Tensor | None = None,
+    seen_from: Tensor | None = None,
+    spread_weight: float = 0.0,
+    spread_scale: float = 0.5,
 ) -> ViewLoss:
     """Render ``view`` and compare it with its picture (paper, equations for L and L_init), or what ``focus`` names.
 
-    What is drawn is ``disturbed``, if that is given, before ``background`` ``[3]`` instead of the scene's environment.
+    What is drawn is ``disturbed``, if that is given, and looks as from ``seen_from`` ``[3]``, before ``background``
+    ``[3]`` instead of the scene's environment. With a ``spread_weight`` the spread of the undisturbed depth counts too,
+    drawn in ``spread_scale`` of the picture's size.
     """
     with watch.stage("generate"):
-        structured, visible = scene.structured(view.camera, backend, tiles=None if focus is None else focus.tiles)
-        gaussians = scene.dressed(structured)
-        gaussians = gaussians if disturbed is None else disturbed(gaussians)
+        tiles = None if focus is None else focus.tiles
+        structured, visible = scene.structured(view.camera, backend, tiles=tiles, seen_from=seen_from)
+        calm = scene.dressed(structured)
+        gaussians = calm if disturbed is None else disturbed(calm)
     with watch.stage("rasterise"):
         behind = scene.background(view.camera) if background is None else background
         rendering = draw(gaussians, view.camera, backend, track_screen=track_screen, focus=focus, background=behind)
     with watch.stage("loss"):
-        image, tiles = rendering.image, None if focus is None else focus.tiles
+        image = rendering.image
         gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]
         if gains.requires_grad:
             l1, ssim = backend.l1_ssim(image * gains + biases, view.image, tiles=tiles)
@@ -88,8 +95,14 @@ def view_loss(
             )
             total = total + weights.volume * terms["volume"]
         if weights.offset_distance:
-            terms["offset_distance"] = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights)
+            terms["offset_distance"] = offset_distance(
+                scene.anchors, voxel_size=voxel_size, weights=weights, backend=backend
+            )
             total = total + weights.offset_distance * terms["offset_distance"]
+    if spread_weight:
+        with watch.stage("rasterise"):
+            terms["depth_spread"] = depth_spread(calm, view.camera, scale=spread_scale, backend=backend)
+            total = total + spread_weight * terms["depth_spread"]
     return ViewLoss(total, terms, rendering, gains, biases, structured, visible, focus)
 
 
@@ -132,7 +145,8 @@ class LastPass:
     @property
     def terms(self) -> dict[str, float]:
         """Mean of each loss term."""
-        by_name = {
-            name: [terms[name] for terms in self._terms.values()] for name in next(iter(self._terms.values()), ())
-        }
+        names = dict.fromkeys(
+            name for terms in self._terms.values() for name in terms
+        )  # Not every view has every term.
+        by_name = {name: [terms[name] for terms in self._terms.values() if name in terms] for name in names}
         return {name: float(torch.stack(values).mean()) for name, values in by_name.items()}

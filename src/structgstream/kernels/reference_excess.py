@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far Gaussians stray from their anchors, in pure torch: the oracle."""
+
+import torch
+from torch import Tensor
+
+
+def excess(offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor:
+    """The parts of |offsets ``[M, K, 3]`` x exp(log_scales ``[M, 3]``)| beyond ``limit``, summed, ``[]``."""
+    return torch.relu((offsets * log_scales.exp()[:, None]).abs() - limit).sum()
