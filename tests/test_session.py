@@ -18,6 +18,7 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.records import scanned
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError, StorageError
+from structgstream.evaluation.run_log import log_entry
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import TINY, StreamConfig
@@ -61,7 +62,7 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     def first(frame, rig, points, *, config, backend, seed, on_step, before=None):
         seeds.append(seed)
-        return FitResult(small_scene(seed=seed % 1000), 1, 20.0)
+        return FitResult(small_scene(seed=seed % 1000), 1, 20.0, grown=4, removed=3)
 
     def following(scene, frame, rig, *, config, backend, seed, on_step, **options):
         seeds.append(seed)
@@ -93,6 +94,8 @@ def test_every_frame_is_reported_and_readable(quick_fits: list[int]) -> None:
     ]
     assert [r.kind.name for r in reports] == ["KEY", "DELTA", "KEY", "DELTA", "KEY"]
     assert [(r.train_psnr, r.spawned, r.pruned, r.anchors) for r in reports[:2]] == [(20.0, 0, 0, 3), (21.0, 2, 1, 3)]
+    assert [(r.grown, r.removed) for r in reports[:2]] == [(4, 3), (0, 0)]
+    assert [log_entry(r)["removed"] for r in reports[:2]] == [3, 0]
     assert [r.free for r in reports] == [len(scene.free) for _, scene in reader.scenes()]
     assert all({"read", "fit", "encode", "write", "total"} <= r.seconds.keys() for r in reports)
     assert reader.header.rig.held_out == source.rig.held_out
