@@ -51,6 +51,17 @@ def test_a_line_for_each_frame() -> None:
     assert text(out) == "frame  2/20  train 31.20 dB   812.3 kB     5.1 s  34,512 anchors  2,301 free (+5 -1)\n"
 
 
+def test_a_line_tells_which_pictures_were_not_believed() -> None:
+    out = Console(file=io.StringIO(), force_terminal=False, width=300)
+    counts = {"lifted": 40, "views left out": 2, "jumps": 0, "births refused": 1}
+    with display(20, console=out) as shown:
+        shown.frame(replace(REPORT, counts=counts))
+        shown.frame(replace(REPORT, counts={"lifted": 40, "views left out": 0}))
+    odd, usual = text(out).splitlines()
+    assert "[2 views left out: their pictures changed alone, or not at all]  [births refused" in odd
+    assert usual.endswith("2,301 free (+5 -1)")
+
+
 def test_a_line_tells_how_many_anchors_came_and_went() -> None:
     out = console(terminal=False)
     with display(20, console=out) as shown:

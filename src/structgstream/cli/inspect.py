@@ -121,6 +121,7 @@ def described(reader: "StreamReader", rows: "Sequence[Row]", *, log: Mapping[int
             "bytes": row.bytes,
             "fields": {name: size for name, size in row.sizes.items() if name != REST},
             "changes": {name: log.get(row.index, {})[name] for name in CHANGES if name in log.get(row.index, {})},
+            "counts": log.get(row.index, {}).get("counts", {}),
         }
         for row in rows
     ]

@@ -2,6 +2,7 @@
 """What the user sees while frames are fitted: bars on a terminal, a line for each frame elsewhere."""
 
 import time
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
@@ -49,13 +50,25 @@ def summary(report: "FrameReport", frames: int) -> str:
         f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
-        f"{report.free:,} free{change(report.spawned, report.pruned)}"
+        f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}"
     )
 
 
 def change(came: int, went: int) -> str:
     """How many came and went, in brackets; nothing when none did."""
     return f" (+{came:,} -{went:,})" if came or went else ""
+
+
+def remarks(counts: Mapping[str, int]) -> str:
+    """What a user should know of a frame's pictures: which were not believed (``training/trust.py``)."""
+    found = []
+    if counts.get("views left out"):
+        found.append(f"{counts['views left out']} views left out: their pictures changed alone, or not at all")
+    if counts.get("jumps"):
+        found.append("the pictures changed everywhere: motion not followed")
+    if counts.get("births refused"):
+        found.append("births refused: too much is missing at once")
+    return "".join(f"  [{remark}]" for remark in found)
 
 
 def human_bytes(count: float) -> str:

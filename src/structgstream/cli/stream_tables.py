@@ -2,6 +2,7 @@
 """What a stream file holds, as tables for a terminal."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,11 @@ def facts(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence
         )
         anchors, free = change(grown, removed) or " (none)", change(spawned, pruned) or " (none)"
         table.add_row("came, went", f"anchors{anchors}, free Gaussians{free}, says the log")
+    acts = Counter[str]()
+    for packet in packets:
+        acts.update(packet["counts"])
+    if acts:
+        table.add_row("acts", ", ".join(f"{name} {count:,}" for name, count in acts.items()))
     state = "damaged" if header["damage"] else "not finished"
     table.add_row("state", "complete" if header["complete"] else f"{state}: {header['cut_reason']}")
     return table

@@ -97,8 +97,19 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     online("settling", title, replace(whole, least_gain=gain), "least_gain")
     paced = replace(whole, iterations=PAPER_ITERATIONS, patching=replace(patching, iteration=PAPER_ITERATIONS // 2))
     online("more-iterations", f"{PAPER_ITERATIONS} iterations in a frame", paced, "iterations", "patching.iteration")
-    spawnless = replace(whole, patching=replace(patching, spawn="off"))
-    online("without-free", "w/o free 3DGs", spawnless, "patching.spawn")
+    start, births = whole.start, whole.births
+    online("without-start", "w/o motion start", replace(whole, start=replace(start, enabled=False)), "start.enabled")
+    online("one-round", "motion start in one round", replace(whole, start=replace(start, rounds=1)), "start.rounds")
+    alike = replace(start, lift=replace(start.lift, color_bandwidth=0.0))
+    online("colors-alike", "neighbours of any colour", replace(whole, start=alike), "start.lift.color_bandwidth")
+    gated(
+        "without-residuals", "the gate sees no residuals", replace(motion, residual_threshold=0.0), "residual_threshold"
+    )
+    spawn = "gradient" if patching.spawn == "off" else "off"
+    title = "births by gradients too" if spawn == "gradient" else "w/o births by gradients"
+    online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
+    spawnless = replace(whole, births=replace(births, enabled=False), patching=replace(patching, spawn="off"))
+    online("without-free", "w/o free 3DGs", spawnless, "births.enabled", "patching.spawn")
     priced("free-unpriced", "bits of free 3DGs cost nothing", replace(rounding, free_priced=False), "free_priced")
     gated("unseen-kept", "unseen free 3DGs are kept", replace(motion, unseen_pixels=0.0), "unseen_pixels")
     refreshed = replace(
