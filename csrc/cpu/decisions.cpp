@@ -15,7 +15,7 @@ namespace {
 
 enum Result { kDone = 0, kNoMemory = 1, kDamaged = 2, kRefused = 3 };
 
-constexpr int kMaxInputs = 8;
+constexpr int kResidualInputs = 6;
 constexpr int kLeast = 32, kMost = 65536 - 32;  // of a chance
 constexpr int kFar = 1983;                      // of its logit
 constexpr int kWeightLimit = (1 << 19) - 1;
@@ -117,51 +117,56 @@ struct Arithmetic {
     int64_t place;
 };
 
-template <bool kEncodes>
+// The decisions of one model of so many inputs. A number's contexts are looked up once: `at` takes them.
+template <bool kEncodes, int kInputs>
 struct Coder {
     Coder(sgs_arithmetic* arithmetic, const sgs_model* model)
         : arithmetic(arithmetic), model(*model), table(constants()) {}
 
-    // One decision; `cells` are the model's inputs at this node.
-    bool decide(bool yes, const int32_t* contexts, int node) {
-        const int inputs = model.inputs, nodes = model.nodes;
-        int32_t* weights = model.weights + node * inputs;
-        int32_t cells[kMaxInputs], logits[kMaxInputs];
+    void at(const int32_t* contexts) {
+        for (int k = 0; k < kInputs; ++k) rows[k] = (model.starts[k] + contexts[k]) * model.nodes;
+    }
+
+    bool decide(bool yes, int node) {
+        int32_t* weights = model.weights + node * kInputs;
+        uint16_t* chances = model.chances + node;
+        uint8_t* seen = model.seen + node;
+        int32_t logits[kInputs];
         int32_t sum = 0;
-        for (int k = 0; k < inputs; ++k) {
-            cells[k] = (model.starts[k] + contexts[k]) * nodes + node;
-            logits[k] = table.stretch[model.chances[cells[k]] >> 4];
+        for (int k = 0; k < kInputs; ++k) {
+            logits[k] = table.stretch[chances[rows[k]] >> 4];
             sum += weights[k] * logits[k] >> 16;
         }
         const int chance = table.squash_of[std::clamp(sum, -kFar, kFar) + kFar];
         yes = arithmetic.decide(yes, chance);
         const int32_t target = yes ? 65536 : 0, error = (target - chance) >> 4;
-        for (int k = 0; k < inputs; ++k) {
+        for (int k = 0; k < kInputs; ++k)
             weights[k] = std::clamp(weights[k] + ((logits[k] * error + 4096) >> 13), -kWeightLimit, kWeightLimit);
-            uint16_t& cell = model.chances[cells[k]];
-            uint8_t& seen = model.seen[cells[k]];
-            cell = static_cast<uint16_t>(std::clamp(cell + ((target - cell) * table.share[seen] >> 16), kLeast, kMost));
-            seen = static_cast<uint8_t>(std::min(seen + 1, 255));
+        for (int k = 0; k < kInputs; ++k) {
+            const int32_t cell = chances[rows[k]], count = seen[rows[k]];
+            chances[rows[k]] =
+                static_cast<uint16_t>(std::clamp(cell + ((target - cell) * table.share[count] >> 16), kLeast, kMost));
+            seen[rows[k]] = static_cast<uint8_t>(count + (count < 255));
         }
         return yes;
     }
 
     // A signed number; false where it is damaged.
-    bool number(int64_t* value, const int32_t* contexts) {
+    bool number(int64_t* value) {
         const int64_t given = kEncodes ? *value : 0;
-        if (!decide(given != 0, contexts, 0)) {
+        if (!decide(given != 0, 0)) {
             *value = 0;
             return true;
         }
-        const bool negative = decide(given < 0, contexts, 1);
+        const bool negative = decide(given < 0, 1);
         const int64_t given_size = given < 0 ? -given : given;
         int64_t size = 1;
-        while (size <= kNearSizes && decide(given_size > size, contexts, 1 + static_cast<int>(size))) ++size;
+        while (size <= kNearSizes && decide(given_size > size, 1 + static_cast<int>(size))) ++size;
         if (size > kNearSizes) {
             const int64_t given_rest = given_size - kNearSizes;
             int length = 0;
             while (length < kLengths &&
-                   decide(given_rest >> length > 1, contexts, 2 + kNearSizes + std::min(length, kLengthNodes - 1)))
+                   decide(given_rest >> length > 1, 2 + kNearSizes + std::min(length, kLengthNodes - 1)))
                 ++length;
             int64_t rest = 1;
             for (int bit = length - 1; bit >= 0; --bit) rest = rest << 1 | arithmetic.decide(given_rest >> bit & 1, 32768);
@@ -173,6 +178,7 @@ struct Coder {
 
     Arithmetic<kEncodes> arithmetic;
     sgs_model model;
+    int32_t rows[kInputs];
     const Constants& table;
 };
 
@@ -220,7 +226,7 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
         for (int64_t i = 0; i < count; ++i) has[i / kBlock] |= active[i];
     for (auto& number : last) number = static_cast<uint8_t>(bit_length(number, 5));
     {
-        Coder<kEncodes> coder(arithmetic, block_model);
+        Coder<kEncodes, 2> coder(arithmetic, block_model);
         for (int level = 0; level < 5; ++level) {
             const Pass pass = kPasses[level];
             for (int64_t b = pass.first; b < blocks; b += pass.step) {
@@ -228,11 +234,12 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
                 const int beside = level ? has[b - pass.first] + (b + pass.first < blocks ? has[b + pass.first] : 0) : 0;
                 const int32_t contexts[2] = {(last[b + 1] * 3 + beside) * 5 + level,
                                              (bit_length(ever[b], 5) * 11 + last[b] + last[b + 2]) * 3 + beside};
-                has[b] = coder.decide(has[b], contexts, 0);
+                coder.at(contexts);
+                has[b] = coder.decide(has[b], 0);
             }
         }
     }
-    Coder<kEncodes> coder(arithmetic, row_model);
+    Coder<kEncodes, 3> coder(arithmetic, row_model);
     for (int level = 0; level < 5; ++level) {
         const Pass pass = kPasses[level];
         const int64_t near = pass.first, far = 3 * pass.first;
@@ -245,7 +252,8 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
             const int32_t contexts[3] = {(wide * 3 + beside) * 5 + level,
                                          (bit_length(sizes[i], 5) * 3 + beside) * 6 + bit_length(around, 5),
                                          ((level * 3 + beyond) * 3 + beside) * 8 + (history[i] & 7)};
-            found[i] = coder.decide(active[i], contexts, 0);
+            coder.at(contexts);
+            found[i] = coder.decide(active[i], 0);
         }
     }
     if (!kEncodes) std::copy_n(found, count, active);
@@ -255,7 +263,7 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
 template <bool kEncodes>
 Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_t count, int columns, const int32_t* last,
                       const int32_t* others, int32_t* residuals) {
-    Coder<kEncodes> coder(arithmetic, model);
+    Coder<kEncodes, kResidualInputs> coder(arithmetic, model);
     std::vector<int32_t> told(static_cast<size_t>(count), 0);  // sizes in the columns before
     std::vector<uint8_t> moved(static_cast<size_t>(count), 0);
     for (int64_t a = 0; a < count; ++a)
@@ -274,7 +282,7 @@ Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_
                 // Sixteenths of a bin.
                 const int32_t led = moved[a] ? (level ? 10 * own + 3 * (above + below) : 16 * own) : 8 * (above + below);
                 const int32_t expected = size_class((std::abs(led) + 4) >> 3);
-                const int32_t contexts[6] = {
+                const int32_t contexts[kResidualInputs] = {
                     (limited(own, 8) + 8) * columns + column,
                     (limited(above, 4) + 4) * 9 + limited(below, 4) + 4,
                     ((led < 0 ? -expected : expected) + 15) * 5 + level,
@@ -283,7 +291,8 @@ Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_
                     ((limited(first, 3) + 3) * 7 + limited(off, 3) + 3) * 7 + limited(own, 3) + 3,
                 };
                 int64_t value = residuals[at];
-                if (!coder.number(&value, contexts) || value < -kLargestResidual || value > kLargestResidual)
+                coder.at(contexts);
+                if (!coder.number(&value) || value < -kLargestResidual || value > kLargestResidual)
                     return kDamaged;
                 residuals[at] = static_cast<int32_t>(value);
             }
@@ -293,21 +302,22 @@ Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_
     return kDone;
 }
 
-template <bool kEncodes>
+template <bool kEncodes, int kInputs>
 Result code_numbers(sgs_arithmetic* arithmetic, const sgs_model* model, int64_t count, const int32_t* contexts, bool flags,
                     int64_t* values) {
-    Coder<kEncodes> coder(arithmetic, model);
+    Coder<kEncodes, kInputs> coder(arithmetic, model);
     for (int64_t i = 0; i < count; ++i) {
+        coder.at(contexts + i * kInputs);
         if (flags)
-            values[i] = coder.decide(values[i] != 0, contexts + i * model->inputs, 0);
-        else if (!coder.number(values + i, contexts + i * model->inputs))
+            values[i] = coder.decide(values[i] != 0, 0);
+        else if (!coder.number(values + i))
             return kDamaged;
     }
     return kDone;
 }
 
 bool fits(const sgs_model* model, int inputs, int nodes) {
-    return model->inputs == inputs && model->nodes == nodes && inputs <= kMaxInputs;
+    return model->inputs == inputs && model->nodes == nodes;
 }
 
 }  // namespace
@@ -325,7 +335,7 @@ extern "C" int sgs_code_activity(sgs_arithmetic* arithmetic, const sgs_model* bl
 
 extern "C" int sgs_code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int encodes, int64_t count, int columns,
                                   const int32_t* last, const int32_t* others, int32_t* residuals) {
-    if (count < 0 || columns < 1 || !fits(model, 6, kNodes)) return kRefused;
+    if (count < 0 || columns < 1 || !fits(model, kResidualInputs, kNodes)) return kRefused;
     try {
         return encodes ? code_residuals<true>(arithmetic, model, count, columns, last, others, residuals)
                        : code_residuals<false>(arithmetic, model, count, columns, last, others, residuals);
@@ -336,7 +346,13 @@ extern "C" int sgs_code_residuals(sgs_arithmetic* arithmetic, const sgs_model* m
 
 extern "C" int sgs_code_numbers(sgs_arithmetic* arithmetic, const sgs_model* model, int encodes, int64_t count,
                                 const int32_t* contexts, int flags, int64_t* values) {
-    if (count < 0 || !fits(model, model->inputs, flags ? 1 : kNodes)) return kRefused;
-    return encodes ? code_numbers<true>(arithmetic, model, count, contexts, flags != 0, values)
-                   : code_numbers<false>(arithmetic, model, count, contexts, flags != 0, values);
+    const int nodes = flags ? 1 : kNodes;
+    if (count < 0) return kRefused;
+    if (fits(model, 1, nodes))
+        return encodes ? code_numbers<true, 1>(arithmetic, model, count, contexts, flags != 0, values)
+                       : code_numbers<false, 1>(arithmetic, model, count, contexts, flags != 0, values);
+    if (fits(model, 3, nodes))
+        return encodes ? code_numbers<true, 3>(arithmetic, model, count, contexts, flags != 0, values)
+                       : code_numbers<false, 3>(arithmetic, model, count, contexts, flags != 0, values);
+    return kRefused;
 }

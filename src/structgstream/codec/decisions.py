@@ -42,7 +42,7 @@ def code_activity(
     if not takes_native(native):
         reference.code_activity(arithmetic, models, history=history, sizes=sizes, active=active)
         return
-    state, blocks, rows = arithmetic.native(), models[0].native(), models[1].native()
+    state, blocks, rows = arithmetic.native(), models[0].native, models[1].native
     result = native_library().sgs_code_activity(
         *map(ctypes.byref, (state, blocks, rows)),
         ctypes.c_int(arithmetic.encodes),
@@ -75,7 +75,7 @@ def code_residuals(
     arithmetic.reserve(residuals.size)
     if not takes_native(native):
         return reference.code_residuals(arithmetic, model, last=last, others=others, residuals=residuals)
-    state, its_model = arithmetic.native(), model.native()
+    state, its_model = arithmetic.native(), model.native
     result = native_library().sgs_code_residuals(
         *map(ctypes.byref, (state, its_model)),
         ctypes.c_int(arithmetic.encodes),
@@ -109,7 +109,7 @@ def code_numbers(
     arithmetic.reserve(len(values))
     if not takes_native(native):
         return reference.code_numbers(arithmetic, model, contexts=contexts, values=values, flags=flags)
-    state, its_model = arithmetic.native(), model.native()
+    state, its_model = arithmetic.native(), model.native
     result = native_library().sgs_code_numbers(
         *map(ctypes.byref, (state, its_model)),
         ctypes.c_int(arithmetic.encodes),

@@ -11,6 +11,7 @@ length.
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +97,7 @@ class Model:
         """Decisions of a number."""
         return self.chances.shape[1]
 
+    @cached_property
     def native(self) -> NativeModel:
         """The same memory, for C++."""
         arrays = (self.chances, self.seen, self.weights, self.starts)

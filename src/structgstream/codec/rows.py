@@ -25,10 +25,12 @@ class Change:
     Args:
         residuals: ``[n, C]``, zero in rows that did not change.
         history: u8 ``[n]``: bit 0 says whether this frame changed the row, bits 1 and 2 whether those before did.
+        sizes: i32 ``[n]``: of each row's residuals together.
     """
 
     residuals: Bins
     history: NDArray[np.uint8]
+    sizes: Bins
 
     @property
     def active(self) -> Flags:
@@ -38,21 +40,22 @@ class Change:
     @classmethod
     def none(cls, rows: int, columns: int) -> "Change":
         """Nothing changed."""
-        return cls(np.zeros((rows, columns), np.int32), np.zeros(rows, np.uint8))
+        return cls(np.zeros((rows, columns), np.int32), np.zeros(rows, np.uint8), np.zeros(rows, np.int32))
 
     @classmethod
     def of(cls, residuals: Bins) -> "Change":
         """What these residuals ``[n, C]`` make."""
-        return cls(residuals, (residuals != 0).any(axis=1).astype(np.uint8))
+        return cls(residuals, (residuals != 0).any(axis=1).astype(np.uint8), _sizes(residuals))
 
     def select(self, rows: NDArray[np.bool_]) -> "Change":
         """Of the rows of a mask."""
-        return Change(self.residuals[rows], self.history[rows])
+        return Change(self.residuals[rows], self.history[rows], self.sizes[rows])
 
     def grown(self, rows: int) -> "Change":
         """With so many rows more, which did not change."""
         more = Change.none(rows, self.residuals.shape[1])
-        return Change(np.concatenate([self.residuals, more.residuals]), np.concatenate([self.history, more.history]))
+        pairs = ((self.residuals, more.residuals), (self.history, more.history), (self.sizes, more.sizes))
+        return Change(*map(np.concatenate, pairs))
 
 
 def coded_change(
@@ -72,7 +75,7 @@ def coded_change(
         f"{groups[0][0]}.active",
         None if change is None else change.active,
         history=before.history,
-        sizes=_sizes(before.residuals),
+        sizes=before.sizes,
     )
     rows = np.flatnonzero(active)
     residuals = np.zeros_like(before.residuals)
@@ -82,9 +85,11 @@ def coded_change(
         found = coder.residuals(f"{name}.change", given, last=before.residuals[rows, first:end], others=others)
         residuals[rows, first:end] = found
         others = others + _sizes(found)
-    return Change(residuals, before.history << 1 & _REMEMBERED | active)
+    sizes = np.zeros(len(active), np.int32)
+    sizes[rows] = others
+    return Change(residuals, before.history << 1 & _REMEMBERED | active, sizes)
 
 
 def _sizes(residuals: Bins) -> Bins:
     """Of each row's residuals together; no context tells so large ones apart that the limit matters."""
-    return np.minimum(np.abs(residuals), _MOST).sum(axis=1, dtype=np.int32)
+    return np.minimum(np.abs(residuals), _MOST) @ np.ones(residuals.shape[1], np.int32)
