@@ -70,9 +70,7 @@ class _Adaptive:
         if found.size:
             model = self._models.get(name, residual_contexts(found.shape[1]), nodes=NUMBER_NODES)
             last = np.ascontiguousarray(last)
-            self._looked_at(
-                name, code_residuals(self._code(name), model, last=last, others=others, residuals=found)
-            )
+            self._looked_at(name, code_residuals(self._code(name), model, last=last, others=others, residuals=found))
         return found
 
     def flags(self, name: str, values: Flags | None, inputs: Inputs, *, counts: Sequence[int]) -> Flags:
@@ -136,7 +134,10 @@ class AdaptiveDecoder(_Adaptive):
                 raise StreamError(f"{self._where} has {code.size} bytes of {name}, which are not all; it is damaged.")
 
     def _code(self, name: str) -> Arithmetic:
-        return self._codes[name.partition(".")[0]]
+        field = name.partition(".")[0]
+        if field not in self._codes:
+            raise StreamError(f"{self._where} holds no {field}, which the header announces; it is damaged.")
+        return self._codes[field]
 
     def _looked_at(self, name: str, sound: bool) -> None:
         if not sound:

@@ -107,7 +107,13 @@ def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, f
 
 
 def coded_scene(
-    coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, *, fields: Sequence[FieldName], has_free: bool, where: str
+    coder: AdaptiveCoder,
+    after: SceneBins | None,
+    before: SceneBins,
+    *,
+    fields: Sequence[FieldName],
+    has_free: bool,
+    where: str,
 ) -> SceneBins:
     """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
 

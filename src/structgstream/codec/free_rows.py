@@ -87,7 +87,9 @@ def _coded_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, wh
     given = None if new is None else np.array([len(new.births)])
     count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
     if not 0 <= count <= MOST_FREE - len(alive):
-        raise StreamError(f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}, or fewer than none.")
+        raise StreamError(
+            f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}, or fewer than none."
+        )
     if not count:
         return FreeBins.none()
     nothing = np.zeros(count, np.int32)
@@ -157,4 +159,3 @@ def _restarted_sums(steps: NDArray[np.int64], fresh: Flags) -> NDArray[np.int64]
     group = np.searchsorted(starts, np.arange(len(steps)), side="right") - 1
     base = total[starts] - steps[starts]
     return total - base[group]
-

@@ -74,11 +74,12 @@ def check_prefix(data: Stored, name: str) -> None:
         raise StreamError(f"{name} is cut at byte {len(data)}, before anything that can be shown.")
     _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
-        newer, older = "Install a newer structgstream.", "Reconstruct it again, or install the structgstream that wrote it."
-        advice = newer if major > MAJOR else older
-        raise StreamError(
-            f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}"
+        newer, older = (
+            "Install a newer structgstream.",
+            "Reconstruct it again, or install the structgstream that wrote it.",
         )
+        advice = newer if major > MAJOR else older
+        raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}")
 
 
 def head_at(data: Stored, offset: int) -> tuple[int, int] | None:

@@ -149,7 +149,9 @@ export class AdaptiveDecoder {
   }
 
   private codeOf(name: string): Arithmetic {
-    return this.codes.get(fieldIn(name))!;
+    const code = this.codes.get(fieldIn(name));
+    if (!code) throw new StreamError(`${this.where} holds no ${fieldIn(name)}; it is damaged.`);
+    return code;
   }
 
   private check(name: string, code: Arithmetic): void {
