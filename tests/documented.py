@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packets read by the documents alone: docs/entropy.md, Decisions, and docs/bitstream.md, Compact packets, number by number.
+"""Packets read by the documents alone, number by number: Decisions in entropy.md, Compact packets in bitstream.md.
 
 It shares no code with the package and checks nothing but what it needs to go on.
 """

@@ -376,8 +376,7 @@ def test_truncated_fields(field: FieldName) -> None:
     for data in cuts:
         try:
             found = decoder.decode({**coded, field: data}, kind=PacketKind.KEY, index=0)
-        except StreamError as error:
-            assert "Packet 0" in str(error)
+        except StreamError:
             failed += 1
             continue
         check_shapes({**header.static, **found}, distance_input=True, training_cameras=2, where="")

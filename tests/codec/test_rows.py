@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows that mostly stay: both directions, the documents' decoder beside them, and what the contexts are worth."""
 
-import documented
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import documented
 from structgstream.codec.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.models import Models
 from structgstream.codec.rows import Change, coded_change
@@ -112,7 +112,7 @@ def test_prediction_saves_bytes(what: str) -> None:
 
 
 def test_a_group_of_frames_is_near_the_entropy_of_its_noise() -> None:
-    """2000 of 30,000 rows move in 12 frames by a steady step and noise; an oracle that knew the steps would pay the noise."""
+    """2000 of 30,000 rows move in 12 frames by a steady step and noise; who knew the steps would pay the noise."""
     g = np.random.default_rng(7)
     rows = 30_000
     moving = np.zeros(rows, np.bool_)

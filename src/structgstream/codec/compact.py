@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from structgstream.codec.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.bins import (
     ANCHOR_ROWS,
     FREE_STEPS,
@@ -20,7 +21,6 @@ from structgstream.codec.bins import (
     coded_scene,
     valued,
 )
-from structgstream.codec.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.errors import StreamError

@@ -104,7 +104,7 @@ def _coded_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, wh
     fresh = frames != 0
     numbers = coder.numbers("free_births.number", numbers, [fresh], counts=[2])
     frame, number = np.cumsum(frames), _restarted_sums(numbers, fresh)
-    if not (0 <= int(frame.min()) <= int(frame.max()) < 1 << 31 and 0 <= int(number.min())):
+    if not (0 <= int(frame.min()) <= int(frame.max()) < 1 << 31 and int(number.min()) >= 0):
         raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
     if int(number.max()) >= 1 << _FRAME_BITS:
         raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
@@ -117,7 +117,7 @@ def _coded_born(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: i
     """The bins ``[count, 14]`` of what is born, column by column.
 
     Most are like those of the row before, the last of what is alive before the first. What hardly differs between free
-    Gaussians is told as their difference from the mean of what is alive, and green and blue change as the colour before.
+    Gaussians is told as the difference from the mean of what is alive, and green and blue change as the colour before.
     """
     start = alive[-1].astype(np.int64) if len(alive) else np.zeros(FREE_COLUMNS, np.int64)
     found = np.zeros((count, FREE_COLUMNS), np.int64)

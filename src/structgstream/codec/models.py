@@ -3,9 +3,9 @@
 
 Note [One state a field]
 ~~~~~~~~~~~~~~~~~~~~~~~~
-A packet is small, so nothing in it is told that can be learned: chances are those of the packets before in the group, and
-go on with every decision. Each field of a packet is one arithmetic code, which ends up to a byte above its decisions'
-length.
+A packet is small, so nothing in it is told that can be learned: chances are those of the packets before in the group,
+and go on with every decision. Each field of a packet is one arithmetic code, at most two bytes above what its decisions
+take.
 """
 
 import ctypes

@@ -247,10 +247,9 @@ def _residual_contexts(
     told = sum(map(abs, row[:column]))
     first = row[column - 1] if column else 0
     off = first - past[column - 1] if column else 0
-    if any(past):
-        led = 10 * own + 3 * (above + below) if level else 16 * own
-    else:
-        led = 8 * (above + below)
+    beginning = 8 * (above + below)
+    going_on = 10 * own + 3 * (above + below) if level else 16 * own
+    led = going_on if any(past) else beginning
     expected = size_class(abs(led) + 4 >> 3)
     return (
         (_limited(own, 8) + 8) * columns + column,

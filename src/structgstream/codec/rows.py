@@ -54,8 +54,11 @@ class Change:
     def grown(self, rows: int) -> "Change":
         """With so many rows more, which did not change."""
         more = Change.none(rows, self.residuals.shape[1])
-        pairs = ((self.residuals, more.residuals), (self.history, more.history), (self.sizes, more.sizes))
-        return Change(*map(np.concatenate, pairs))
+        return Change(
+            np.concatenate([self.residuals, more.residuals]),
+            np.concatenate([self.history, more.history]),
+            np.concatenate([self.sizes, more.sizes]),
+        )
 
 
 def coded_change(
@@ -87,7 +90,8 @@ def coded_change(
         others = others + _sizes(found)
     sizes = np.zeros(len(active), np.int32)
     sizes[rows] = others
-    return Change(residuals, before.history << 1 & _REMEMBERED | active, sizes)
+    history = (before.history << 1 & _REMEMBERED | active).astype(np.uint8)
+    return Change(residuals, history, sizes)
 
 
 def _sizes(residuals: Bins) -> Bins:
