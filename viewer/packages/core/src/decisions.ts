@@ -116,19 +116,19 @@ export class Arithmetic {
     for (let k = 0; k < inputs; k++) {
       const logit = LOGITS[chances[rows[k]! + node]! >> 4]!;
       logits[k] = logit;
-      sum += (weights[first + k]! * logit) >> 16;
+      sum += Math.imul(weights[first + k]!, logit) >> 16;
     }
     const chance = CHANCES[clamped(sum, -FAR, FAR) + FAR]!;
     const yes = this.told(chance);
     const target = yes ? 65536 : 0;
     const error = (target - chance) >> 4;
     for (let k = 0; k < inputs; k++) {
-      const weight = weights[first + k]! + ((logits[k]! * error + 4096) >> 13);
+      const weight = weights[first + k]! + ((Math.imul(logits[k]!, error) + 4096) >> 13);
       weights[first + k] = clamped(weight, -WEIGHT_LIMIT, WEIGHT_LIMIT);
       const cell = rows[k]! + node;
       const before = chances[cell]!;
       const count = seen[cell]!;
-      chances[cell] = clamped(before + (((target - before) * SHARES[count]!) >> 16), LEAST, MOST);
+      chances[cell] = clamped(before + (Math.imul(target - before, SHARES[count]!) >> 16), LEAST, MOST);
       if (count < 255) seen[cell] = count + 1;
     }
     return yes;
@@ -155,20 +155,21 @@ export class Arithmetic {
       this.range = -1;
       for (let i = 0; i < 4; i++) this.take();
     }
-    let range = this.range >>> 0;
-    const bound = (range >>> 16) * chance;
-    const yes = this.low >>> 0 < bound;
+    // All are kept as signed numbers of 32 bits; `>>> 0` says which is the larger.
+    let range = this.range;
+    const bound = Math.imul(range >>> 16, chance);
+    const yes = this.low >>> 0 < bound >>> 0;
     if (yes) {
       range = bound;
     } else {
       this.low = (this.low - bound) | 0;
-      range -= bound;
+      range = (range - bound) | 0;
     }
-    while (range < 1 << 24) {
+    while (range >>> 24 === 0) {
       this.take();
-      range *= 256;
+      range <<= 8;
     }
-    this.range = range | 0;
+    this.range = range;
     return yes ? 1 : 0;
   }
 
