@@ -168,10 +168,11 @@ function decodedBlocks(code: Arithmetic, model: Model, history: Uint8Array): Uin
   const count = Math.ceil(history.length / BLOCK);
   const last = new Uint8Array(count + 2);
   const ever = new Uint8Array(count);
-  for (const [i, past] of history.entries()) {
-    const block = (i / BLOCK) | 0;
-    last[block + 1]! += past & 1;
-    ever[block]! += past ? 1 : 0;
+  for (let i = 0; i < history.length; i++) {
+    const past = history[i]!;
+    if (!past) continue;
+    last[((i / BLOCK) | 0) + 1]! += past & 1;
+    ever[(i / BLOCK) | 0]!++;
   }
   for (const [i, active] of last.entries()) last[i] = bitLength(active, 5);
   const found = new Uint8Array(count + 8);

@@ -58,8 +58,9 @@ export function decodedChange(decoder: AdaptiveDecoder, before: Change, groups: 
     }
   }
   const sizes = new Int32Array(active.length);
-  for (const [a, row] of rows.entries()) sizes[row] = others[a]!;
-  const history = active.map((now, i) => ((before.history[i]! << 1) & REMEMBERED) | now);
+  for (let a = 0; a < rows.length; a++) sizes[rows[a]!] = others[a]!;
+  const history = new Uint8Array(active.length);
+  for (let i = 0; i < history.length; i++) history[i] = ((before.history[i]! << 1) & REMEMBERED) | active[i]!;
   return { history, sizes, residuals, columns };
 }
 
