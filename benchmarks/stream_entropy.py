@@ -1,58 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What entropy coding costs in a stream: ``python -m benchmarks.stream_entropy FILE ...``.
+"""Where a stream's coded bytes go: ``python -m benchmarks.stream_entropy FILE ...``.
 
-For the init record and for all packets: the bytes of their sections of symbols, tables and heads included, beside the
-symbols' empirical entropy given their contexts. It takes the frequencies of every section alone, or those of all
-sections of one name in a group of packets, which share their tables; neither pays for telling them.
+For the init record: the bytes of its sections of symbols, tables and heads included, beside the symbols' empirical
+entropy given their contexts, which does not pay for telling the frequencies. For all packets: the bytes by name.
 """
 
 import sys
-from collections.abc import Iterator
+from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.codec.adaptive import AdaptiveDecoder
 from structgstream.codec.coder import Contexts, Decoder
-from structgstream.codec.packets import PacketKind
-from structgstream.codec.reader import StreamReader, open_stream
-
-Counts = dict[str, NDArray[np.int64]]
+from structgstream.codec.reader import open_stream
 
 
 class Counted:
-    """Listens to a decoder: bytes of sections, and their symbols by name of the section and context."""
+    """Listens to a decoder: bytes of sections, and the entropy of their symbols given their contexts."""
 
     def __init__(self) -> None:
         self.bytes = 0
-        self.alone_bytes = 0.0
-        """Entropy, every section taken alone."""
-        self.counts: Counts = {}
+        self.entropy_bytes = 0.0
 
-    def entropy_bytes(self) -> float:
-        """Entropy, all sections of a name taken together."""
-        return sum(map(_entropy_bytes, self.counts.values()))
-
-    def section(self, name: str, counts: NDArray[np.int64], size: int) -> None:
+    def section(self, counts: NDArray[np.int64], size: int) -> None:
         """A section of ``size`` bytes, its symbols counted by context."""
+        share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
         self.bytes += size
-        self.alone_bytes += _entropy_bytes(counts)
-        self.counts[name] = self.counts.get(name, np.zeros_like(counts)) + counts
-
-    def add(self, other: "Counted") -> None:
-        """Bytes and symbols of another one."""
-        self.bytes += other.bytes
-        self.alone_bytes += other.alone_bytes
-        for name, counts in other.counts.items():
-            self.counts[name] = self.counts.get(name, np.zeros_like(counts)) + counts
+        self.entropy_bytes -= float((counts * np.log2(np.where(share > 0, share, 1))).sum()) / 8
 
 
-def _entropy_bytes(counts: NDArray[np.int64]) -> float:
-    share = counts / np.maximum(counts.sum(1, keepdims=True), 1)
-    return -float((counts * np.log2(np.where(share > 0, share, 1))).sum()) / 8
-
-
-def counted_parts(path: str) -> Iterator[tuple[PacketKind | None, Counted]]:
-    """The init record (None) and every packet of a stream."""
+def counted_init(path: str) -> Counted:
+    """The sections of the init record."""
     current = Counted()
     section = Decoder._section
 
@@ -62,41 +41,48 @@ def counted_parts(path: str) -> Iterator[tuple[PacketKind | None, Counted]]:
         symbols = section(self, name, contexts, count=count, alphabet=alphabet)
         counts = np.zeros((count, alphabet), np.int64)
         np.add.at(counts, (contexts, symbols), 1)
-        current.section(name, counts, before - len(self._left[field]))
+        current.section(counts, before - len(self._left[field]))
         return symbols
 
     Decoder._section = listening
     try:
-        reader: StreamReader = open_stream(path)
-        yield None, current
-        for info in reader.packets:
-            current = Counted()
-            reader.scene(info.index)
-            yield info.kind, current
+        open_stream(path)
     finally:
         Decoder._section = section
+    return current
+
+
+def packet_bytes(path: str) -> Counter[str]:
+    """The bytes of all packets by name; a byte counts where it is taken."""
+    found: Counter[str] = Counter()
+    before: Counter[str] = Counter()  # of a field, in this packet
+    looked_at = AdaptiveDecoder._looked_at
+
+    def listening(self: AdaptiveDecoder, name: str, sound: bool) -> None:
+        looked_at(self, name, sound)
+        field = name.partition(".")[0]
+        taken = min(self._codes[field].place, self._codes[field].size)
+        found[name] += taken - before[field]
+        before[field] = taken
+
+    AdaptiveDecoder._looked_at = listening
+    try:
+        reader = open_stream(path)
+        for info in reader.packets:
+            before.clear()
+            reader.scene(info.index)
+    finally:
+        AdaptiveDecoder._looked_at = looked_at
+    return found
 
 
 def told(path: str) -> str:
-    """One line a part."""
-    header, packets, groups = Counted(), Counted(), []
-    for kind, part in counted_parts(path):
-        if kind is None:
-            header = part
-            continue
-        if kind is PacketKind.KEY:
-            groups.append(Counted())
-        groups[-1].add(part)
-        packets.add(part)
-    lines = [path]
-    for name, size, entropy in (
-        ("init record, each section alone", header.bytes, header.alone_bytes),
-        ("packets, each section alone", packets.bytes, packets.alone_bytes),
-        ("packets, with the rest of their group", packets.bytes, sum(group.entropy_bytes() for group in groups)),
-    ):
-        share = f", {100 * (size / entropy - 1):.2f} % over" if entropy else ""
-        lines.append(f"  {name}: {size:,} bytes, entropy {entropy:,.0f}{share}")
-    return "\n".join(lines)
+    """One line for the init record, and one for each name."""
+    init, packets = counted_init(path), packet_bytes(path)
+    share = f", {100 * (init.bytes / init.entropy_bytes - 1):.2f} % over" if init.entropy_bytes else ""
+    lines = [path, f"  init record: {init.bytes:,} bytes, entropy {init.entropy_bytes:,.0f}{share}"]
+    lines += [f"  {name}: {size:,} bytes" for name, size in sorted(packets.items())]
+    return "\n".join([*lines, f"  packets together: {packets.total():,} bytes"])
 
 
 if __name__ == "__main__":

@@ -214,10 +214,10 @@ def delta_bytes(rate_weight: float) -> int:
 
 
 def test_a_higher_price_makes_fewer_bytes() -> None:
-    """Up to a price of 0.01 here: from there on no anchor moves any more, and what is left are empty tables."""
+    """Up to a price of 0.01 here: from there on no anchor moves any more, and what is left are heads of blocks."""
     sizes = [delta_bytes(weight) for weight in (0.0, 1e-3, 1e-2, 1.0)]
     assert sizes[0] > 1.6 * sizes[1] > 2.0 * sizes[2]
-    assert sizes[2] == sizes[3] == 3 * 42
+    assert sizes[2] == sizes[3] == 3 * 17
 
 
 def test_without_a_look_at_motion_everything_moves_f_sigma_too() -> None:

@@ -120,6 +120,38 @@ int sgs_rans_decode(
     const uint16_t* words, int64_t word_count, const uint32_t* states, int lanes, const uint16_t* contexts,
     int64_t count, const uint16_t* frequencies, int64_t context_count, int alphabet, uint8_t* symbols);
 
+/* Adaptive decisions (docs/entropy.md). The bytes of a field while they are written or read: `size` is their number for
+ * reading, the room for writing; all else is 0 at first. A model has `inputs` cells for each decision: input k the chances and
+ * counts from row starts[k] + context on, `nodes` in a row, and weights [nodes, inputs]. */
+typedef struct {
+    uint8_t* bytes;
+    int64_t size, place;
+    uint32_t low, range;
+    int32_t started;
+} sgs_arithmetic;
+typedef struct {
+    uint16_t* chances;
+    uint8_t* seen;
+    int32_t* weights;
+    const int32_t* starts;
+    int32_t inputs, nodes;
+} sgs_model;
+
+/* What is coded (encodes: 1) or decoded (0) in place. Contexts are not checked; room for writing must suffice. Return 0; 1 where
+ * memory does not suffice; 2 where a number is out of bounds; 3 where the model does not fit.
+ * Activity: history u8 [count], sizes [count] of the last residuals, active u8 [count].
+ * Residuals of active rows [count, columns], their last ones, and others [count], the sizes in groups before.
+ * Numbers [count], or flags with a model of one node; contexts [count, inputs]. */
+int sgs_code_activity(
+    sgs_arithmetic* arithmetic, const sgs_model* blocks, const sgs_model* rows, int encodes, int64_t count,
+    const uint8_t* history, const int32_t* sizes, uint8_t* active);
+int sgs_code_residuals(
+    sgs_arithmetic* arithmetic, const sgs_model* model, int encodes, int64_t count, int columns, const int32_t* last,
+    const int32_t* others, int32_t* residuals);
+int sgs_code_numbers(
+    sgs_arithmetic* arithmetic, const sgs_model* model, int encodes, int64_t count, const int32_t* contexts, int flags,
+    int64_t* values);
+
 #ifdef __cplusplus
 }
 #endif

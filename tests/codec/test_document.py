@@ -12,13 +12,12 @@ from collections.abc import Callable
 import numpy as np
 import zstandard
 
+from documented import FREE, Model, Packet, Row, Rows, read_free
 from vectors.generate import COMPACT_EXPECTED, COMPACT_STREAM
 
-Row = list[int]
 NAMES = {1: "anchor_positions", 2: "offset_scales", 3: "base_scales", 4: "anchor_offsets", 5: "anchor_features"}
 NAMES |= {6: "opacity_mlp", 7: "color_mlp", 8: "covariance_mlp", 9: "free", 10: "free_births", 11: "camera_color"}
 NAMES |= {12: "appearance", 13: "appearance_basis", 14: "environment"}
-FREE = [("free_means", 3), ("free_log_scales", 3), ("free_quats", 4), ("free_logit_opacities", 1), ("free_colors", 3)]
 
 
 class Bits:
@@ -103,7 +102,7 @@ def tables_of(bits: Bits, previous: list[Row]) -> list[Row]:
 
 
 class Fields:
-    """Section Sections of Compact packets: the bytes of each field, read from its beginning, and the tables."""
+    """Section Coded init fields: the bytes of each field, read from its beginning, and the tables."""
 
     def __init__(self, data: dict[str, bytes], tables: dict[str, list[Row]]) -> None:
         self.data, self.tables = data, tables
@@ -147,9 +146,6 @@ class Fields:
         assert next(following, None) is None
         return symbols
 
-    def flags(self, name: str, contexts: Row, c: int) -> Row:
-        return self.section(name, contexts, c, 2)
-
     def residuals(self, name: str, contexts: Row, c: int) -> Row:
         symbols = self.section(name, contexts, c, 16)
         escapes = Bits(self.take(name, self.number(name)))
@@ -167,89 +163,6 @@ class Fields:
         below = [max(length - 1, 0) for length in lengths]
         rest = Bits(self.take(name, math.ceil(sum(below) / 8)))
         return [2**b + rest.bits(b) if length else 0 for length, b in zip(lengths, below, strict=True)]
-
-
-def limited(value: int, most: int) -> int:
-    return max(-most, min(most, value))
-
-
-def change(fields: Fields, last: list[Row], active: Row, groups: list[tuple[str, int, int]]) -> tuple[list[Row], Row]:
-    """Section Rows: residuals and activity, from the last ones."""
-    n, first = len(last), groups[0][0]
-    level = [min((sum(active[max(i - 3, 0) : i + 4]) - active[i] + 1) // 2, 3) for i in range(n)]
-    now = [0] * (n + 1)
-    for start in (0, 1):
-        rows = range(start, n, 2)
-        beside = {i: now[i - 1] + now[i + 1] if start else 0 for i in rows}
-        contexts = [(active[i] * 3 + beside[i]) * 4 + level[i] for i in rows]
-        for i, flag in zip(rows, fields.flags(f"{first}.active{start}", contexts, 24), strict=True):
-            now[i] = flag
-    moving = [i for i in range(n) if now[i]]
-    found = [[0] * len(row) for row in last]
-    for name, begin, end in groups:
-        nothing = [0] * (end - begin)
-        for start in (0, 1):
-            contexts = []
-            for a in range(start, len(moving), 2):
-                sides = (a - 1, a + 1) if start else ()
-                near = [found[moving[b]][begin:end] if b < len(moving) else nothing for b in sides]
-                for column in range(begin, end):
-                    both = limited(sum(side[column - begin] for side in near), 3)
-                    contexts.append((limited(last[moving[a]][column], 2) + 2) * 7 + both + 3)
-            values = iter(fields.residuals(f"{name}.change{start}", contexts, 35))
-            for a in range(start, len(moving), 2):
-                found[moving[a]][begin:end] = [next(values) for _ in range(begin, end)]
-    return found, now[:n]
-
-
-class Rows:
-    """Rows of bins, and their last change."""
-
-    def __init__(self, bins: list[Row]) -> None:
-        self.bins = bins
-        self.forget()
-
-    def forget(self) -> None:
-        self.last, self.active = [[0] * len(row) for row in self.bins], [0] * len(self.bins)
-
-    def keep(self, which: Row) -> None:
-        self.bins, self.last = [self.bins[i] for i in which], [self.last[i] for i in which]
-        self.active = [self.active[i] for i in which]
-
-    def read(self, fields: Fields, groups: list[tuple[str, int, int]]) -> None:
-        self.last, self.active = change(fields, self.last, self.active, groups)
-        self.bins = [[a + b for a, b in zip(*rows, strict=True)] for rows in zip(self.bins, self.last, strict=True)]
-
-
-def read_free(fields: Fields, free: Rows, births: Row) -> Row:
-    """Section Free 3DGs; the births afterwards."""
-    alive = fields.flags("free_births.alive", free.active, 2)
-    which = [i for i, flag in enumerate(alive) if flag]
-    free.keep(which)
-    births = [births[i] for i in which]
-    groups, column = [], 0
-    for name, width in FREE:
-        groups.append((name.replace("free_", "free.", 1), column, column + width))
-        column += width
-    free.read(fields, groups)
-    n = fields.number("free_births.count")
-    if not n:
-        return births
-    frames = fields.naturals("free_births.frame", [0] * n, 1)
-    numbers = fields.naturals("free_births.number", [int(frame != 0) for frame in frames], 2)
-    frame = number = 0
-    for i, (step, value) in enumerate(zip(frames, numbers, strict=True)):
-        frame, number = frame + step, value if step or not i else number + value
-        births.append(frame * 2**32 + number)
-    values, row = fields.naturals("free.born", [*range(14)] * n, 14), [0] * 14
-    for i in range(n):
-        steps = [-(v + 1) // 2 if v % 2 else v // 2 for v in values[14 * i : 14 * i + 14]]
-        row = [a + b for a, b in zip(row, steps, strict=True)]
-        free.bins.append(row)
-        free.last.append([0] * 14)
-        free.active.append(0)
-    assert births == sorted(set(births))
-    return births
 
 
 def blocks(data: bytes) -> dict[str, tuple[list[int], bytes]]:
@@ -350,7 +263,7 @@ def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> No
     static = {name: numbers for name, (_, numbers) in stored.items() if name not in dynamic}
     anchors = [name for code, name in NAMES.items() if code <= 3 and name in dynamic]
     weights = [name for code, name in NAMES.items() if 6 <= code <= 8 and name in dynamic]
-    tables: dict[str, list[Row]] = {}
+    models: dict[str, Model] = {}
     rows, births = {"anchors": Rows([]), "free": Rows([])}, []
     for kind, payload in packets:
         if kind == 2:
@@ -361,13 +274,13 @@ def frames_of(data: bytes, emit: Callable[[dict[str, list[float]]], None]) -> No
             beside = zip(*(bins[name] for name in anchors), strict=True)
             rows = {"anchors": Rows([[bin for part in row for bin in part] for row in beside])}
             rows |= {name: Rows(bins[name]) for name in weights} | {"free": Rows([])}
-            births, tables = [], {}
-        fields = Fields({name: raw for name, (_, raw) in blocks(payload[12:]).items()}, tables)
-        rows["anchors"].read(fields, [(name, 3 * i, 3 * i + 3) for i, name in enumerate(anchors)])
+            births, models = [], {}
+        packet = Packet({name: raw for name, (_, raw) in blocks(payload[12:]).items()}, models)
+        rows["anchors"].read(packet, [(name, 3 * i, 3 * i + 3) for i, name in enumerate(anchors)])
         for name in weights:
-            rows[name].read(fields, [(name, 0, 1)])
-        births = read_free(fields, rows["free"], births)
-        assert not any(fields.data.values())
+            rows[name].read(packet, [(name, 0, 1)])
+        births = read_free(packet, rows["free"], births)
+        assert packet.is_whole()
         told = {name: values(rows[name].bins, steps[name]) for name in weights}
         for i, name in enumerate(anchors):
             told[name] = values([row[3 * i : 3 * i + 3] for row in rows["anchors"].bins], steps[name])

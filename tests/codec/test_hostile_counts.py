@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every count of a compact stream made as large as it can be: refused, and before memory is taken for it."""
+"""Every count of a compact init record made as large as it can be: refused, and before memory is taken for it.
+
+Packets have one count, of births, which ``test_free_rows.py`` looks at.
+"""
 
 import tracemalloc
 from collections.abc import Callable, Iterator, Mapping
@@ -37,11 +40,10 @@ class Count(NamedTuple):
     end: int
 
 
-def header_with_all() -> tuple[StreamHeader, Fields]:
-    """A header, and the first packet's fields, that have everything that can be there."""
+def header_with_all() -> StreamHeader:
+    """A header that has everything that can be there."""
     first = with_appearance(small_scene(2, free=3), 1)
-    header = compact_header(first, dynamic=CODABLE)
-    return header, CompactEncoder(header).encode(state_of(first), kind=PacketKind.KEY, index=0)
+    return compact_header(first, dynamic=CODABLE)
 
 
 def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]:
@@ -96,20 +98,8 @@ def check_all_refused(fields: Fields, counts: list[Count], decode: Callable[[Fie
         tracemalloc.stop()
 
 
-def test_counts_in_packets() -> None:
-    header, fields = header_with_all()
-
-    def decode(given: Fields) -> object:
-        return CompactDecoder(header).decode(given, kind=PacketKind.KEY, index=0)
-
-    counts = counts_of(fields, decode)
-    assert len(counts) > 80
-    assert {count.field for count in counts} == CODABLE
-    check_all_refused(fields, counts, decode)
-
-
 def test_counts_in_the_init_record() -> None:
-    header, _ = header_with_all()
+    header = header_with_all()
     payload = packed_header(header)
     (length,) = LENGTH.unpack_from(payload)
     coded = mixed_blocks(payload, LENGTH.size + length, where="")[1]
@@ -125,7 +115,7 @@ def test_counts_in_the_init_record() -> None:
 
 
 def test_sizes_in_blocks() -> None:
-    payload = packed_header(header_with_all()[0])
+    payload = packed_header(header_with_all())
     (length,) = LENGTH.unpack_from(payload)
     tracemalloc.start()
     for block in blocks_in(payload, LENGTH.size + length, where=""):
@@ -145,7 +135,7 @@ def test_as_many_free_gaussians_as_a_scene_may_have_take_bounded_memory() -> Non
     state = dict(state_of(first))
     state["free"], state["free_births"] = torch.zeros(2**18, 14), torch.arange(2**18)
     fields = CompactEncoder(header).encode(state, kind=PacketKind.KEY, index=0)
-    assert sum(map(len, fields.values())) < 400
+    assert sum(map(len, fields.values())) < 800
     tracemalloc.start()
     found = CompactDecoder(header).decode(fields, kind=PacketKind.KEY, index=0)
     peak = tracemalloc.get_traced_memory()[1]

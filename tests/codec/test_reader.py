@@ -105,11 +105,13 @@ def test_unknown_records_are_skipped() -> None:
     assert same(reader.scene(3), StreamReader(data).scene(3))
 
 
-def test_a_newer_major_version_is_refused_and_a_newer_minor_is_not() -> None:
+def test_another_major_version_is_refused_and_a_newer_minor_is_not() -> None:
     data = small_stream()
-    with pytest.raises(StreamError, match=r"format version 2\.0; this program reads 1\.x\. Install a newer"):
-        StreamReader(data[:8] + struct.pack("<HH", 2, 0) + data[PREFIX.size :])
-    assert len(StreamReader(data[:8] + struct.pack("<HH", 1, 9) + data[PREFIX.size :])) == 4
+    with pytest.raises(StreamError, match=r"format version 3\.0; this program reads 2\.x\. Install a newer"):
+        StreamReader(data[:8] + struct.pack("<HH", 3, 0) + data[PREFIX.size :])
+    with pytest.raises(StreamError, match=r"format version 1\.0; this program reads 2\.x\. Reconstruct it again"):
+        StreamReader(data[:8] + struct.pack("<HH", 1, 0) + data[PREFIX.size :])
+    assert len(StreamReader(data[:8] + struct.pack("<HH", 2, 9) + data[PREFIX.size :])) == 4
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from structgstream.errors import StreamError
 def test_the_layout_of_a_record() -> None:
     head = bytes([2, 0, 0, 0, 3, 0, 0, 0])
     assert packed(RecordType.KEY, b"abc") == head + b"abc" + struct.pack("<I", zlib.crc32(head + b"abc"))
-    assert prefix() == b"\x89SGS\r\n\x1a\n\x01\x00\x00\x00"
+    assert prefix() == b"\x89SGS\r\n\x1a\n\x02\x00\x00\x00"
 
 
 @given(st.lists(st.binary(max_size=20), max_size=5))

@@ -190,12 +190,12 @@ def test_what_cannot_be_resumed(tmp_path: Path) -> None:
     damaged = bytearray(small_stream())
     damaged[40] ^= 1
     newer = bytearray(small_stream())
-    newer[8] = 2
+    newer[8] = 3
     for content, message in [
         (b"Dear", "is not a structgstream file"),
         (b"A long letter to someone.", "is not a structgstream file"),
         (bytes(damaged), "Cannot continue .*a.sgs: the record at byte 12 .* damaged. Start again with --overwrite"),
-        (bytes(newer), "format version 2.0"),
+        (bytes(newer), "format version 3.0"),
     ]:
         path = tmp_path / "a.sgs"
         path.write_bytes(content)

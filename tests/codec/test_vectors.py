@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The golden streams of format version 1: what was written once must be readable for ever, and raw written the same.
+"""The golden streams of version 2: what a release has written must be readable for ever, and raw written the same.
 
 What a ``compact`` encoder chooses may become better; what a decoder makes of it may not change.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the golden streams of format version 1, one of each codec, and what a decoder must find in them.
+"""Makes the golden streams of format version 2, one of each codec, and what a decoder must find in them.
 
 With ``raw`` every number is a small multiple of a power of two; with ``compact`` it is the product of a whole number
 and a float32, which need not be one: exact in JSON and on any machine. Run from the repository's root, only when a new
@@ -26,8 +26,8 @@ from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_
 from structgstream.similarity import Similarity
 
 FOLDER = Path(__file__).parent
-STREAM, EXPECTED, SUMS = (FOLDER / name for name in ("version-1.sgs", "version-1.json", "SHA256SUMS"))
-COMPACT_STREAM, COMPACT_EXPECTED = (FOLDER / f"version-1-compact.{suffix}" for suffix in ("sgs", "json"))
+STREAM, EXPECTED, SUMS = (FOLDER / name for name in ("version-2.sgs", "version-2.json", "SHA256SUMS"))
+COMPACT_STREAM, COMPACT_EXPECTED = (FOLDER / f"version-2-compact.{suffix}" for suffix in ("sgs", "json"))
 ANCHORS, K, FEATURES, HIDDEN = 3, 2, 2, 3
 KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.KEY)
 COMPACT_KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA)

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.codec.coder import Bins, Coder
+from structgstream.codec.adaptive import AdaptiveCoder
+from structgstream.codec.coder import Bins
 from structgstream.codec.free_rows import FreeBins, coded_free
 from structgstream.codec.rows import Change, coded_change
 from structgstream.errors import StreamError
@@ -106,7 +107,13 @@ def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, f
 
 
 def coded_scene(
-    coder: Coder, after: SceneBins | None, before: SceneBins, *, fields: Sequence[FieldName], has_free: bool, where: str
+    coder: AdaptiveCoder,
+    after: SceneBins | None,
+    before: SceneBins,
+    *,
+    fields: Sequence[FieldName],
+    has_free: bool,
+    where: str,
 ) -> SceneBins:
     """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
 

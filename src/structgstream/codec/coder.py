@@ -5,7 +5,7 @@ Note [Two directions]
 ~~~~~~~~~~~~~~~~~~~~~
 A format is written down once, as a function that hands values to a :class:`Coder` and goes on with what it gets back.
 An encoder is handed the true values and returns them; a decoder is handed None and returns what the bytes say. So the
-two cannot disagree about order or contexts.
+two cannot disagree about order or contexts. Here are the sections of the init record; ``adaptive.py`` has packets.
 """
 
 from collections.abc import Mapping
@@ -34,12 +34,6 @@ _FLAT = 128  # of the geometric rows: what is expected of a context that has not
 
 class Coder(Protocol):
     """Encodes or decodes arrays of whole numbers, one section after another; names tell whose tables are used."""
-
-    def flags(
-        self, name: str, values: NDArray[np.bool_] | None, contexts: Contexts, *, count: int
-    ) -> NDArray[np.bool_]:
-        """Yes or no ``[n]``, with contexts u16 ``[n]`` below ``count``."""
-        ...
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
         """Small signed numbers ``[n]``: up to 7 costs its entropy, what is larger more."""
@@ -73,12 +67,6 @@ class Tables:
         """What the set is from now on."""
         self._sets[name] = tables
 
-    def copy(self) -> "Tables":
-        """The same sets, to go on with apart."""
-        other = Tables()
-        other._sets = dict(self._sets)
-        return other
-
 
 class Encoder:
     """Writes; what a name says before its dot is the field whose bytes in :attr:`fields` grow."""
@@ -86,11 +74,6 @@ class Encoder:
     def __init__(self, tables: Tables) -> None:
         self._tables = tables
         self.fields: dict[str, bytes] = {}
-
-    def flags(self, name: str, values: Flags | None, contexts: Contexts, *, count: int) -> Flags:
-        assert values is not None
-        self._section(name, values.astype(np.uint8), contexts, count=count, alphabet=2)
-        return values
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
         assert values is not None
@@ -136,9 +119,6 @@ class Decoder:
         self._tables = tables
         self._left: dict[str, memoryview] = {name: memoryview(data) for name, data in fields.items()}
         self._where = where
-
-    def flags(self, name: str, values: Flags | None, contexts: Contexts, *, count: int) -> Flags:
-        return self._section(name, contexts, count=count, alphabet=2).astype(np.bool_)
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
         symbols = self._section(name, contexts, count=count, alphabet=ALPHABET)

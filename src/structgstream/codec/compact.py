@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact).
 
-A key packet follows the header's reference state instead, with tables that nothing has used: it stands alone, and so
+A key packet follows the header's reference state instead, with models that have seen nothing: it stands alone, and so
 does the group of packets up to the next one.
 """
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from structgstream.codec.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.bins import (
     ANCHOR_ROWS,
     FREE_STEPS,
@@ -20,7 +21,7 @@ from structgstream.codec.bins import (
     coded_scene,
     valued,
 )
-from structgstream.codec.coder import Coder, Decoder, Encoder, Tables
+from structgstream.codec.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
@@ -35,7 +36,7 @@ class CompactState:
 
     index: int
     bins: SceneBins
-    tables: Tables
+    models: Models
 
 
 class _Compact:
@@ -67,14 +68,14 @@ class _Compact:
         self._reference = binned(known, rows, header.steps)
         self.state: CompactState | None = None
 
-    def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Tables]:
+    def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Models]:
         if kind is PacketKind.KEY:
-            return self._reference, Tables()
+            return self._reference, Models()
         if self.state is None or self.state.index != index - 1:
             raise StreamError(f"Packet {index} needs packet {index - 1}, which was not decoded before it.")
-        return self.state.bins, self.state.tables.copy()
+        return self.state.bins, Models(self.state.models)
 
-    def _coded(self, coder: Coder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
+    def _coded(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
         return coded_scene(
             coder,
             after,
@@ -84,9 +85,9 @@ class _Compact:
             where=f"Packet {index}",
         )
 
-    def _keep(self, kind: PacketKind, index: int, bins: SceneBins, tables: Tables) -> None:
+    def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
         # What a key packet changes is everything since the reference, and tells nothing of what comes next.
-        self.state = CompactState(index, bins.unmoved() if kind is PacketKind.KEY else bins, tables)
+        self.state = CompactState(index, bins.unmoved() if kind is PacketKind.KEY else bins, models)
 
 
 class CompactEncoder(_Compact):
@@ -102,16 +103,17 @@ class CompactEncoder(_Compact):
         Raises:
             StreamError: a value is out of range, or a delta packet does not follow the packet before it.
         """
-        before, tables = self._start(kind, index)
+        before, models = self._start(kind, index)
         after = binned(state, self._header.dynamic, self._header.steps)
         if after.anchors.shape != before.anchors.shape:
             raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
         for name, bins in after.weights.items():
             if bins.shape != before.weights[name].shape:
                 raise StreamError(f"Frame {index} has {name} of another size than the header.")
-        encoder = Encoder(tables)
-        self._keep(kind, index, self._coded(encoder, after, before, index), tables)
-        return {name: encoder.fields.get(name, b"") for name in self._header.dynamic}
+        encoder = AdaptiveEncoder(models, where=f"Frame {index}")
+        self._keep(kind, index, self._coded(encoder, after, before, index), models)
+        fields = encoder.fields()
+        return {name: fields.get(name, b"") for name in self._header.dynamic}
 
 
 class CompactDecoder(_Compact):
@@ -125,11 +127,11 @@ class CompactDecoder(_Compact):
         Raises:
             StreamError: the packet is damaged, or does not follow the one before it.
         """
-        before, tables = self._start(kind, index)
-        decoder = Decoder(tables, fields, where=f"Packet {index}")
+        before, models = self._start(kind, index)
+        decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
         bins = self._coded(decoder, None, before, index)
         decoder.end()
-        self._keep(kind, index, bins, tables)
+        self._keep(kind, index, bins, models)
         return valued(bins, self._header.dynamic, self._header.steps)
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.coder import Bins, Coder, Contexts, Flags
+from structgstream.codec.adaptive import AdaptiveCoder
+from structgstream.codec.coder import Bins, Flags, bit_lengths
 from structgstream.codec.rows import Change, coded_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FREE_COLUMNS
@@ -20,6 +21,8 @@ GROUPS = (
 )
 MOST_FREE = 2**18
 """Free Gaussians that a scene may have: a symbol can take less than a bit, so bytes do not bound their number."""
+_MEANS = range(6, 11)  # quaternions and opacities
+_LED = (12, 13)  # green and blue
 _FRAME_BITS = 32  # a birth is frame * 2^32 + number
 
 
@@ -47,15 +50,14 @@ class FreeBins:
         return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
 
 
-def coded_free(coder: Coder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
+def coded_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
     """Codes what becomes of ``before``; of ``after``, births and bins are looked at.
 
     Raises:
         StreamError: births do not ascend or are out of range, or there are too many.
     """
     alive = None if after is None else np.isin(before.births, after.births)
-    contexts = before.change.active.astype(np.uint16)
-    alive = coder.flags("free_births.alive", alive, contexts, count=2)
+    alive = coder.flags("free_births.alive", alive, [before.change.history], counts=[8])
     old = FreeBins(
         before.births[alive],
         before.bins[alive],
@@ -68,50 +70,86 @@ def coded_free(coder: Coder, after: FreeBins | None, before: FreeBins, *, where:
         change = Change.of(after.bins[kept] - old.bins)
         new = FreeBins(after.births[~kept], after.bins[~kept], Change.none(0, FREE_COLUMNS))
     change = coded_change(coder, change, old.change, groups=GROUPS)
-    born = _coded_births(coder, new, most=MOST_FREE - len(old.births), where=where)
+    kept_bins = old.bins + change.residuals
+    born = _coded_births(coder, new, kept_bins, where=where)
     births = np.concatenate([old.births, born.births])
     if not (np.diff(births) > 0).all():
         raise StreamError(f"{where} has births that do not ascend; it is damaged.")
     return FreeBins(
         births,
-        np.concatenate([old.bins + change.residuals, born.bins]),
-        Change(
-            np.concatenate([change.active, np.zeros(len(born.births), np.bool_)]),
-            np.concatenate([change.residuals, np.zeros_like(born.bins)]),
-        ),
+        np.concatenate([kept_bins, born.bins]),
+        change.grown(len(born.births)),
     )
 
 
-def _coded_births(coder: Coder, new: FreeBins | None, *, most: int, where: str) -> FreeBins:
-    count = coder.number("free_births.count", None if new is None else len(new.births))
-    if count > most:
-        raise StreamError(f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}.")
+def _coded_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
+    """What is born, given the bins of what is alive."""
+    given = None if new is None else np.array([len(new.births)])
+    count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
+    if not 0 <= count <= MOST_FREE - len(alive):
+        raise StreamError(
+            f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}, or fewer than none."
+        )
     if not count:
         return FreeBins.none()
-    nothing = np.zeros(count, np.uint16)
-    frames = numbers = fresh = None
+    nothing = np.zeros(count, np.int32)
+    frames = numbers = None
     if new is not None:
         if int(new.births.min()) < 0:
             raise StreamError(f"{where} has births below 0.")
         frames = np.diff(new.births >> _FRAME_BITS, prepend=0)
         numbers = np.diff(new.births & (1 << _FRAME_BITS) - 1, prepend=0)
-        fresh = frames != 0
-        numbers = np.where(fresh, new.births & (1 << _FRAME_BITS) - 1, numbers)
-    frames = coder.naturals("free_births.frame", frames, nothing, count=1)
+        numbers = np.where(frames != 0, new.births & (1 << _FRAME_BITS) - 1, numbers)
+    frames = coder.numbers("free_births.frame", frames, [nothing], counts=[1])
     fresh = frames != 0
-    numbers = coder.naturals("free_births.number", numbers, fresh.astype(np.uint16), count=2)
+    numbers = coder.numbers("free_births.number", numbers, [fresh], counts=[2])
     frame, number = np.cumsum(frames), _restarted_sums(numbers, fresh)
-    if int(frame[-1]) >= 1 << 31 or int(number.max()) >= 1 << _FRAME_BITS:
+    if not (0 <= int(frame.min()) <= int(frame.max()) < 1 << 31 and int(number.min()) >= 0):
+        raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
+    if int(number.max()) >= 1 << _FRAME_BITS:
         raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
     births = (frame << _FRAME_BITS) + number
-    columns = np.tile(np.arange(FREE_COLUMNS, dtype=np.uint16), (count, 1))
-    steps = None if new is None else _zigzag(np.diff(new.bins.astype(np.int64), axis=0, prepend=0)).ravel()
-    contexts: Contexts = columns.ravel()
-    steps = coder.naturals("free.born", steps, contexts, count=FREE_COLUMNS).reshape(count, FREE_COLUMNS)
-    bins = np.cumsum(np.where(steps % 2 == 1, -(steps >> 1) - 1, steps >> 1), axis=0)
-    if count and not -(2**31) <= int(bins.min()) <= int(bins.max()) < 2**31:
-        raise StreamError(f"{where} has a bin beyond 32 bits; it is damaged.")
-    return FreeBins(births, bins.astype(np.int32), Change.none(count, FREE_COLUMNS))
+    bins = _coded_born(coder, None if new is None else new.bins, alive, count=count, where=where)
+    return FreeBins(births, bins, Change.none(count, FREE_COLUMNS))
+
+
+def _coded_born(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
+    """The bins ``[count, 14]`` of what is born, column by column.
+
+    Most are like those of the row before, the last of what is alive before the first. What hardly differs between free
+    Gaussians is told as the difference from the mean of what is alive, and green and blue change as the colour before.
+    """
+    start = alive[-1].astype(np.int64) if len(alive) else np.zeros(FREE_COLUMNS, np.int64)
+    found = np.zeros((count, FREE_COLUMNS), np.int64)
+    one, two = np.zeros((2, count), np.int64)  # errors in the columns before
+    for column in range(FREE_COLUMNS):
+        has_mean = column in _MEANS
+        mean = int(alive[:, column].sum(dtype=np.int64)) // len(alive) if has_mean and len(alive) else 0
+        led = np.diff(found[:, column - 1], prepend=start[column - 1]) if column in _LED else 0
+        errors = None
+        if new is not None:
+            true = new[:, column].astype(np.int64)
+            errors = true - mean if has_mean else np.diff(true, prepend=start[column]) - led
+        length, before = _length(one), _length(two)
+        errors = coder.numbers(
+            "free.born",
+            errors,
+            [
+                np.full(count, column),
+                (column * 13 + length) * 3 + np.sign(one) + 1,
+                column * 13 + np.minimum(length + before, 12),
+            ],
+            counts=[FREE_COLUMNS, FREE_COLUMNS * 39, FREE_COLUMNS * 13],
+        )
+        found[:, column] = errors + mean if has_mean else np.cumsum(errors + led) + start[column]
+        if not -(2**31) <= int(found[:, column].min()) <= int(found[:, column].max()) < 2**31:
+            raise StreamError(f"{where} has a bin beyond 32 bits; it is damaged.")
+        one, two = errors, one
+    return found.astype(np.int32)
+
+
+def _length(errors: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.minimum(bit_lengths(np.abs(errors)), 12)
 
 
 def _restarted_sums(steps: NDArray[np.int64], fresh: Flags) -> NDArray[np.int64]:
@@ -121,7 +159,3 @@ def _restarted_sums(steps: NDArray[np.int64], fresh: Flags) -> NDArray[np.int64]
     group = np.searchsorted(starts, np.arange(len(steps)), side="right") - 1
     base = total[starts] - steps[starts]
     return total - base[group]
-
-
-def _zigzag(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.where(values < 0, -2 * values - 1, 2 * values)

@@ -29,7 +29,7 @@ def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: 
 
 def has_native() -> bool:
     """Whether the native library is there and has this coder."""
-    return native_reason() is None and hasattr(native_library(), "sgs_rans_decode")
+    return native_reason() is None and hasattr(native_library(), "sgs_code_numbers")
 
 
 def encode(
@@ -63,7 +63,7 @@ def encode(
     if not len(symbols):
         return _varint(0)
     lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
-    code = _native_encode if _takes_native(native) else encode_lanes
+    code = _native_encode if takes_native(native) else encode_lanes
     states, words = code(symbols, contexts, tables, lanes=lanes)
     head = _varint(len(symbols)) + _varint(len(words) << 2 | LANES.index(lanes))
     return head + states.astype("<u4").tobytes() + words.astype("<u2").tobytes()
@@ -99,7 +99,7 @@ def decode(
         return np.empty(0, np.uint8)
     states = np.frombuffer(data, "<u4", lanes, start).astype(np.uint32)
     words = np.frombuffer(data, "<u2", word_count, start + 4 * lanes).astype(np.uint16)
-    code = _native_decode if _takes_native(native) else decode_lanes
+    code = _native_decode if takes_native(native) else decode_lanes
     if (symbols := code(words, states, contexts, tables)) is None:
         raise StreamError(f"{where} is damaged: its words and final states contradict each other.")
     return symbols
@@ -158,7 +158,12 @@ def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> 
     return np.ascontiguousarray(contexts)
 
 
-def _takes_native(native: bool | None) -> bool:
+def takes_native(native: bool | None) -> bool:
+    """Whether C++ is to be taken; None takes it where it is.
+
+    Raises:
+        StreamError: it is asked for and not there.
+    """
     if native and not has_native():
         raise StreamError("The installed native library has no entropy coder; install structgstream again.")
     return has_native() if native is None else native

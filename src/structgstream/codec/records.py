@@ -15,7 +15,7 @@ from structgstream.codec.stored import Stored
 from structgstream.errors import StreamError
 
 MAGIC = b"\x89SGS\r\n\x1a\n"
-MAJOR, MINOR = 1, 0
+MAJOR, MINOR = 2, 0
 PREFIX = struct.Struct("<8sHH")
 RECORD = struct.Struct("<BBHI")
 CHECKSUM = struct.Struct("<I")
@@ -74,9 +74,12 @@ def check_prefix(data: Stored, name: str) -> None:
         raise StreamError(f"{name} is cut at byte {len(data)}, before anything that can be shown.")
     _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
-        raise StreamError(
-            f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. Install a newer structgstream."
+        newer, older = (
+            "Install a newer structgstream.",
+            "Reconstruct it again, or install the structgstream that wrote it.",
         )
+        advice = newer if major > MAJOR else older
+        raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}")
 
 
 def head_at(data: Stored, offset: int) -> tuple[int, int] | None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of bins that mostly stay: which ones change, and by how much (docs/bitstream.md, section Rows).
 
-Rows stand in an order in which neighbours belong together. What is asked in a first pass of every second row gives the
-rows between them two neighbours to lean on, so every pass knows all its contexts before it begins.
+Rows stand in an order in which neighbours belong together. Passes go from every sixteenth row to every second, so that
+each row but the first ones has a neighbour on either side that is known.
 """
 
 from collections.abc import Sequence
@@ -11,43 +11,58 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.coder import Bins, Coder, Contexts
+from structgstream.codec.adaptive import AdaptiveCoder
+from structgstream.codec.coder import Bins, Flags
 
-_SIGNS = 2  # a residual's context tells -2 and less, -1, 0, 1, 2 and more
-_CLASSES = 2 * _SIGNS + 1
-ACTIVITY_CONTEXTS = 2 * 3 * 4
-RESIDUAL_CONTEXTS = _CLASSES * (_CLASSES + 2)
+_REMEMBERED = 7  # activity of three frames
+_MOST = 255  # of a size that counts
 
 
 @dataclass(frozen=True)
 class Change:
-    """What a frame did to rows of bins.
+    """What a frame did to rows of bins, and whether those before it did anything.
 
     Args:
-        active: ``[n]``, the rows that changed.
-        residuals: ``[n, C]``, zero where they did not.
+        residuals: ``[n, C]``, zero in rows that did not change.
+        history: u8 ``[n]``: bit 0 says whether this frame changed the row, bits 1 and 2 whether those before did.
+        sizes: i32 ``[n]``: of each row's residuals together.
     """
 
-    active: NDArray[np.bool_]
     residuals: Bins
+    history: NDArray[np.uint8]
+    sizes: Bins
+
+    @property
+    def active(self) -> Flags:
+        """``[n]``, the rows that changed."""
+        return (self.history & 1).astype(np.bool_)
 
     @classmethod
     def none(cls, rows: int, columns: int) -> "Change":
         """Nothing changed."""
-        return cls(np.zeros(rows, np.bool_), np.zeros((rows, columns), np.int32))
+        return cls(np.zeros((rows, columns), np.int32), np.zeros(rows, np.uint8), np.zeros(rows, np.int32))
 
     @classmethod
     def of(cls, residuals: Bins) -> "Change":
         """What these residuals ``[n, C]`` make."""
-        return cls((residuals != 0).any(axis=1), residuals)
+        return cls(residuals, (residuals != 0).any(axis=1).astype(np.uint8), _sizes(residuals))
 
     def select(self, rows: NDArray[np.bool_]) -> "Change":
         """Of the rows of a mask."""
-        return Change(self.active[rows], self.residuals[rows])
+        return Change(self.residuals[rows], self.history[rows], self.sizes[rows])
+
+    def grown(self, rows: int) -> "Change":
+        """With so many rows more, which did not change."""
+        more = Change.none(rows, self.residuals.shape[1])
+        return Change(
+            np.concatenate([self.residuals, more.residuals]),
+            np.concatenate([self.history, more.history]),
+            np.concatenate([self.sizes, more.sizes]),
+        )
 
 
 def coded_change(
-    coder: Coder, change: Change | None, before: Change, *, groups: Sequence[tuple[str, int, int]]
+    coder: AdaptiveCoder, change: Change | None, before: Change, *, groups: Sequence[tuple[str, int, int]]
 ) -> Change:
     """Codes a change, which is like the one ``before``.
 
@@ -55,54 +70,30 @@ def coded_change(
         coder: either direction.
         change: what to code; None when decoding.
         before: the same rows' last change.
-        groups: ``(name, first column, end)`` of columns that have tables of their own, all columns in their order.
+        groups: ``(name, first column, end)`` of columns that have models of their own, all columns in their order.
     """
     if not groups:
         return before
-    active = _coded_activity(coder, f"{groups[0][0]}.active", None if change is None else change.active, before.active)
+    active = coder.activity(
+        f"{groups[0][0]}.active",
+        None if change is None else change.active,
+        history=before.history,
+        sizes=before.sizes,
+    )
     rows = np.flatnonzero(active)
     residuals = np.zeros_like(before.residuals)
+    others = np.zeros(len(rows), np.int32)
     for name, first, end in groups:
-        values = None if change is None else change.residuals[rows, first:end]
-        last = before.residuals[rows, first:end]
-        residuals[rows, first:end] = _coded_residuals(coder, f"{name}.change", values, last)
-    return Change(active, residuals)
+        given = None if change is None else change.residuals[rows, first:end]
+        found = coder.residuals(f"{name}.change", given, last=before.residuals[rows, first:end], others=others)
+        residuals[rows, first:end] = found
+        others = others + _sizes(found)
+    sizes = np.zeros(len(active), np.int32)
+    sizes[rows] = others
+    history = (before.history << 1 & _REMEMBERED | active).astype(np.uint8)
+    return Change(residuals, history, sizes)
 
 
-def _coded_activity(
-    coder: Coder, name: str, active: NDArray[np.bool_] | None, before: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    count = len(before)
-    around = np.zeros(count + 6, np.int64)
-    around[3:-3] = before
-    near = sum(around[3 + step : 3 + step + count] for step in (-3, -2, -1, 1, 2, 3))
-    near = np.minimum((np.zeros(count, np.int64) + near + 1) // 2, 3)
-    found = np.zeros(count, np.bool_)
-    for first in (0, 1):
-        rows = np.arange(first, count, 2)
-        beside = np.zeros(len(rows), np.int64)
-        if first:
-            known = np.append(found, False)
-            beside = known[rows - 1].astype(np.int64) + known[rows + 1]
-        contexts = ((before[rows] * 3 + beside) * 4 + near[rows]).astype(np.uint16)
-        values = None if active is None else active[rows]
-        found[rows] = coder.flags(f"{name}{first}", values, contexts, count=ACTIVITY_CONTEXTS)
-    return found
-
-
-def _coded_residuals(coder: Coder, name: str, values: Bins | None, before: Bins) -> Bins:
-    """Residuals ``[n, c]`` of active rows, every second row first."""
-    count, columns = before.shape
-    found = np.zeros((count + 1, columns), np.int32)
-    own = np.clip(before, -_SIGNS, _SIGNS) + _SIGNS
-    for first in (0, 1):
-        rows = np.arange(first, count, 2)
-        beside = np.full((len(rows), columns), _SIGNS + 1, np.int64)
-        if first:
-            both = found[rows - 1].astype(np.int64) + found[rows + 1]
-            beside = np.clip(both, -_SIGNS - 1, _SIGNS + 1) + _SIGNS + 1
-        contexts: Contexts = (own[rows] * (_CLASSES + 2) + beside).astype(np.uint16).ravel()
-        given = None if values is None else values[rows].ravel()
-        coded = coder.residuals(f"{name}{first}", given, contexts, count=RESIDUAL_CONTEXTS)
-        found[rows] = coded.reshape(len(rows), columns)
-    return found[:count]
+def _sizes(residuals: Bins) -> Bins:
+    """Of each row's residuals together; no context tells so large ones apart that the limit matters."""
+    return np.minimum(np.abs(residuals), _MOST) @ np.ones(residuals.shape[1], np.int32)

@@ -6,7 +6,7 @@
  * exact, and storing it as float32 rounds it once.
  */
 
-import type { Decoder } from "./coder.js";
+import type { AdaptiveDecoder } from "./adaptive.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, type Fields, FREE_COLUMNS, type Tensor } from "./fields.js";
 import { decodedFree, type FreeBins, noFree } from "./freeRows.js";
@@ -52,7 +52,7 @@ function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[
 export function unmoved(bins: SceneBins): SceneBins {
   return {
     ...bins,
-    change: noChange(bins.change.active.length, bins.change.columns),
+    change: noChange(bins.change.history.length, bins.change.columns),
     weightChanges: new Map([...bins.weights].map(([name, weights]) => [name, noChange(weights.length, 1)])),
     free: { ...bins.free, change: noChange(bins.free.births.length, FREE_COLUMNS) },
   };
@@ -99,7 +99,7 @@ function nearest(value: Tensor, step: number): Int32Array {
 /** The dynamic fields that bins stand for. */
 export function valued(bins: SceneBins, dynamic: ReadonlySet<FieldName>, steps: Steps): Map<FieldName, Tensor> {
   const state = new Map<FieldName, Tensor>();
-  const rows = bins.change.active.length;
+  const rows = bins.change.history.length;
   const { columns } = bins.change;
   for (const { name, first, end } of anchorColumns(dynamic, columns)) {
     const step = steps.get(name)!;
@@ -129,7 +129,7 @@ export function valued(bins: SceneBins, dynamic: ReadonlySet<FieldName>, steps: 
  * @throws StreamError what is decoded contradicts itself
  */
 export function decodedScene(
-  decoder: Decoder,
+  decoder: AdaptiveDecoder,
   before: SceneBins,
   dynamic: ReadonlySet<FieldName>,
   where: string,

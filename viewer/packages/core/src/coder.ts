@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Arrays of whole numbers from the sections of a packet's fields (docs/bitstream.md, codec `compact`). */
+/** Arrays of whole numbers from the sections of the init record's fields (docs/bitstream.md, Coded init fields). */
 
 import { BitReader } from "./bits.js";
 import { StreamError } from "./errors.js";
@@ -13,11 +13,7 @@ const FLAT = 128; // of the geometric rows: what is expected of a context that h
 
 /** The frequency tables that both sides hold, by name; what was not used yet is a geometric guess. */
 export class Tables {
-  private readonly sets: Map<string, FrequencyTables>;
-
-  constructor(other?: Tables) {
-    this.sets = new Map(other?.sets);
-  }
+  private readonly sets = new Map<string, FrequencyTables>();
 
   get(name: string, contexts: number, alphabet: number): FrequencyTables {
     return this.sets.get(name) ?? geometric(FLAT, contexts, alphabet);
@@ -39,11 +35,6 @@ export class Decoder {
     private readonly where: string,
   ) {
     this.left = new Map(fields);
-  }
-
-  /** Yes (1) or no (0), `[n]`, with contexts `[n]` below `count`. */
-  flags(name: string, contexts: Uint8Array, count: number): Uint8Array {
-    return this.section(name, contexts, count, 2);
   }
 
   /** Signed numbers `[n]` of 32 bits. */

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact). */
 
+import { AdaptiveDecoder } from "./adaptive.js";
 import { binned, CODABLE, decodedScene, FREE_STEPS, type SceneBins, unmoved, valued } from "./bins.js";
-import { Decoder, Tables } from "./coder.js";
+import { Models } from "./decisions.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, mergedFields, type Tensor } from "./fields.js";
 import type { StreamHeader } from "./header.js";
@@ -11,7 +12,7 @@ import type { StreamHeader } from "./header.js";
 interface CompactState {
   readonly index: number;
   readonly bins: SceneBins;
-  readonly tables: Tables;
+  readonly models: Models;
 }
 
 /**
@@ -68,16 +69,16 @@ export class CompactDecoder {
   decode(fields: ReadonlyMap<FieldName, Uint8Array>, isKey: boolean, index: number): Map<FieldName, Tensor> {
     const { dynamic, steps } = this.header;
     const where = `Packet ${index}`;
-    const start = isKey ? { bins: this.reference, tables: undefined } : this.state;
+    const start = isKey ? { bins: this.reference, models: undefined } : this.state;
     if (start === undefined || (!isKey && this.state?.index !== index - 1)) {
       throw new StreamError(`${where} needs packet ${index - 1}, which was not decoded before it.`);
     }
-    const tables = new Tables(start.tables);
-    const decoder = new Decoder(tables, fields, where);
+    const models = new Models(start.models);
+    const decoder = new AdaptiveDecoder(models, fields, where);
     const bins = decodedScene(decoder, start.bins, dynamic, where);
     decoder.end();
     // What a key packet changes is everything since the reference, and tells nothing of what comes next.
-    this.state = { index, bins: isKey ? unmoved(bins) : bins, tables };
+    this.state = { index, bins: isKey ? unmoved(bins) : bins, models };
     return valued(bins, dynamic, steps);
   }
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Free Gaussians from frame to frame: some die, some change, some are born (docs/bitstream.md, section Free 3DGs). */
 
-import type { Decoder } from "./coder.js";
+import { type AdaptiveDecoder, bitLength } from "./adaptive.js";
 import { StreamError } from "./errors.js";
 import { FREE_COLUMNS } from "./fields.js";
 import { type Change, decodedChange, type Group, noChange, placesOf } from "./rows.js";
@@ -17,6 +17,10 @@ const GROUPS: readonly Group[] = [
   { name: "free.colors", first: 11, end: 14 },
 ];
 
+const MEANS = [6, 7, 8, 9, 10]; // quaternions and opacities
+const LED = [12, 13]; // green and blue
+const BORN_CONTEXTS = [FREE_COLUMNS, FREE_COLUMNS * 39, FREE_COLUMNS * 13];
+
 /** Free Gaussians as bins `[F, 14]`, their ascending births, and what the last frame did to them. */
 export interface FreeBins {
   readonly births: BigInt64Array;
@@ -29,15 +33,18 @@ export function noFree(): FreeBins {
 }
 
 /** What becomes of `before`. */
-export function decodedFree(decoder: Decoder, before: FreeBins, where: string): FreeBins {
-  const alive = placesOf(decoder.flags("free_births.alive", before.change.active, 2));
+export function decodedFree(decoder: AdaptiveDecoder, before: FreeBins, where: string): FreeBins {
+  const alive = placesOf(decoder.flags("free_births.alive", before.change.history, 8));
   const kept: Change = {
-    active: Uint8Array.from(alive, (row) => before.change.active[row]!),
+    history: Uint8Array.from(alive, (row) => before.change.history[row]!),
+    sizes: Int32Array.from(alive, (row) => before.change.sizes[row]!),
     residuals: rowsOf(before.change.residuals, alive),
     columns: FREE_COLUMNS,
   };
   const change = decodedChange(decoder, kept, GROUPS);
-  const born = decodedBirths(decoder, MOST_FREE - alive.length, where);
+  const stayed = rowsOf(before.bins, alive);
+  for (let i = 0; i < stayed.length; i++) stayed[i]! += change.residuals[i]!;
+  const born = decodedBirths(decoder, stayed, where);
   const births = new BigInt64Array(alive.length + born.births.length);
   for (const [i, row] of alive.entries()) births[i] = before.births[row]!;
   births.set(born.births, alive.length);
@@ -47,12 +54,12 @@ export function decodedFree(decoder: Decoder, before: FreeBins, where: string): 
     }
   }
   const bins = new Int32Array(births.length * FREE_COLUMNS);
-  bins.set(rowsOf(before.bins, alive));
-  for (let i = 0; i < change.residuals.length; i++) bins[i]! += change.residuals[i]!;
+  bins.set(stayed);
   bins.set(born.bins, alive.length * FREE_COLUMNS);
   // What was born did not change.
   const whole = noChange(births.length, FREE_COLUMNS);
-  whole.active.set(change.active);
+  whole.history.set(change.history);
+  whole.sizes.set(change.sizes);
   whole.residuals.set(change.residuals);
   return { births, bins, change: whole };
 }
@@ -65,36 +72,73 @@ function rowsOf(values: Int32Array, rows: Int32Array): Int32Array {
   return found;
 }
 
-function decodedBirths(decoder: Decoder, most: number, where: string): Pick<FreeBins, "births" | "bins"> {
-  const count = decoder.number("free_births.count");
-  if (count > most) {
-    throw new StreamError(`${where} adds ${count} free Gaussians, which makes more than ${MOST_FREE}.`);
+/** What is born, given the bins of what is alive. */
+function decodedBirths(decoder: AdaptiveDecoder, alive: Int32Array, where: string): Pick<FreeBins, "births" | "bins"> {
+  const count = decoder.numbers("free_births.count", new Int32Array(1), [1])[0]!;
+  if (count < 0 || count > MOST_FREE - alive.length / FREE_COLUMNS) {
+    throw new StreamError(
+      `${where} adds ${count} free Gaussians, which makes more than ${MOST_FREE}, or fewer than none.`,
+    );
   }
   if (!count) return noFree();
-  const frames = decoder.naturals("free_births.frame", new Uint8Array(count), 1);
-  const fresh = Uint8Array.from(frames, (frame) => Number(frame !== 0));
-  const numbers = decoder.naturals("free_births.number", fresh, 2);
+  const frames = decoder.numbers("free_births.frame", new Int32Array(count), [1]);
+  const fresh = Int32Array.from(frames, (frame) => Number(frame !== 0));
+  const numbers = decoder.numbers("free_births.number", fresh, [2]);
   const births = new BigInt64Array(count);
   let frame = 0;
   let number = 0;
   for (let i = 0; i < count; i++) {
     frame += frames[i]!;
     number = (fresh[i] ? 0 : number) + numbers[i]!;
-    if (frame >= 2 ** 31 || number >= 2 ** 32) {
+    if (frame < 0 || frame >= 2 ** 31 || number < 0 || number >= 2 ** 32) {
       throw new StreamError(`${where} has births beyond 63 bits; it is damaged.`);
     }
     births[i] = (BigInt(frame) << 32n) | BigInt(number);
   }
-  const contexts = Uint8Array.from({ length: count * FREE_COLUMNS }, (_, i) => i % FREE_COLUMNS);
-  const steps = decoder.naturals("free.born", contexts, FREE_COLUMNS);
-  const bins = new Int32Array(steps.length);
-  for (let i = 0; i < steps.length; i++) {
-    const step = steps[i]!;
-    const bin = (i < FREE_COLUMNS ? 0 : bins[i - FREE_COLUMNS]!) + (step & 1 ? -(step >> 1) - 1 : step >> 1);
-    if (bin < -(2 ** 31) || bin >= 2 ** 31) {
-      throw new StreamError(`${where} has a bin beyond 32 bits; it is damaged.`);
+  return { births, bins: decodedBorn(decoder, alive, count, where) };
+}
+
+/** The bins `[count, 14]` of what is born, column by column. */
+function decodedBorn(decoder: AdaptiveDecoder, alive: Int32Array, count: number, where: string): Int32Array {
+  const bins = new Int32Array(count * FREE_COLUMNS);
+  const rows = alive.length / FREE_COLUMNS;
+  const contexts = new Int32Array(count * BORN_CONTEXTS.length);
+  let one: Int32Array = new Int32Array(count); // errors in the columns before
+  let two: Int32Array = new Int32Array(count);
+  for (let column = 0; column < FREE_COLUMNS; column++) {
+    for (let i = 0, at = 0; i < count; i++) {
+      const length = errorLength(one[i]!);
+      contexts[at++] = column;
+      contexts[at++] = (column * 13 + length) * 3 + Math.sign(one[i]!) + 1;
+      contexts[at++] = column * 13 + Math.min(length + errorLength(two[i]!), 12);
     }
-    bins[i] = bin;
+    const errors = decoder.numbers("free.born", contexts, BORN_CONTEXTS);
+    const start = rows ? alive[alive.length - FREE_COLUMNS + column]! : 0;
+    const mean = MEANS.includes(column) && rows ? meanOf(alive, column) : 0;
+    for (let i = 0, at = column; i < count; i++, at += FREE_COLUMNS) {
+      let led = mean;
+      if (!MEANS.includes(column)) led = i ? bins[at - FREE_COLUMNS]! : start;
+      if (LED.includes(column)) {
+        const before = i ? bins[at - 1 - FREE_COLUMNS]! : rows ? alive[alive.length - FREE_COLUMNS + column - 1]! : 0;
+        led += bins[at - 1]! - before;
+      }
+      const bin = errors[i]! + led;
+      if (bin < -(2 ** 31) || bin >= 2 ** 31) {
+        throw new StreamError(`${where} has a bin beyond 32 bits; it is damaged.`);
+      }
+      bins[at] = bin;
+    }
+    [one, two] = [errors, one];
   }
-  return { births, bins };
+  return bins;
+}
+
+function meanOf(bins: Int32Array, column: number): number {
+  let sum = 0;
+  for (let at = column; at < bins.length; at += FREE_COLUMNS) sum += bins[at]!;
+  return Math.floor(sum / (bins.length / FREE_COLUMNS));
+}
+
+function errorLength(error: number): number {
+  return bitLength(Math.abs(error), 12);
 }

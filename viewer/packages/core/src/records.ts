@@ -4,7 +4,7 @@
 import { StreamError } from "./errors.js";
 
 export const RecordType = { init: 1, key: 2, delta: 3, index: 4 } as const;
-export const MAJOR = 1;
+export const MAJOR = 2;
 export const PREFIX_BYTES = 12;
 export const HEAD_BYTES = 8;
 export const CHECKSUM_BYTES = 4;
@@ -64,7 +64,8 @@ export function checkPrefix(bytes: Uint8Array, name: string): void {
   const major = view.getUint16(8, true);
   if (major !== MAJOR) {
     const version = `${major}.${view.getUint16(10, true)}`;
-    throw new StreamError(`${name} has format version ${version}; this program reads ${MAJOR}.x. Use a newer one.`);
+    const advice = major > MAJOR ? "Use a newer one." : "Write the stream again, or use an older one.";
+    throw new StreamError(`${name} has format version ${version}; this program reads ${MAJOR}.x. ${advice}`);
   }
 }
 

@@ -8,7 +8,7 @@ import { readStream, StreamReader } from "../src/reader.ts";
 import { crc32, RecordType, viewOf } from "../src/records.ts";
 import { bytesOf, expectSame, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
-const STREAMS = { raw: bytesOf(VECTORS, "version-1.sgs"), compact: bytesOf(VECTORS, "version-1-compact.sgs") };
+const STREAMS = { raw: bytesOf(VECTORS, "version-2.sgs"), compact: bytesOf(VECTORS, "version-2-compact.sgs") };
 
 function flipped(stream: Uint8Array, ...bits: number[]): Uint8Array {
   const damaged = stream.slice();

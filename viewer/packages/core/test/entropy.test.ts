@@ -3,6 +3,7 @@
 
 import { expect, test } from "vitest";
 import { BitReader } from "../src/bits.ts";
+import { Arithmetic, Model, NUMBER_NODES } from "../src/decisions.ts";
 import { StreamError } from "../src/errors.ts";
 import { decodedSymbols, sectionHead } from "../src/rans.ts";
 import { residualsOf } from "../src/residualSymbols.ts";
@@ -80,4 +81,20 @@ test("more zeros than an Exp-Golomb code may have, and a cut one", () => {
   expect(() => new BitReader(Uint8Array.of(0b00010110), "It").golomb(0, 2)).toThrow("cut or out of bounds");
   expect(() => new BitReader(Uint8Array.of(0b00000001), "It").golomb(0, 8)).toThrow("ends within a number");
   expect(() => new BitReader(Uint8Array.of(0), "It").golomb(0, 8)).toThrow("cut or out of bounds");
+});
+
+test("decisions: numbers with one input of two contexts", () => {
+  const model = new Model([2], NUMBER_NODES);
+  const code = new Arithmetic(Uint8Array.of(0x92, 0xa5, 0xec, 0x05));
+  const found = [0, 0, 1, 1, 0].map((context) => {
+    code.at(model, Int32Array.of(context), 0);
+    return code.number(model);
+  });
+  expect(found).toEqual([0, 3, -1, 20, 0]);
+  expect(code.isWhole).toBe(true);
+  expect(code.isOver).toBe(false);
+  for (let i = 0; i < 9; i++) code.number(model);
+  expect(code.isWhole).toBe(false);
+  expect(new Arithmetic(new Uint8Array(0)).isWhole).toBe(true);
+  expect(new Arithmetic(new Uint8Array(1)).isWhole).toBe(false);
 });

@@ -2,7 +2,8 @@
 /** Damaged streams give scenes or a StreamError: no other exception, and no large allocation. */
 
 import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
-import { Decoder, Tables } from "../src/coder.ts";
+import { AdaptiveDecoder } from "../src/adaptive.ts";
+import { Models } from "../src/decisions.ts";
 import { StreamError } from "../src/errors.ts";
 import { decodedFree, MOST_FREE, noFree } from "../src/freeRows.ts";
 import { readStream } from "../src/reader.ts";
@@ -10,7 +11,7 @@ import { bytesOf, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.
 
 const MOST_BYTES = 2 ** 20;
 const STREAMS: [string, Uint8Array][] = [
-  ["raw", bytesOf(VECTORS, "version-1.sgs")],
+  ["raw", bytesOf(VECTORS, "version-2.sgs")],
   ["compact", bytesOf(FIXTURES, "tiny.sgs")],
 ];
 const ARRAYS = { Uint8Array, Uint16Array, Int32Array, Float32Array, Float64Array, BigInt64Array };
@@ -114,28 +115,27 @@ describe.each(STREAMS)("the %s stream", (_, stream) => {
   });
 });
 
-/** What {@link decodedFree} reads of a packet in which nothing is there and `count`, a varint, is born. */
-function bornOf(...count: number[]): Decoder {
-  const kept = (bytes: number) => [bytes, ...Array<number>(bytes).fill(0)]; // a table set that changes nothing
-  const changes = Array.from({ length: 10 }, () => [...kept(5), 0, 0]).flat();
-  const free = Uint8Array.of(...kept(3), 0, ...kept(3), 0, ...changes);
-  const births = Uint8Array.of(...kept(1), 0, ...count);
-  return new Decoder(
-    new Tables(),
+/** What {@link decodedFree} reads of a packet in which nothing is there, and `births` are the bytes of what is born. */
+function bornOf(...births: number[]): AdaptiveDecoder {
+  return new AdaptiveDecoder(
+    new Models(),
     new Map([
-      ["free", free],
-      ["free_births", births],
+      ["free", new Uint8Array(0)],
+      ["free_births", Uint8Array.from(births)],
     ]),
     "It",
   );
 }
 
 test("more births than a scene may have are refused before anything is allocated for them", () => {
-  expect(decodedFree(bornOf(0), noFree(), "It").births.length).toBe(0);
-  expect(() => decodedFree(bornOf(0x80, 0x80, 0x10), noFree(), "It")).toThrow("ends 1 bytes too early in free_births");
+  expect(decodedFree(bornOf(129), noFree(), "It").births.length).toBe(0);
+  const most = () => decodedFree(bornOf(64, 62, 189, 124, 229), noFree(), "It");
+  expect(most).toThrow("ends too early in free_births");
   largest = 0;
-  expect(() => decodedFree(bornOf(0x81, 0x80, 0x10), noFree(), "It")).toThrow(`adds ${MOST_FREE + 1} free Gaussians`);
-  expect(() => decodedFree(bornOf(255, 255, 255, 255, 15), noFree(), "It")).toThrow("adds 4294967295 free Gaussians");
-  expect(() => decodedFree(bornOf(255, 255, 255, 255, 16), noFree(), "It")).toThrow("a number beyond 32 bits");
+  const more = () => decodedFree(bornOf(64, 62, 189, 124, 228), noFree(), "It");
+  expect(more).toThrow(`adds ${MOST_FREE + 1} free Gaussians`);
+  const huge = () => decodedFree(bornOf(64, 62, 143, 66, 0, 2, 244), noFree(), "It");
+  expect(huge).toThrow("adds 2147483647 free Gaussians");
+  expect(() => decodedFree(bornOf(33), noFree(), "It")).toThrow("adds -1 free Gaussians");
   expect(largest).toBeLessThan(2 ** 16);
 });

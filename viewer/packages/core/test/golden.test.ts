@@ -53,7 +53,7 @@ test.each(GOLDEN)("the golden stream %s", (name) => {
 });
 
 test("the golden stream's header", () => {
-  const header = readStream(bytesOf(VECTORS, "version-1.sgs")).header!;
+  const header = readStream(bytesOf(VECTORS, "version-2.sgs")).header!;
   expect(header.cameras.map(({ name, heldOut }) => [name, heldOut])).toEqual([
     ["left", false],
     ["middle", true],

@@ -36,7 +36,7 @@ function edited(folder: URL, name: string, edit: (description: Description) => v
   return joined(length, packed, payload.slice(end));
 }
 
-const raw = (edit: (d: Description) => void) => () => unpackedHeader(edited(VECTORS, "version-1.sgs", edit));
+const raw = (edit: (d: Description) => void) => () => unpackedHeader(edited(VECTORS, "version-2.sgs", edit));
 const compact = (edit: (d: Description) => void) => () => unpackedHeader(edited(FIXTURES, "tiny.sgs", edit));
 
 test("keys that are not known are ignored", () => {

@@ -6,7 +6,7 @@ import { readStream, StreamReader } from "../src/reader.ts";
 import { RecordType } from "../src/records.ts";
 import { bytesOf, expectSame, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
-const RAW = bytesOf(VECTORS, "version-1.sgs");
+const RAW = bytesOf(VECTORS, "version-2.sgs");
 const COMPACT = bytesOf(FIXTURES, "paper.sgs");
 
 function expectSameReaders(found: StreamReader, expected: StreamReader): void {
@@ -90,9 +90,11 @@ describe.each([
 test("what is no stream, and another major version", () => {
   expect(() => new StreamReader("a.sgs").push(Uint8Array.of(0x89, 0x50))).toThrow("a.sgs is not a structgstream file");
   const newer = RAW.slice();
-  newer[8] = 2;
-  expect(() => readStream(newer)).toThrow("has format version 2.0; this program reads 1.x. Use a newer one.");
-  newer.set([1, 0, 9], 8);
+  newer[8] = 3;
+  expect(() => readStream(newer)).toThrow("has format version 3.0; this program reads 2.x. Use a newer one.");
+  newer[8] = 1;
+  expect(() => readStream(newer)).toThrow("has format version 1.0; this program reads 2.x. Write the stream again");
+  newer.set([2, 0, 9], 8);
   expect(readStream(newer).packets.length).toBe(3);
 });
 
