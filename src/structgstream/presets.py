@@ -20,6 +20,7 @@ from structgstream.training.online import OnlineConfig
 from structgstream.training.optim import Rate
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.rounding import RoundingConfig
+from structgstream.training.solidity import SolidityConfig
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,15 @@ COMPACT = replace(
     MOTION,
     initial=replace(
         MOTION.initial,
+        iterations=3000,
+        schedule_iterations=3000,
+        coarse_iterations=2250,
+        seed_voxels=2,
+        growth=GrowthConfig(
+            collect_from=160, start=300, stop=2600, grad_threshold=5e-5, max_anchors=42_000, room_until=1800
+        ),
         disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5),
+        solidity=SolidityConfig(weight=0.05, every=4),
         random_background=True,
     ),
     environment=EnvironmentConfig(enabled=True),
@@ -160,7 +169,8 @@ COMPACT = replace(
     ),
 )
 """As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks. Frame 0
-is disturbed while it is fitted, so that it does not learn its cameras by heart, and stands before an environment."""
+starts from few seeds and grows where gradients are strong, its surfaces are made solid, it is disturbed while it is
+fitted, so that it does not learn its cameras by heart, and it stands before an environment."""
 
 FAST = replace(
     COMPACT,
@@ -168,15 +178,15 @@ FAST = replace(
         COMPACT.initial,
         iterations=1200,
         schedule_iterations=1200,
-        coarse_iterations=700,
-        growth=GrowthConfig(
-            collect_from=200,
-            start=300,
+        coarse_iterations=850,
+        growth=replace(
+            COMPACT.initial.growth,
+            collect_from=80,
+            start=150,
             stop=1000,
-            interval=100,
+            room_until=720,
             eligible_count=20,
             prune_visits=40,
-            max_anchors=80_000,
         ),
     ),
 )
