@@ -49,12 +49,12 @@ def sensor(view: View, target: Sequence[float]) -> Any:
     })  # fmt: skip
 
 
-def rendered(scene: Any, camera: Any, *, samples: int, seed: int) -> np.ndarray:
+def rendered(scene: Any, camera: Any, *, samples: int, guide_samples: int, seed: int) -> np.ndarray:
     """Linear RGB ``[H, W, 3]``, path traced and denoised with albedo and normals as guides."""
     path = mi.load_dict({"type": "path", "max_depth": 7, "rr_depth": 4})
     guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
     color = np.array(mi.render(scene, integrator=path, sensor=camera, spp=samples, seed=seed))[..., :3]
-    guide = np.array(mi.render(scene, integrator=guides, sensor=camera, spp=16, seed=seed))
+    guide = np.array(mi.render(scene, integrator=guides, sensor=camera, spp=guide_samples, seed=seed))
     albedo, normal = np.clip(guide[..., -6:-3], 0, 1), guide[..., -3:]
     parts = [np.ascontiguousarray(part, np.float32) for part in (color, albedo, normal)]
     return np.array(mitsuba_oidn.denoise(*parts, hdr=True))
@@ -77,6 +77,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, nargs="*", default=list(range(10)))
     parser.add_argument("--samples", type=int, default=48, help="a pixel, training cameras")
     parser.add_argument("--held-out-samples", type=int, default=160, help="a pixel, camera 0")
+    parser.add_argument("--guide-samples", type=int, default=16, help="a pixel, albedo and normals for the denoiser")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     rig, stage = RIGS[options.scene], STAGES[options.scene]
@@ -96,7 +97,9 @@ def main() -> None:
         for number, path in missing.items():
             start = time.perf_counter()
             samples = options.held_out_samples if number == 0 else options.samples
-            linear = rendered(scene, cameras[number], samples=samples, seed=1000 * frame + number)
+            linear = rendered(
+                scene, cameras[number], samples=samples, guide_samples=options.guide_samples, seed=1000 * frame + number
+            )
             Image.fromarray(developed(linear)).save(path)
             print(f"{path.name}: {time.perf_counter() - start:.1f} s", flush=True)
 
