@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes of the bundled clip: boxes, surfaces of revolution, tubes and sheets. Metres, z up."""
+"""Triangle meshes of the clips: boxes, surfaces of revolution, tubes and sheets. Metres, z up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +36,9 @@ class Mesh:
             np.add.at(total, place[self.faces[:, corner]], face_normals)
         normals = total[place]
         return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
+
+
+Parts = dict[str, tuple[Mesh, str]]  # name -> (mesh, material)
 
 
 def rotation(axis: str, degrees: float) -> Array:

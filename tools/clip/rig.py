@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ten cameras of the bundled clip: a two-row arc, and camera 0 in its middle as the held-out view."""
+"""The ten cameras of each clip: a two-row arc, and camera 0 in its middle as the held-out view."""
 
 import math
 from dataclasses import dataclass
@@ -9,16 +9,6 @@ from numpy.typing import NDArray
 
 WIDTH, HEIGHT, FPS, FRAMES = 320, 240, 30, 12
 FIELD_OF_VIEW_DEGREES = 52.0
-RADIUS_METRES = 1.5
-NEAR_METRES = 0.6
-TARGET = np.array([0.02, 0.12, 0.155])
-
-# (azimuth, elevation) in degrees about the target; azimuth 0 looks along +y
-DIRECTIONS = (
-    (0.0, 17.0),
-    (-30.0, 10.0), (-15.0, 10.0), (0.0, 9.0), (15.0, 10.0), (30.0, 10.0),
-    (-23.0, 25.0), (-8.0, 26.0), (8.0, 26.0), (23.0, 25.0),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,21 +27,56 @@ def intrinsics() -> NDArray[np.float64]:
     return np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
 
 
-def views() -> list[View]:
-    """The cameras in the order of their numbers."""
-    out = []
-    for number, (azimuth, elevation) in enumerate(np.deg2rad(DIRECTIONS)):
-        direction = [
-            math.sin(azimuth) * math.cos(elevation),
-            -math.cos(azimuth) * math.cos(elevation),
-            math.sin(elevation),
-        ]
-        eye = TARGET + RADIUS_METRES * np.array(direction)
-        forward = (TARGET - eye) / np.linalg.norm(TARGET - eye)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = [right, np.cross(forward, right), forward]
-        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-        out.append(View(f"cam{number:02d}", eye, intrinsics(), viewmat))
-    return out
+@dataclass(frozen=True)
+class Rig:
+    """Cameras around a point, all at one distance from it; nothing is nearer to one of them than ``near_metres``."""
+
+    target: tuple[float, float, float]
+    radius_metres: float
+    near_metres: float
+    # (azimuth, elevation) in degrees about the target; azimuth 0 looks along +y
+    directions: tuple[tuple[float, float], ...]
+
+    def views(self) -> list[View]:
+        """The cameras in the order of their numbers."""
+        out = []
+        target = np.array(self.target)
+        for number, (azimuth, elevation) in enumerate(np.deg2rad(self.directions)):
+            direction = [
+                math.sin(azimuth) * math.cos(elevation),
+                -math.cos(azimuth) * math.cos(elevation),
+                math.sin(elevation),
+            ]
+            eye = target + self.radius_metres * np.array(direction)
+            forward = (target - eye) / np.linalg.norm(target - eye)
+            right = np.cross(forward, [0.0, 0.0, 1.0])
+            right /= np.linalg.norm(right)
+            viewmat = np.eye(4)
+            viewmat[:3, :3] = [right, np.cross(forward, right), forward]
+            viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+            out.append(View(f"cam{number:02d}", eye, intrinsics(), viewmat))
+        return out
+
+
+RIGS = {
+    "table": Rig(
+        target=(0.02, 0.12, 0.155),
+        radius_metres=1.5,
+        near_metres=0.6,
+        directions=(
+            (0.0, 17.0),
+            (-30.0, 10.0), (-15.0, 10.0), (0.0, 9.0), (15.0, 10.0), (30.0, 10.0),
+            (-23.0, 25.0), (-8.0, 26.0), (8.0, 26.0), (23.0, 25.0),
+        ),
+    ),
+    "throw": Rig(
+        target=(0.0, 0.0, 0.82),
+        radius_metres=3.6,
+        near_metres=1.2,
+        directions=(
+            (0.0, 12.0),
+            (-30.0, 7.0), (-15.0, 6.0), (0.0, 5.0), (15.0, 6.0), (30.0, 7.0),
+            (-23.0, 20.0), (-8.0, 21.0), (8.0, 21.0), (23.0, 20.0),
+        ),
+    ),
+}  # fmt: skip

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders the bundled clip: ``python tools/clip/scene.py build/clip`` writes one PNG per camera and frame.
+"""Renders a clip: ``python tools/clip/scene.py table build/clip`` writes one PNG per camera and frame.
 
 Pictures that exist are skipped, so a run that was stopped goes on where it ended.
 """
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +17,14 @@ from PIL import Image
 mi.set_variant("llvm_ad_rgb")
 
 import mitsuba_oidn  # noqa: E402  (needs the variant)
-from materials import all_surfaces, shape  # noqa: E402
-from motion import moving_parts  # noqa: E402
-from rig import FIELD_OF_VIEW_DEGREES, FPS, FRAMES, HEIGHT, TARGET, WIDTH, View, views  # noqa: E402
-from room import Parts, still_parts  # noqa: E402
+from materials import lights, shape  # noqa: E402
+from meshes import Parts  # noqa: E402
+from rig import FIELD_OF_VIEW_DEGREES, FPS, FRAMES, HEIGHT, RIGS, WIDTH, View  # noqa: E402
+from table.stage import TABLE  # noqa: E402
+from throw.stage import THROW  # noqa: E402
 
 EXPOSURE = 0.95
-
-
-def lights() -> dict[str, Any]:
-    """A warm panel at the ceiling, a cool window at the left, and dim light from the open front."""
-    to_world = mi.ScalarTransform4f()
-
-    def area(red: float, green: float, blue: float) -> dict[str, Any]:
-        return {"type": "area", "radiance": {"type": "rgb", "value": [red, green, blue]}}
-
-    panel = to_world.translate([0.25, -0.25, 2.18]).rotate([1, 0, 0], 180).scale([0.5, 0.35, 1])
-    window = to_world.translate([-1.68, -0.55, 0.95]).rotate([0, 1, 0], 90).scale([0.55, 0.6, 1])
-    return {
-        "panel": {"type": "rectangle", "to_world": panel, "emitter": area(17.0, 14.8, 12.0)},
-        "window": {"type": "rectangle", "to_world": window, "emitter": area(12.0, 13.2, 15.0)},
-        "front": {"type": "constant", "radiance": {"type": "rgb", "value": [0.36, 0.35, 0.34]}},
-    }
+STAGES = {"table": TABLE, "throw": THROW}
 
 
 def shapes(parts: Parts, surfaces: dict[str, Any]) -> dict[str, Any]:
@@ -45,9 +32,9 @@ def shapes(parts: Parts, surfaces: dict[str, Any]) -> dict[str, Any]:
     return {name: shape(name, mesh, surfaces[surface]) for name, (mesh, surface) in parts.items()}
 
 
-def sensor(view: View) -> Any:
+def sensor(view: View, target: Sequence[float]) -> Any:
     """The view as a Mitsuba camera; the box filter keeps pixels independent, as the denoiser expects."""
-    to_world = mi.ScalarTransform4f().look_at(origin=view.eye.tolist(), target=TARGET.tolist(), up=[0, 0, 1])
+    to_world = mi.ScalarTransform4f().look_at(origin=view.eye.tolist(), target=list(target), up=[0, 0, 1])
     film = {
         "type": "hdrfilm",
         "width": WIDTH,
@@ -62,12 +49,12 @@ def sensor(view: View) -> Any:
     })  # fmt: skip
 
 
-def rendered(scene: Any, camera: Any, *, samples: int, seed: int) -> np.ndarray:
+def rendered(scene: Any, camera: Any, *, samples: int, guide_samples: int, seed: int) -> np.ndarray:
     """Linear RGB ``[H, W, 3]``, path traced and denoised with albedo and normals as guides."""
     path = mi.load_dict({"type": "path", "max_depth": 7, "rr_depth": 4})
     guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
     color = np.array(mi.render(scene, integrator=path, sensor=camera, spp=samples, seed=seed))[..., :3]
-    guide = np.array(mi.render(scene, integrator=guides, sensor=camera, spp=16, seed=seed))
+    guide = np.array(mi.render(scene, integrator=guides, sensor=camera, spp=guide_samples, seed=seed))
     albedo, normal = np.clip(guide[..., -6:-3], 0, 1), guide[..., -3:]
     parts = [np.ascontiguousarray(part, np.float32) for part in (color, albedo, normal)]
     return np.array(mitsuba_oidn.denoise(*parts, hdr=True))
@@ -84,30 +71,35 @@ def developed(linear: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", choices=sorted(RIGS))
     parser.add_argument("out", type=Path, help="folder for the pictures")
     parser.add_argument("--frames", type=int, nargs="*", default=list(range(FRAMES)))
-    parser.add_argument("--cameras", type=int, nargs="*", default=list(range(len(views()))))
+    parser.add_argument("--cameras", type=int, nargs="*", default=list(range(10)))
     parser.add_argument("--samples", type=int, default=48, help="a pixel, training cameras")
     parser.add_argument("--held-out-samples", type=int, default=160, help="a pixel, camera 0")
+    parser.add_argument("--guide-samples", type=int, default=16, help="a pixel, albedo and normals for the denoiser")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    rig = views()
-    surfaces = all_surfaces()
-    still = shapes(still_parts(), surfaces) | {name: mi.load_dict(light) for name, light in lights().items()}
-    cameras = {number: sensor(rig[number]) for number in options.cameras}
+    rig, stage = RIGS[options.scene], STAGES[options.scene]
+    views, surfaces = rig.views(), stage.surfaces()
+    light = lights(size=stage.lights_size, panel=stage.panel, window=stage.window)
+    still = shapes(stage.still(), surfaces) | {name: mi.load_dict(part) for name, part in light.items()}
+    cameras = {number: sensor(views[number], rig.target) for number in options.cameras}
     for frame in options.frames:
         missing = {
             number: path
             for number in options.cameras
-            if not (path := options.out / f"{rig[number].name}_{frame:02d}.png").exists()
+            if not (path := options.out / f"{views[number].name}_{frame:02d}.png").exists()
         }
         if not missing:
             continue
-        scene = mi.load_dict({"type": "scene"} | still | shapes(moving_parts(frame / FPS), surfaces))
+        scene = mi.load_dict({"type": "scene"} | still | shapes(stage.moving(frame / FPS), surfaces))
         for number, path in missing.items():
             start = time.perf_counter()
             samples = options.held_out_samples if number == 0 else options.samples
-            linear = rendered(scene, cameras[number], samples=samples, seed=1000 * frame + number)
+            linear = rendered(
+                scene, cameras[number], samples=samples, guide_samples=options.guide_samples, seed=1000 * frame + number
+            )
             Image.fromarray(developed(linear)).save(path)
             print(f"{path.name}: {time.perf_counter() - start:.1f} s", flush=True)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Procedural textures of the bundled clip, made with numpy alone.
+"""Procedural textures of the clips, made with numpy alone.
 
 Every function returns sRGB values ``[n, n, 3]`` in 0..1. All but the pictures tile without a seam.
 """
@@ -183,3 +183,54 @@ def playball(n: int, palette: Sequence[Color], *, seed: int) -> Texture:
         dot = np.hypot(du, v - cv) < rng.uniform(0.02, 0.05)
         out = np.where(dot[..., None], colors[rng.integers(len(colors))], out)
     return np.clip(out * (1 + 0.04 * noise(n, slope=0.9, seed=seed))[..., None], 0, 1)
+
+
+def lined_ball(n: int, color: Color, line: Color, *, seed: int) -> Texture:
+    """A ball of one colour with dark lines: two great circles and two small ones. Not periodic in v."""
+    v, u = _unit_grid(n)
+    x, y = np.cos(2 * np.pi * u) * np.sin(np.pi * v), np.sin(2 * np.pi * u) * np.sin(np.pi * v)
+    z = np.cos(np.pi * v)
+    width = 0.055
+    lines = (np.abs(x) < width) | (np.abs(z) < width) | (np.abs(np.abs(y) - 0.62 - 0.12 * z**2) < width * 0.8)
+    out = np.where(lines[..., None], line, color)
+    return np.clip(out * (1 + 0.06 * noise(n, slope=0.6, seed=seed))[..., None], 0, 1)
+
+
+def tartan(n: int, palette: Sequence[Color], *, across: int, along: int, seed: int) -> Texture:
+    """A woven cloth of stripes: ``along`` bands over v and ``across`` over u, each of the palette's colours in turn."""
+    v, u = _unit_grid(n)
+    colors = np.asarray(palette)
+    rng = np.random.default_rng(seed)
+    layers = []
+    for count, at in ((along, v), (across, u)):
+        if count:
+            edges = np.sort(rng.uniform(-0.25, 0.25, 3 * count) + np.arange(3 * count)) / (3 * count)
+            band = np.searchsorted(edges, at.ravel()).reshape(at.shape) - 1
+            layers.append(colors[band % len(colors)])
+    weave = np.sin(2 * np.pi * 90 * u) * np.sin(2 * np.pi * 90 * v)
+    out = np.mean(layers, axis=0)
+    return np.clip(out * (0.95 + 0.05 * weave + 0.06 * noise(n, slope=0.9, seed=seed + 1))[..., None], 0, 1)
+
+
+def face(n: int, skin: Color, hair: Color, *, seed: int) -> Texture:
+    """A head around its axis: the face's middle is at u = 0.75 (which looks along -y), v goes up from the chin."""
+    v, u = _unit_grid(n)
+    out = np.asarray(skin) * (1 + 0.05 * noise(n, slope=1.5, seed=seed))[..., None]
+    x, y = ((u - 0.75 + 0.5) % 1 - 0.5) * 2 * np.pi, (v - 0.5) * np.pi
+    cheeks = np.exp(-((np.abs(x) - 0.55) ** 2 + (y + 0.2) ** 2) / 0.05)
+    out = out * (1 + cheeks[..., None] * np.array([0.08, -0.10, -0.10]))
+    strands = np.sin(60 * x + 6 * noise(n, slope=1.6, seed=seed + 1))
+    fringe = 0.55 + 0.08 * np.sin(7 * x)
+    covered = np.where(np.abs(x) < 1.15, y > fringe, y > -0.55)
+    out = np.where(covered[..., None], np.asarray(hair) * (1 + 0.25 * strands)[..., None], out)
+    white = ((np.abs(x) - 0.36) / 0.17) ** 2 + ((y - 0.12) / 0.09) ** 2 < 1
+    iris = ((np.abs(x) - 0.36) / 0.08) ** 2 + ((y - 0.12) / 0.085) ** 2 < 1
+    brow = (np.abs(np.abs(x) - 0.36) < 0.2) & (np.abs(y - 0.30) < 0.035)
+    mouth = ((x / 0.28) ** 2 + ((y + 0.48 - 0.25 * x**2) / 0.055) ** 2) < 1
+    nose = (np.abs(x) < 0.09) & (np.abs(y + 0.10) < 0.06)
+    out = np.where(white[..., None], (0.94, 0.93, 0.90), out)
+    out = np.where(iris[..., None], (0.12, 0.10, 0.08), out)
+    out = np.where(brow[..., None], np.asarray(hair) * 0.8, out)
+    out = np.where(mouth[..., None], (0.62, 0.16, 0.16), out)
+    out = np.where(nose[..., None], np.asarray(skin) * 0.8, out)
+    return np.clip(out, 0, 1)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands still in the bundled clip, room, table and things, as ``name -> (mesh, material)``."""
+"""What stands still: room, table and things."""
 
 import numpy as np
-from meshes import Mesh, box, revolved, rotation, sheet, smooth_profile, sphere, tube
+from meshes import Mesh, Parts, box, revolved, sheet, smooth_profile, sphere, tube
+from props import books, picture, plant
 
-Parts = dict[str, tuple[Mesh, str]]
 TAP = np.array([0.10, 0.075, 0.235])  # the mouth of the tap; the glass stands under it
 
 
@@ -40,7 +40,7 @@ def furniture() -> Parts:
     ):
         frame = box((width + 0.05, 0.025, height + 0.05), metres_per_repeat=0.3).placed((x, 1.148, z))
         parts[f"frame{number}"] = (frame, "oak")
-        parts[f"picture{number}"] = (_picture(width, height).placed((x, 1.133, z)), f"picture{number}")
+        parts[f"picture{number}"] = (picture(width, height).placed((x, 1.133, z)), f"picture{number}")
     return parts
 
 
@@ -51,47 +51,16 @@ def _runner() -> Mesh:
     return sheet(np.stack([x, y, height], -1), np.stack([x / 0.8, y / 0.8], -1))
 
 
-def _picture(width: float, height: float) -> Mesh:
-    x, z = np.meshgrid([-width / 2, width / 2], [-height / 2, height / 2], indexing="ij")
-    return sheet(np.stack([x, np.zeros_like(x), z], -1), np.stack([x / width + 0.5, z / height + 0.5], -1))
-
-
 def shelf_goods() -> Parts:
     """Books, a plant and a bowl on the shelf."""
-    parts: Parts = {}
-    rng = np.random.default_rng(2)
-    x = -0.90
-    for number in range(10):
-        thickness, height = rng.uniform(0.028, 0.05), rng.uniform(0.15, 0.21)
-        book = box((thickness, 0.14, height), metres_per_repeat=0.2)
-        at = (x + thickness / 2, 1.05, 0.474 + height / 2)
-        parts[f"book{number}"] = (book.placed(at, rotation("y", rng.normal(0, 1.0))), f"book{number % 6}")
-        x += thickness + 0.005
+    parts = books((-0.90, 1.05, 0.474), count=10, seed=2)
     pot = [(0, 0), (0.055, 0), (0.075, 0.10), (0.08, 0.115), (0.07, 0.115), (0.065, 0.10), (0, 0.10)]
     parts["pot"] = (revolved(smooth_profile(pot)).placed((-0.33, 1.05, 0.474)), "clay")
-    parts |= _plant((-0.33, 1.05, 0.58), leaves=22, length=(0.09, 0.18), seed=5, name="fern")
+    parts |= plant((-0.33, 1.05, 0.58), leaves=22, length=(0.09, 0.18), seed=5, name="fern")
     bowl = [(0, 0.010), (0.045, 0.014), (0.09, 0.06), (0.095, 0.06), (0.05, 0.004), (0, 0)]
     parts["bowl"] = (revolved(smooth_profile(bowl)).placed((-0.07, 1.05, 0.474)), "vase")
     for number, (dx, dy, z) in enumerate([(-0.03, 0.0, 0.525), (0.035, 0.01, 0.525), (0.0, -0.005, 0.566)]):
         parts[f"lemon{number}"] = (sphere(0.033).placed((-0.07 + dx, 1.05 + dy, z)), "lemon")
-    return parts
-
-
-def _plant(at: tuple[float, float, float], *, leaves: int, length: tuple[float, float], seed: int, name: str) -> Parts:
-    """Bent leaves that spring from one point."""
-    rng = np.random.default_rng(seed)
-    parts: Parts = {}
-    along = np.linspace(0, 1, 14)[:, None]
-    side = np.array([-1.0, 0.0, 1.0])
-    for number in range(leaves):
-        reach, bend = rng.uniform(*length), rng.uniform(0.3, 1.4)
-        out, up = reach * np.sin(along * bend) / bend, reach * along * np.cos(along * bend * 0.8)
-        half_width = 0.1 * reach * np.sin(np.pi * np.clip(along, 0.04, 0.985))
-        fold = -0.3 * half_width * (1 - np.abs(side))
-        points = np.stack(np.broadcast_arrays(out, half_width * side, up + fold), -1)
-        uvs = np.stack(np.broadcast_arrays(along, side / 2 + 0.5), -1)
-        leaf = sheet(points, uvs).placed(at, rotation("z", rng.uniform(0, 360)))
-        parts[f"{name}{number}"] = (leaf, f"leaf{number % 3}")
     return parts
 
 
@@ -132,7 +101,7 @@ def table_goods() -> Parts:
         "vase": (revolved(smooth_profile(vase)).placed((-0.58, 0.30, 0)), "vase"),
         "plate": (revolved(smooth_profile(plate)).placed((-0.40, 0.03, 0.005)), "plate"),
     }
-    parts |= _plant((-0.58, 0.30, 0.19), leaves=16, length=(0.12, 0.24), seed=9, name="bouquet")
+    parts |= plant((-0.58, 0.30, 0.19), leaves=16, length=(0.12, 0.24), seed=9, name="bouquet")
     for number, (dx, dy, size) in enumerate(
         [(0.066, 0, (0.010, 0.142, 0.155)), (-0.066, 0, (0.010, 0.142, 0.155)),
          (0, 0.066, (0.122, 0.010, 0.155)), (0, -0.066, (0.122, 0.010, 0.155))]

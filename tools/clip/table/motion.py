@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves in the bundled clip, in closed form in time (seconds); the clip lasts 0.4 s.
+"""What moves, in closed form in time (seconds); the clip lasts 0.4 s.
 
 Every shape is there from frame 0, hidden until it appears, so that the renderer compiles its kernel once.
 """
 
 import numpy as np
-from meshes import box, revolved, rotation, sheet, smooth_profile, sphere, tube
-from room import TAP, Parts
+from meshes import Parts, box, revolved, rotation, sheet, smooth_profile, sphere, tube
+
+from table.room import TAP
 
 POUR_SECONDS = 0.085  # the tap opens
 JACK_SECONDS = 0.085  # the spring is let go
