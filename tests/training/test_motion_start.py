@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What moves begins a frame where the pictures show it."""
 
-from dataclasses import replace
-
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.lifting import LiftConfig, lifted_motion
 from structgstream.training.motion import MotionConfig, moving_parts
 from structgstream.training.motion_start import MotionStartConfig, displaced, started
-from structgstream.training.observation import MotionEvidence
 from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
 from worlds import World, moving_world
@@ -65,53 +61,3 @@ def test_displaced_moves_anchors_and_free_gaussians() -> None:
     scene = world().scene
     by = torch.arange(3.0 * len(scene.anchors)).reshape(-1, 3)
     assert torch.equal(displaced(scene, by).anchors.positions, scene.anchors.positions + by)
-
-
-def evidence_of(colors: torch.Tensor, flows: torch.Tensor, views: int) -> MotionEvidence:
-    return MotionEvidence(torch.full((views, len(colors)), 5.0), flows.expand(views, -1, 2), colors)
-
-
-def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
-    """A red ball beside a hand: ball and hand have flows of their own, and lie among each other."""
-    scenery = world()
-    views = training_views(scenery.frames[1], scenery.rig, CPU)
-    generator = torch.Generator().manual_seed(0)
-    centers = 0.05 * torch.randn(40, 3, generator=generator)
-    ball = torch.arange(40) < 20
-    colors = torch.where(ball[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.7, 0.6, 0.5]))
-    # The ball moves to the right in all pictures, the hand rests.
-    flows = torch.where(ball[:, None], torch.tensor([6.0, 0.0]), torch.tensor([0.0, 0.0]))
-
-    def lengths(bandwidth: float) -> tuple[float, float]:
-        config = LiftConfig(color_bandwidth=bandwidth)
-        found = lifted_motion(
-            evidence_of(colors, flows, len(views)), centers, torch.zeros(40, 3), views, config=config, backend=BACKEND
-        ).displacements.norm(dim=1)
-        return float(found[ball].mean()), float(found[~ball].mean())
-
-    ball_alike, hand_alike = lengths(0.15)
-    ball_mixed, hand_mixed = lengths(0.0)
-    assert hand_alike < 0.05 * ball_alike
-    assert hand_alike < hand_mixed or ball_alike > ball_mixed
-
-
-def test_what_hardly_moves_does_not_move() -> None:
-    scenery = world()
-    views = training_views(scenery.frames[1], scenery.rig, CPU)
-    centers = 0.1 * torch.randn(30, 3, generator=torch.Generator().manual_seed(1))
-    flows = torch.tensor([[0.2, 0.0]]).expand(30, 2)
-    given = (evidence_of(torch.zeros(30, 3), flows, len(views)), centers, torch.zeros(30, 3), views)
-    config = LiftConfig()
-    assert lifted_motion(*given, config=config, backend=BACKEND).displacements.any()
-    still = lifted_motion(*given, config=replace(config, least_pixels=0.5), backend=BACKEND)
-    assert not still.displacements.any()
-
-
-def test_without_evidence_movers_follow_their_priors() -> None:
-    scenery = world()
-    views = training_views(scenery.frames[1], scenery.rig, CPU)
-    nothing = MotionEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2), torch.zeros(4, 3))
-    priors = torch.rand(4, 3)
-    found = lifted_motion(nothing, torch.zeros(4, 3), priors, views, config=LiftConfig(), backend=BACKEND)
-    assert torch.equal(found.displacements, priors)
-    assert not found.lifted.any()

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sweep along rays, where it is known what emerged; each back-end on its own."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rigs import arc_rig
+from structgstream.kernels import cpu_sweep, reference_sweep
+from structgstream.kernels._load import native_reason
+from structgstream.kernels.reference_sweep import SweepView, Swept
+
+needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+SWEEPERS = [
+    pytest.param(reference_sweep.sweep, id="reference"),
+    pytest.param(cpu_sweep.sweep, id="cpu", marks=needs_native),
+]
+
+
+def emerged(planes: int = 65) -> tuple[list[SweepView], torch.Tensor, torch.Tensor]:
+    """A red disc of radius 0.25 in front of a grey wall has emerged at the origin, as four cameras see it."""
+    rig, found = arc_rig(5, width=64, height=48), []
+    for name in rig.training:
+        camera = rig[name]
+        matrices = camera.beside(torch.zeros(1))
+        center = matrices.viewmat[:3, 3]
+        y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+        u, v = (matrices.K @ center)[:2] / center[2]
+        disc = ((x - u) ** 2 + (y - v) ** 2).sqrt() < 0.25 * matrices.K[0, 0] / center[2]
+        colors = torch.where(disc[..., None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.5, 0.5, 0.5]))
+        found.append(SweepView(colors, disc.float(), torch.full((48, 64), 6.0), matrices.viewmat, matrices.K, near=1.0))
+    own = found[1]
+    u, v = ((own.K @ own.viewmat[:3, 3])[:2] / own.viewmat[2, 3]).floor().long().tolist()
+    return found, torch.tensor([[u, v]]), torch.tensor([6.0])
+
+
+@pytest.mark.parametrize("sweep", SWEEPERS)
+def test_what_emerged_is_found_where_it_is(sweep) -> None:
+    scene, pixel, farthest = emerged()
+    found: Swept = sweep(scene, 1, pixel, farthest, planes=65, least_supports=2, most_contradictions=0.34)
+    center = float(scene[1].viewmat[2, 3])
+    # Any depth at which the ray stays within the disc's image in all views is as good; the middle of them is taken.
+    assert abs(float(found.depths) - center) < 0.15
+    assert float(found.costs) < 0.03
+
+
+@pytest.mark.parametrize("sweep", SWEEPERS)
+def test_one_view_alone_is_contradicted(sweep) -> None:
+    scene, pixel, farthest = emerged()
+    alone = [v if i == 1 else replace(v, missing=torch.zeros_like(v.missing)) for i, v in enumerate(scene)]
+    found: Swept = sweep(alone, 1, pixel, farthest, planes=65, least_supports=1, most_contradictions=0.34)
+    assert float(found.depths) == 0.0
+    assert torch.isinf(found.costs).all()
+
+
+@pytest.mark.parametrize("sweep", SWEEPERS)
+def test_what_is_hidden_has_no_vote(sweep) -> None:
+    """Behind what is rendered nothing can emerge: with a wall before the disc no point is supported."""
+    scene, pixel, _ = emerged()
+    walled = [replace(v, depths=torch.full_like(v.depths, 1.5)) for v in scene]
+    found: Swept = sweep(walled, 1, pixel, torch.tensor([6.0]), planes=65, least_supports=2, most_contradictions=0.34)
+    assert float(found.depths) < 1.7  # before the wall, or nowhere

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What pictures say of movers: sums by blending weight, and where a mover is seen."""
+
+from dataclasses import replace
+
+import torch
+
+from rigs import arc_rig, random_scene
+from structgstream.gaussians import concatenate
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.observation import by_mover, flow_evidence, gathered, mover_centers, slots_of
+from worlds import emerging_ball
+
+RIG = arc_rig(4, width=48, height=32)
+CAMERA = RIG[RIG.training[0]]
+BACKEND = reference_backend()
+
+
+def test_movers_are_anchors_then_free_gaussians() -> None:
+    scene = random_scene(4, free=2)
+    k = scene.anchors.offsets_per_anchor
+    assert slots_of(scene) == 4 * k + 2
+    sums = torch.arange(float(slots_of(scene)))[:, None]
+    found = by_mover(sums, scene)[:, 0]
+    assert found.tolist() == [sum(range(i * k, i * k + k)) for i in range(4)] + [4 * k, 4 * k + 1]
+
+
+def test_gathered_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from_it() -> None:
+    scene = random_scene(30, free=3)
+    gaussians = scene.gaussians(CAMERA, BACKEND)
+    maps = torch.ones(32, 48, 1)
+    alone = gathered(gaussians, scene, CAMERA, maps, BACKEND)
+    assert alone.shape == (slots_of(scene), 1)
+    ball = emerging_ball(0.99)
+    before = replace(ball, means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
+    covered = gathered(gaussians, scene, CAMERA, maps, BACKEND, still=before)
+    assert covered.shape == alone.shape, "what hides is not told of"
+    assert float(covered.sum()) < 0.8 * float(alone.sum())
+    assert (covered <= alone + 1e-4).all()
+    together = concatenate(gaussians, before)
+    assert len(together) == len(gaussians) + 1
+
+
+def test_evidence_is_a_mean_with_bounds() -> None:
+    # c, c flow_x, c flow_y, cover, and colours times cover, of three movers in one view.
+    sums = torch.tensor(
+        [[4.0, 8.0, -4.0, 8.0, 4.0, 2.0, 0.0], [0.1, 1.0, 1.0, 1.0, 1, 1, 1], [90.0, 90, 0, 90, 0, 0, 9]]
+    )
+    found = flow_evidence([sums, torch.zeros_like(sums)], least_pixels=0.3, most_pixels=20.0)
+    assert found.weights[0].tolist() == [4.0, 0.0, 20.0]
+    assert found.flows[0, 0].tolist() == [2.0, -1.0]
+    assert not found.weights[1].any()
+    torch.testing.assert_close(found.colors[0], torch.tensor([0.5, 0.25, 0.0]))
+    assert found.select(torch.tensor([2])).weights.shape == (2, 1)
+
+
+def test_a_mover_is_where_its_gaussians_are_seen() -> None:
+    scene = random_scene(2, free=1)
+    anchors, k = scene.anchors, scene.anchors.offsets_per_anchor
+    cover = torch.zeros(2 * k + 1)
+    cover[3] = 5.0  # of the first anchor only its fourth Gaussian shows, of the second none
+    found = mover_centers(scene, cover)
+    fourth = anchors.positions[0] + anchors.offsets[0, 3] * anchors.log_offset_scales[0].exp()
+    torch.testing.assert_close(found[0], fourth)
+    torch.testing.assert_close(found[1], anchors.positions[1])
+    torch.testing.assert_close(found[2], scene.free.means[0])

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Before the first iteration: what emerged is born where it is, and what is to blame dies."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from structgstream.kernels._load import native_reason
+from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.scene.scene import Scene
+from structgstream.training.births import BirthConfig
+from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.partition import Partition, focuses
+from structgstream.training.patching import BIRTHS_PER_FRAME
+from structgstream.training.renewal import Renewal, renewal
+from structgstream.training.residuals import residual_floor
+from structgstream.training.views import training_views
+from worlds import emerging_ball, moving_world
+
+CPU = torch.device("cpu")
+WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
+CONFIG = BirthConfig(enabled=True, least_hits=2)
+BACKENDS = [
+    pytest.param(reference_backend, id="reference"),
+    pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
+]
+
+
+def renewed(backend: Backend, *, scene: Scene = WORLD.scene, config: BirthConfig = CONFIG, room: int = 1000) -> Renewal:
+    motion = MotionConfig(enabled=True, picture_scale=1.0)
+    first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
+    partition = Partition.of(scene, moving_parts(scene, views, first, config=motion, backend=backend))
+    return renewal(
+        partition,
+        views,
+        focuses(partition, views, config=motion, backend=backend),
+        frame_index=1,
+        floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend),
+        room=room,
+        least_pixels=motion.least_pixels,
+        config=config,
+        backend=backend,
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
+    found, ball = renewed(backend()), emerging_ball(0.95)
+    born = found.born
+    assert len(born) >= 3
+    assert not found.refused
+    near = (born.means - ball.means).norm(dim=1)
+    assert near.median() < 2.5 * float(ball.scales[0, 0])
+    torch.testing.assert_close(born.colors.median(0).values, ball.colors[0], atol=0.4, rtol=0)  # soft, before others
+    assert born.births.tolist() == [BIRTHS_PER_FRAME + n for n in range(len(born))]
+    torch.testing.assert_close(born.logit_opacities.sigmoid(), torch.full((len(born),), 0.7))
+
+
+def test_births_keep_to_the_room_there_is() -> None:
+    everything = renewed(reference_backend())
+    assert len(renewed(reference_backend(), config=replace(CONFIG, most=2)).born) == 2
+    assert len(renewed(reference_backend(), room=1).born) == 1
+    assert len(renewed(reference_backend(), room=0).born) == 0
+    assert len(everything.born) > 2
+
+
+def test_off_nothing_is_born() -> None:
+    found = renewed(reference_backend(), config=replace(CONFIG, enabled=False))
+    assert len(found.born) == 0
+    assert found.kept.all()
+
+
+def test_when_everything_is_missing_nothing_is_born_and_that_is_told() -> None:
+    found = renewed(reference_backend(), config=replace(CONFIG, most_missing_share=1e-4))
+    assert found.refused
+    assert found.missing_share > 1e-4
+    assert len(found.born) == 0
+
+
+def test_births_are_repeated_bit_for_bit() -> None:
+    one, other = (renewed(reference_backend()).born for _ in range(2))
+    assert torch.equal(one.means, other.means)
+    assert torch.equal(one.colors, other.colors)
+
+
+def test_a_ghost_dies() -> None:
+    """The ball was there in a wrong place before: nobody sees it there now."""
+    ghost = emerging_ball(0.95)
+    free = replace(
+        WORLD.scene.free,
+        means=ghost.means + torch.tensor([[0.5, 0.0, 0.0]]),
+        log_scales=ghost.scales.log(),
+        quats=ghost.quats,
+        logit_opacities=torch.logit(ghost.opacities),
+        colors=ghost.colors,
+        births=torch.tensor([3]),
+    )
+    backend = reference_backend()
+    scene = replace(WORLD.scene, free=free)
+    first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
+    motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05)
+    floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
+    which = moving_parts(scene, views, first, config=motion, backend=backend, floor=floor)
+    assert which.free.all(), "what is wrong passes the gate"
+    partition = Partition.of(scene, which)
+    found = renewal(
+        partition,
+        views,
+        focuses(partition, views, config=motion, backend=backend),
+        frame_index=1,
+        floor=floor,
+        room=1000,
+        least_pixels=0.3,
+        config=CONFIG,
+        backend=backend,
+    )
+    assert found.kept.tolist() == [False]
