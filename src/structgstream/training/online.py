@@ -149,7 +149,7 @@ def fit_next_frame(
         seed: all randomness comes from it, so a frame can be repeated alone.
         steps: of what is sent rounded (Note [Bins]); what it names is drawn rounded and comes back so.
         older: the decoded scene two frames before, for what has a memory (:func:`remembers`); None for none.
-        floor: what frame 0 missed (:func:`looks_back`); None for none.
+        floor: what frame 0 missed, for ``config.motion.residual_threshold`` and for births; None for nothing.
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
         on_step: called after every iteration.
     """
