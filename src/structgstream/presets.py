@@ -15,6 +15,7 @@ from structgstream.training.online import OnlineConfig
 from structgstream.training.optim import Rate
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.rounding import RoundingConfig
+from structgstream.training.solidity import SolidityConfig
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,26 @@ MOTION = replace(
 
 COMPACT = replace(
     MOTION,
-    initial=replace(MOTION.initial, disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5)),
+    initial=replace(
+        MOTION.initial,
+        iterations=3000,
+        schedule_iterations=3000,
+        coarse_iterations=2250,
+        seed_voxels=2,
+        disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5),
+        solidity=SolidityConfig(weight=0.05, every=4),
+        growth=GrowthConfig(
+            collect_from=160,
+            start=300,
+            stop=2550,
+            grad_threshold=5e-5,
+            eligible_count=30,
+            prune_visits=60,
+            max_anchors=42_000,
+            least_growth=0.25,
+            room_until=1800,
+        ),
+    ),
     codec="compact",
     online=replace(
         MOTION.online,
@@ -96,7 +116,8 @@ COMPACT = replace(
     ),
 )
 """As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks. Frame 0
-is disturbed while it is fitted, so that it does not learn its cameras by heart."""
+starts from few anchors and grows where pictures ask for more, its surfaces are made solid, and it is disturbed while it
+is fitted, so that it does not learn its cameras by heart (docs/compact.md)."""
 
 FAST = replace(
     RIG,
