@@ -145,7 +145,13 @@ COMPACT = replace(
         coarse_iterations=2250,
         seed_voxels=2,
         growth=GrowthConfig(
-            collect_from=160, start=300, stop=2600, grad_threshold=5e-5, max_anchors=42_000, room_until=1800
+            collect_from=160,
+            start=300,
+            stop=2600,
+            grad_threshold=5e-5,
+            max_anchors=42_000,
+            least_growth=0.25,
+            room_until=1800,
         ),
         disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5),
         solidity=SolidityConfig(weight=0.05, every=4),

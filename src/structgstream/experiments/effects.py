@@ -2,7 +2,7 @@
 """What each part of the compact stream is worth: the whole, and the whole with one switch thrown at a time."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 
 from structgstream.errors import ConfigError
 from structgstream.experiments.results import Result
@@ -11,7 +11,6 @@ from structgstream.experiments.summary import Summary, summaries
 from structgstream.experiments.variants import FULL, Variant
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
-from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.rounding import RoundingConfig
@@ -21,7 +20,7 @@ WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode on the frame 0 that the compact stream begins with."""
-DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{field.name}" for field in fields(DisturbanceConfig))
+DISTURBANCE_FIELDS = ("initial.disturbance.dropped_share", "initial.disturbance.noise_scales")
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """What is tried where the whole has it not."""
 PAPER_ITERATIONS = 100
@@ -73,7 +72,8 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     whole = full.online
     motion, rounding, patching = whole.motion, whole.rounding, whole.patching
     rows.append(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
-    calm = replace(full.initial, disturbance=DisturbanceConfig())
+    undisturbed = replace(full.initial.disturbance, dropped_share=0.0, noise_scales=0.0)
+    calm = replace(full.initial, disturbance=undisturbed)
     row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
     gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
     share = 0.0 if motion.least_views_share else VIEWS_SHARE

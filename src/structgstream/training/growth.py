@@ -39,6 +39,9 @@ class GrowthConfig:
     """The iterations after which contributions are looked at."""
     max_anchors: int = 1_000_000
     """No anchor is added beyond this number; those with the largest gradients come first."""
+    least_growth: float = 0.0
+    """There is room for this share of the seeds on top of them, even beyond ``max_anchors``: a capture with many points
+    grows, too."""
     room_until: int = 0
     """Their number may rise evenly from ``start`` to this iteration; 0: there is room for all from the beginning."""
 
@@ -47,10 +50,13 @@ class GrowthConfig:
 
         Few at first cost little while pictures are still coarse, and what comes late comes where it is missed most.
         """
+        most = self.max_anchors
+        if self.least_growth:
+            most = max(most, seeds + round(self.least_growth * seeds))
         if iteration >= self.room_until:
-            return self.max_anchors
+            return most
         share = max(0.0, (iteration - self.start) / (self.room_until - self.start))
-        return min(self.max_anchors, seeds + round(share * max(0, self.max_anchors - seeds)))
+        return min(most, seeds + round(share * max(0, most - seeds)))
 
     def last(self, iterations: int) -> int:
         """The iteration after which anchors no longer change, in a fit of ``iterations``.
