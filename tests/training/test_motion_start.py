@@ -5,7 +5,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig, moving_parts
-from structgstream.training.motion_start import MotionStartConfig, displaced, started
+from structgstream.training.motion_start import MotionStartConfig, displaced, flow_views, started
 from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
 from worlds import World, moving_world
@@ -23,7 +23,9 @@ def world() -> World:
 def begun(scenery: World, *, rounds: int = 2, enabled: bool = True):
     config = MotionStartConfig(enabled=enabled, rounds=rounds)
     views, before = (training_views(scenery.frames[t], scenery.rig, CPU) for t in (1, 0))
-    which = moving_parts(scenery.scene, views, before, config=MOTION, backend=BACKEND, with_flow=enabled)
+    which = moving_parts(
+        scenery.scene, views, before, config=MOTION, backend=BACKEND, flow_from=flow_views(views, 1, config)
+    )
     partition = Partition.of(scenery.scene, which)
     priors = torch.zeros(len(which.movers), 3)
     return partition, started(partition, views, priors, config=config, motion=MOTION, backend=BACKEND)
@@ -61,3 +63,14 @@ def test_displaced_moves_anchors_and_free_gaussians() -> None:
     scene = world().scene
     by = torch.arange(3.0 * len(scene.anchors)).reshape(-1, 3)
     assert torch.equal(displaced(scene, by).anchors.positions, scene.anchors.positions + by)
+
+
+def test_flow_is_looked_for_in_turns_where_there_are_many_views() -> None:
+    views = training_views(world().frames[0], world().rig, CPU)  # five
+    config = MotionStartConfig(enabled=True, views=3)
+    turns = [flow_views(views, frame, config) for frame in (1, 2)]
+    assert [len(turn) for turn in turns] == [2, 3]
+    assert turns[0] | turns[1] == {view.index for view in views}
+    assert flow_views(views, 3, config) == turns[0]
+    assert len(flow_views(views, 1, MotionStartConfig(enabled=True))) == 5
+    assert not flow_views(views, 1, MotionStartConfig())

@@ -60,7 +60,7 @@ def test_a_light_switched_on_is_a_jump() -> None:
     cpu, backend = torch.device("cpu"), reference_backend()
     before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
     bright = [replace(v, image=(v.image.int() + 60).clamp(max=255).to(torch.uint8)) for v in views]
-    found = moving_parts(WORLD.scene, bright, before, config=CONFIG, backend=backend, with_flow=True)
+    found = moving_parts(WORLD.scene, bright, before, config=CONFIG, backend=backend, flow_from=range(len(views)))
     assert found.jumped
     assert found.evidence is None
     assert len(found.trusted) == len(views)

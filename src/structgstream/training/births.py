@@ -20,7 +20,7 @@ from structgstream.kernels.reference_sweep import SweepView
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.training.residuals import ResidualFloor, box_mean, residual
-from structgstream.training.views import View
+from structgstream.training.views import View, area_mean
 
 MASK_PIXELS = 5
 HIT_VOXELS = 1.8
@@ -79,7 +79,7 @@ def missing_in(picture: Tensor, view: View, *, floor: ResidualFloor | None, conf
     scale = min(1.0, config.picture_width / view.camera.width)
     small = view.reduced(scale)
     size = (small.camera.height, small.camera.width)
-    seen = interpolate(picture.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
+    seen = area_mean(picture.permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
     off = residual(seen, small.image)
     limit = off.new_full((), config.residual_threshold)
     if floor is not None:

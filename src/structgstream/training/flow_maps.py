@@ -4,9 +4,9 @@
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from structgstream.flow import agreeing, dis_search
+from structgstream.training.views import area_mean
 
 CONTEXT_PIXELS = 16
 """Flow is looked for in the box around what changed, and so far around it."""
@@ -29,12 +29,12 @@ def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, in
     box = _box(changed)
     if box is not None:
         rows, columns = box
-        search = dis_search("capture", preset="medium")
+        search = dis_search("capture", refined=False)
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
         forward, backward = search(earlier, later), search(later, earlier)
         believed = agreeing(forward, backward).astype(np.float32)[..., None]
         maps[rows, columns] = torch.from_numpy(np.concatenate([believed, believed * forward], axis=-1))
-    small = interpolate(maps.permute(2, 0, 1)[None], size=size, mode="area")
+    small = area_mean(maps.permute(2, 0, 1)[None], size)
     return small[0].permute(1, 2, 0).to(first.device)
 
 

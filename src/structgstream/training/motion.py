@@ -7,12 +7,12 @@ when it differs from the last frame's, or when the rendering misses there what f
 slow to be seen between two frames adds up, and what was left behind stays wrong.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import max_pool2d
 
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
@@ -21,7 +21,7 @@ from structgstream.training.flow_maps import flow_map
 from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
 from structgstream.training.residuals import ResidualFloor, residual_of
 from structgstream.training.trust import ViewChange, believed, jumped
-from structgstream.training.views import View
+from structgstream.training.views import View, area_mean
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ class Moving:
         shown: for each trusted view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
         trusted: numbers of the views whose pictures can be believed (``trust``); only they were asked.
         jumped: whether everything changed, so that there is no motion to follow.
-        evidence: how all movers were seen to move, if that was asked for.
+        evidence: how all movers were seen to move, if that was asked for ...
+        told: ... and the indices of the views that told of it.
         centers: ``[M + F, 3]`` where all movers are seen, if that was asked for.
     """
 
@@ -90,6 +91,7 @@ class Moving:
     trusted: tuple[int, ...] = ()
     jumped: bool = False
     evidence: MotionEvidence | None = None
+    told: tuple[int, ...] = ()
     centers: Tensor | None = None
 
     @property
@@ -124,7 +126,7 @@ def moving_parts(
     backend: Backend,
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
-    with_flow: bool = False,
+    flow_from: Collection[int] = (),
 ) -> Moving:
     """What may move between the pictures ``before`` and those of ``views`` (same cameras, same order).
 
@@ -136,7 +138,7 @@ def moving_parts(
         backend: what computes.
         older: the scene a frame earlier, for ``moved_ease``; None for none.
         floor: what frame 0 missed, for ``residual_threshold``; None for none.
-        with_flow: also find how everything was seen to move.
+        flow_from: indices of the views in which flow is looked for too.
     """
     anchors, free = len(scene.anchors), len(scene.free)
     ease = torch.ones(anchors + free, device=scene.anchors.positions.device)
@@ -146,8 +148,9 @@ def moving_parts(
     with torch.no_grad():
         baked = scene.baked()
         for view, last in zip(views, before, strict=True):
+            flows = view.index in flow_from
             looks.append(
-                _look(baked, view, last, config=config, backend=backend, ease=ease, floor=floor, with_flow=with_flow)
+                _look(baked, view, last, config=config, backend=backend, ease=ease, floor=floor, with_flow=flows)
             )
     changes = [look.change for look in looks]
     trusted = [number for number, good in enumerate(believed(changes)) if good]
@@ -163,12 +166,14 @@ def moving_parts(
         trusted=tuple(trusted),
         jumped=jumped(changes),
     )
-    if not with_flow or found.jumped:
+    told = [n for n in trusted if views[n].index in flow_from]
+    if not told or found.jumped:
         return found
     evidence = flow_evidence(
-        [looks[n].flows for n in trusted], least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS
+        [looks[n].flows for n in told], least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS
     )
-    return replace(found, evidence=evidence, centers=mover_centers(scene, cover.sum(0)))
+    centers = mover_centers(scene, cover.sum(0))
+    return replace(found, evidence=evidence, told=tuple(views[n].index for n in told), centers=centers)
 
 
 @dataclass(frozen=True)
@@ -199,7 +204,7 @@ def _look(
         last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
     )
     size = (small.camera.height, small.camera.width)
-    part = interpolate(changed[None, None].to(gaussians.means), size=size, mode="area")
+    part = area_mean(changed[None, None].to(gaussians.means), size)
     difference = float(part.mean())
     wrong_share = 0.0
     if floor is not None and config.residual_threshold > 0.0:

@@ -35,7 +35,17 @@ class MotionStartConfig:
     """Lift flow. Off, the paper: everything begins where it was."""
     rounds: int = 2
     """1: flow between the pictures alone; 2: and from the rendering to the pictures."""
+    views: int = 14
+    """Flow is looked for in about so many views at most, in every second or third one of more, by turns."""
     lift: LiftConfig = field(default_factory=LiftConfig)
+
+
+def flow_views(views: Sequence[View], frame_index: int, config: MotionStartConfig) -> frozenset[int]:
+    """Indices of the views in which flow is looked for in a frame; none when the start is off."""
+    if not config.enabled:
+        return frozenset()
+    stride = -(-len(views) // max(config.views, 2))
+    return frozenset(view.index for n, view in enumerate(views) if n % stride == frame_index % stride)
 
 
 @dataclass(frozen=True)
@@ -79,12 +89,13 @@ def started(
         return Started(priors, focuses(partition, views, config=motion, backend=backend))
     movers = which.movers
     evidence, centers = which.evidence.select(movers), which.centers[movers]
-    first = lifted_motion(evidence, centers, priors, views, config=config.lift, backend=backend)
+    told = [view for view in views if view.index in which.told]
+    first = lifted_motion(evidence, centers, priors, told, config=config.lift, backend=backend)
     displacements, lifted, corrections = first.displacements, int(first.lifted.sum()), 0
     moved = replace(partition, moving=displaced(partition.moving, displacements))
     places = focuses(moved, views, config=motion, backend=backend)
     if config.rounds > 1:
-        second = corrected(moved.moving, views, places, scale=motion.picture_scale, config=config.lift, backend=backend)
+        second = corrected(moved.moving, told, places, scale=motion.picture_scale, config=config.lift, backend=backend)
         displacements, corrections = displacements + second.displacements, int(second.lifted.sum())
     return Started(displacements, places, lifted, corrections)
 
@@ -112,7 +123,7 @@ def corrected(
 
     Args:
         moving: the moving part of a scene, where it is believed to be.
-        views: of the frame.
+        views: in which flow is looked for.
         focuses: by view index, where it shows; views without one are not looked at.
         scale: of the pictures on which is gathered.
         config: how.

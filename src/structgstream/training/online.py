@@ -26,7 +26,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 from structgstream.training.births import BirthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
-from structgstream.training.motion_start import MotionStartConfig, displaced, started
+from structgstream.training.motion_start import MotionStartConfig, displaced, flow_views, started
 from structgstream.training.observation import slots_of
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
@@ -177,7 +177,7 @@ def fit_next_frame(
                 backend=backend,
                 older=older,
                 floor=floor,
-                with_flow=config.start.enabled,
+                flow_from=flow_views(views, frame.index, config.start),
             )
             partition, ahead = Partition.of(scene, which), ahead[which.movers]
             trusted = [views[number] for number in which.trusted]
