@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from small_presets import TINY_RIG
 from streams import moved, same, small_scene
 from structgstream import session
 from structgstream.beginning import frame_seed
@@ -21,7 +22,7 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.presets import TINY, StreamConfig
+from structgstream.presets import StreamConfig
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import Session
 from structgstream.training.result import FitResult
@@ -73,7 +74,9 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seeds
 
 
-def run(source: Rig, sink, *, resumed=None, config: StreamConfig = TINY, metadata=None) -> list[session.FrameReport]:
+def run(
+    source: Rig, sink, *, resumed=None, config: StreamConfig = TINY_RIG, metadata=None
+) -> list[session.FrameReport]:
     return list(Session(source, sink, config, reference_backend(), resumed=resumed, metadata=metadata).run())
 
 
@@ -162,9 +165,9 @@ def other_camera(source: Rig) -> Rig:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"config": replace(TINY, seed=3)}, "another configuration: seed differ"),
+        ({"config": replace(TINY_RIG, seed=3)}, "another configuration: seed differ"),
         (
-            {"config": replace(TINY, key_interval_seconds=2.0, online=replace(TINY.online, iterations=7))},
+            {"config": replace(TINY_RIG, key_interval_seconds=2.0, online=replace(TINY_RIG.online, iterations=7))},
             "another configuration: key_interval_seconds, online.iterations differ. Resume with the same preset",
         ),
         ({"metadata": {"start": 5}}, "another capture or another part of it: start differ"),
@@ -210,7 +213,7 @@ def test_ctrl_c_leaves_a_complete_file(quick_fits: list[int], tmp_path: Path, mo
 
 def test_a_consumer_that_stops_leaves_a_complete_file(quick_fits: list[int]) -> None:
     sink = MemorySink()
-    reports = Session(capture(), sink, TINY, reference_backend()).run()
+    reports = Session(capture(), sink, TINY_RIG, reference_backend()).run()
     next(reports)
     reports.close()  # type: ignore[attr-defined]
     reader = StreamReader(sink.data)
@@ -258,6 +261,7 @@ def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[in
     header = StreamReader(uninterrupted()).header
     assert header.metadata.keys() == {"capture"}
     assert header.config.keys() == {
+        "environment",
         "initial",
         "online",
         "points",
@@ -273,9 +277,9 @@ def test_the_real_fit_resumes_exactly_and_keeps_static_fields(tmp_path: Path) ->
     world = moving_world(3, emerges_at=1)
     source = Rig(world.rig, world.frames)
     config = replace(
-        TINY,
-        initial=replace(TINY.initial, iterations=12, schedule_iterations=12, coarse_iterations=4, voxel_size=0.1),
-        online=replace(TINY.online, iterations=4, patching=replace(TINY.online.patching, iteration=2)),
+        TINY_RIG,
+        initial=replace(TINY_RIG.initial, iterations=12, schedule_iterations=12, coarse_iterations=4, voxel_size=0.1),
+        online=replace(TINY_RIG.online, iterations=4, patching=replace(TINY_RIG.online.patching, iteration=2)),
     )
     whole = MemorySink()
     run(source, whole, config=config)

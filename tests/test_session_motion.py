@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
+from small_presets import TINY_RIG
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.presets import TINY
 from structgstream.session import FrameReport, Session
 from structgstream.training.motion import MotionConfig
 from worlds import moving_world
 
 WORLD = moving_world(4, speed=0.06, movers=20)
 CONFIG = replace(
-    TINY,
-    initial=replace(TINY.initial, iterations=20, schedule_iterations=20, coarse_iterations=10),
+    TINY_RIG,
+    initial=replace(TINY_RIG.initial, iterations=20, schedule_iterations=20, coarse_iterations=10),
     online=replace(
-        TINY.online,
+        TINY_RIG.online,
         iterations=8,
-        patching=replace(TINY.online.patching, iteration=4),
+        patching=replace(TINY_RIG.online.patching, iteration=4),
         motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
     ),
 )

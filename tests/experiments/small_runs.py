@@ -3,18 +3,21 @@
 
 from dataclasses import replace
 
+from small_presets import TINY_RIG
 from structgstream.data.clip import bundled_clip_path
 from structgstream.experiments.captures import CapturePart
-from structgstream.presets import COMPACT, RIG, TINY, StreamConfig
+from structgstream.presets import COMPACT, StreamConfig
 
 CLIP = CapturePart(bundled_clip_path(), scale=0.25, frames=3)
 
 
 def quick(*, seed: int = 0) -> StreamConfig:
     """Paper mode with next to no iterations."""
-    patching = replace(RIG.online.patching, iteration=1)
-    initial = replace(TINY.initial, iterations=3, disturbance=RIG.initial.disturbance, random_background=False)
-    return replace(RIG, seed=seed, initial=initial, online=replace(RIG.online, iterations=2, patching=patching))
+    patching = replace(TINY_RIG.online.patching, iteration=1)
+    initial = replace(TINY_RIG.initial, iterations=3)
+    return replace(
+        TINY_RIG, seed=seed, initial=initial, online=replace(TINY_RIG.online, iterations=2, patching=patching)
+    )
 
 
 def compact(*, seed: int = 0) -> StreamConfig:

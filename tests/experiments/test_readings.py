@@ -4,11 +4,12 @@
 import pytest
 
 from outcomes import outcome, outcomes
+from small_presets import TINY_RIG
 from structgstream.experiments.readings import BASE, READINGS, readings_sheet
-from structgstream.presets import PAPER, RIG, TINY, StreamConfig, to_json
+from structgstream.presets import PAPER, RIG, StreamConfig, to_json
 
 
-@pytest.mark.parametrize("config", [PAPER, RIG, TINY], ids=["paper", "rig", "tiny"])
+@pytest.mark.parametrize("config", [PAPER, RIG, TINY_RIG], ids=["paper", "rig", "tiny"])
 def test_every_reading_but_the_default_changes_the_configuration_in_a_way_of_its_own(config: StreamConfig) -> None:
     edited = {key: str(to_json(reading.edit(config))) for key, reading in READINGS.items()}
     assert edited.pop(BASE) == str(to_json(config))

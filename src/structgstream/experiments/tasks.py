@@ -14,6 +14,7 @@ from structgstream.experiments.captures import CapturePart, capture_facts
 from structgstream.experiments.results import Result, read_result, result_of, rounded, write_result
 from structgstream.presets import StreamConfig, to_json
 from structgstream.rate_control import RateConfig
+from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.online import OnlineConfig
 
 if TYPE_CHECKING:
@@ -57,7 +58,9 @@ class FirstFrame:
     @property
     def _alone(self) -> StreamConfig:
         """What decides it, and how it is kept: as it was fitted, since streams round it in ways of their own."""
-        return replace(self.config, online=OnlineConfig(), codec="raw", rate=RateConfig())
+        # What is behind the scene is found when a stream begins.
+        plain = replace(self.config, online=OnlineConfig(), codec="raw", rate=RateConfig())
+        return replace(plain, environment=EnvironmentConfig())
 
     def done(self) -> bool:
         """Whether the frame is there; a stream that was interrupted has none."""

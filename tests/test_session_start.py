@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams whose frames begin by flow and births: they act, they repeat, and they resume bit for bit."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from small_presets import TINY_RIG
+from structgstream.cameras import CameraRig
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.records import scanned
+from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import reference_backend
+from structgstream.presets import COMPACT
+from structgstream.session import FrameReport, Session
+from worlds import moving_world
+
+FRAMES = 4
+WORLD = moving_world(FRAMES, cameras=6, speed=0.06, movers=20, emerges_at=2, width=96, height=64)
+CONFIG = replace(
+    COMPACT,
+    initial=replace(TINY_RIG.initial, iterations=60, random_background=True),
+    online=replace(
+        COMPACT.online,
+        iterations=6,
+        motion=replace(COMPACT.online.motion, reach_pixels=1),
+        births=replace(COMPACT.online.births, least_hits=2, residual_threshold=0.2),
+    ),
+)
+
+
+@dataclass
+class Capture:
+    """The world's pictures, some of them spoiled: ``(frame, camera)`` to what is shown instead."""
+
+    pictures: list[MultiViewFrame]
+    fps: float = 30.0
+    name: str = "world"
+    points: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        self.points = WORLD.scene.anchors.positions.numpy().astype(float)
+
+    @property
+    def rig(self) -> CameraRig:
+        return WORLD.rig
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        yield from self.pictures[start:]
+
+
+def run(sink, *, resumed=None, pictures: list[MultiViewFrame] = WORLD.frames) -> list[FrameReport]:
+    return list(Session(Capture(pictures), sink, CONFIG, reference_backend(), resumed=resumed).run())
+
+
+@cache
+def whole() -> tuple[bytes, list[FrameReport]]:
+    reports = run(sink := MemorySink())
+    return bytes(sink.data), reports
+
+
+def test_every_part_acts_and_is_counted() -> None:
+    counts = [report.counts for report in whole()[1]]
+    assert not counts[0]
+    assert all(count["lifted"] > 0 for count in counts[1:])
+    assert all(count["corrected"] > 0 for count in counts[1:])
+    assert not any(count["jumps"] or count["views left out"] for count in counts[1:])
+
+
+def test_the_same_again_is_the_same_file() -> None:
+    run(sink := MemorySink())
+    assert bytes(sink.data) == whole()[0]
+
+
+def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Path) -> None:
+    """What frame 0 missed, what moved last and the last pictures are all found again."""
+    data, path = whole()[0], tmp_path / "a.sgs"
+    for record in [*scanned(data)][:-1]:
+        path.write_bytes(data[: record.end])
+        sink, resumed = FileSink.resume(path)
+        run(sink, resumed=resumed)
+        assert path.read_bytes() == data
+
+
+def spoiled(change, *, frame: int, cameras: int) -> list[MultiViewFrame]:
+    """The world, ``cameras`` of its training cameras changed in one frame."""
+    names = WORLD.rig.training[:cameras]
+    images = dict(WORLD.frames[frame].images)
+    images |= {name: change(images[name]) for name in names}
+    return [replace(f, images=images) if f.index == frame else f for f in WORLD.frames]
+
+
+@pytest.mark.parametrize("kind", ["white", "light"])
+def test_bad_pictures_bring_no_flood(kind: str) -> None:
+    def change(image: np.ndarray) -> np.ndarray:
+        if kind == "white":
+            return np.full_like(image, 255)
+        return np.minimum(image.astype(int) + 80, 255).astype(np.uint8)
+
+    cameras = 1 if kind == "white" else len(WORLD.rig.training)
+    reports = run(sink := MemorySink(), pictures=spoiled(change, frame=1, cameras=cameras))
+    usual = whole()[1]
+    assert len(StreamReader(bytes(sink.data))) == FRAMES, "nothing is lost"
+    assert reports[1].free - reports[0].free <= CONFIG.online.births.most
+    if kind == "white":
+        assert [r.counts["views left out"] for r in reports[1:3]] == [1, 1], "blinded, and back again"
+        assert reports[1].bytes < 2 * usual[1].bytes
+    else:
+        assert [r.counts["jumps"] for r in reports[1:]] == [1, 1, 0], "on, and off again"
+        assert reports[1].counts["born"] == 0
+        everything = 40 * (len(WORLD.scene.anchors) + CONFIG.online.births.most)
+        assert all(r.bytes < everything for r in reports[1:])
