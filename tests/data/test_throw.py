@@ -12,7 +12,7 @@ from structgstream.cameras import Camera
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 
-THROW = Path(__file__).parents[2] / "captures" / "throw"
+THROW = Path(__file__).parents[2] / "examples" / "throw"
 # metres, as tools/clip/README.md states them: thrown, in flight, on the floor, at the second figure's hands
 BALL_CENTRES = {
     2: (0.427, -0.232, 1.218),
