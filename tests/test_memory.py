@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from small_presets import TINY_RIG
 from structgstream import memory
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
@@ -19,7 +20,6 @@ from structgstream.errors import BackendError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, select_backend
 from structgstream.memory import PeakKind, PeakMeter, resident_bytes
-from structgstream.presets import TINY
 from structgstream.session import Session
 from worlds import World, moving_world
 
@@ -155,9 +155,11 @@ def test_a_long_run_and_reading_it_back_hold_no_more_at_the_end_than_at_the_begi
     last = (FRAMES if backend.name == "cpu" else FRAMES_WITHOUT_KERNELS) - 1
     source = Endless(moving_world(2, cameras=3, width=32, height=24), last + 1, points=points)
     config = replace(
-        TINY,
-        initial=replace(TINY.initial, iterations=4, schedule_iterations=4, coarse_iterations=2, voxel_size=0.3),
-        online=replace(TINY.online, iterations=1, patching=replace(TINY.online.patching, iteration=1, max_free=100)),
+        TINY_RIG,
+        initial=replace(TINY_RIG.initial, iterations=4, schedule_iterations=4, coarse_iterations=2, voxel_size=0.3),
+        online=replace(
+            TINY_RIG.online, iterations=1, patching=replace(TINY_RIG.online.patching, iteration=1, max_free=100)
+        ),
     )
     path = tmp_path / "long.sgs"
     measured: dict[int, tuple[int, int]] = {}

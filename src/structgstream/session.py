@@ -150,10 +150,10 @@ class Session:
                 past.older = self._resumed.scene(start - 2)
         if start >= len(self._source):
             return
-        # What moves shows against the frame before, so a resumed stream reads that one once more.
         if start > 0 and online.motion.residual_threshold > 0.0:
             assert self._resumed is not None
             past.floor = self._floor(self._resumed.scene(0), next(self._source.frames(0)))
+        # What moves shows against the frame before, so a resumed stream reads that one once more.
         again = start > 0 and online.motion.enabled
         frames = self._source.frames(start - again)
         past.frame = next(frames) if again else None
