@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One description of a packet, two directions (``coder.py``, Note [Two directions]), with adaptive decisions."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -45,7 +46,7 @@ class AdaptiveCoder(Protocol):
         ...
 
 
-class _Adaptive:
+class _Adaptive(ABC):
     """What both directions have in common: arrays that are filled in place."""
 
     def __init__(self, models: Models, *, where: str) -> None:
@@ -53,8 +54,9 @@ class _Adaptive:
         self._where = where
         self._codes: dict[str, Arithmetic] = {}
 
+    @abstractmethod
     def _code(self, name: str) -> Arithmetic:
-        raise NotImplementedError
+        """The arithmetic code that a name belongs to."""
 
     def activity(self, name: str, active: Flags | None, *, history: NDArray[np.uint8], sizes: Bins) -> Flags:
         values = np.zeros(len(history), np.uint8) if active is None else active.astype(np.uint8)
@@ -91,8 +93,9 @@ class _Adaptive:
             self._looked_at(name, sound)
         return found
 
+    @abstractmethod
     def _looked_at(self, name: str, sound: bool) -> None:
-        raise NotImplementedError
+        """What is to be done once a name has been coded, and whether its numbers made sense."""
 
 
 class AdaptiveEncoder(_Adaptive):
