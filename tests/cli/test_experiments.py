@@ -191,7 +191,7 @@ def test_the_paper_alone_is_the_default(tmp_path: Path, monkeypatch: pytest.Monk
 def test_another_full_method_of_the_compact_tables_must_be_compact(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    error = error_of(["ablate", CLIP, "-o", str(tmp_path), "--table", "rates", "--preset", "fast"], capsys, status=1)
+    error = error_of(["ablate", CLIP, "-o", str(tmp_path), "--table", "rates", "--preset", "motion"], capsys, status=1)
     assert "need codec 'compact', got 'raw'; take --preset compact." in error
 
 
