@@ -144,6 +144,8 @@ COMPACT = replace(
         schedule_iterations=4000,
         coarse_iterations=2800,
         seed_voxels=2,
+        offsets_per_anchor=3,
+        all_drawn=True,
         growth=GrowthConfig(
             collect_from=160,
             start=300,
@@ -161,7 +163,7 @@ COMPACT = replace(
     codec="compact",
     online=replace(
         MOTION.online,
-        iterations=75,
+        iterations=60,
         rates=replace(MOTION.online.rates, anchor_positions=2e-4, final_share=0.4),
         patching=replace(MOTION.online.patching, spawn="off"),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),

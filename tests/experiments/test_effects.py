@@ -41,6 +41,9 @@ def test_what_the_switches_are() -> None:
     assert ROWS[BETTER_FIRST].config == replace(RIG, initial=COMPACT.initial)
     calm = ROWS["compact-without-disturbance"].config
     assert calm.initial == replace(COMPACT.initial, disturbance=RIG.initial.disturbance)
+    many = ROWS["compact-offsets"].config.initial
+    assert (many.offsets_per_anchor, many.all_drawn) == (RIG.initial.offsets_per_anchor, False)
+    assert COMPACT.initial.all_drawn
     assert not online["compact-without-gate"].motion.enabled
     assert "covariance_mlp" not in online["compact-without-gate"].dynamic
     assert online["compact-without-rate"].rounding.rate_weight == 0.0

@@ -43,6 +43,18 @@ def test_the_start_is_neutral() -> None:
     assert seeded(torch.rand(300, 3), distance_input=False).mlps.opacity.w1.shape == (32, 35)
 
 
+def test_every_gaussian_can_begin_drawn_whatever_camera_looks() -> None:
+    points, drawn = torch.rand(300, 3), {}
+    for wanted in (False, True):
+        heads = [
+            seeded(points, all_drawn=wanted, generator=torch.Generator().manual_seed(n)).mlps.opacity for n in range(5)
+        ]
+        inputs = torch.cat([torch.zeros(64, 32), torch.randn(64, 4)], dim=1)
+        drawn[wanted] = [(torch.relu(inputs @ h.w1.T + h.b1) @ h.w2.T + h.b2 > 0).float().mean() for h in heads]
+    assert min(drawn[True]) == 1.0
+    assert max(drawn[False]) < 1.0, "as Scaffold-GS draws them, some begin transparent"
+
+
 def test_the_seed_decides_the_weights() -> None:
     points = torch.rand(100, 3)
     assert torch.equal(seeded(points).mlps.color.w1, seeded(points).mlps.color.w1)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -60,6 +61,19 @@ def test_gradients_reach_exactly_the_trained_parameters() -> None:
     assert screen is not None
     assert screen.shape == (len(loss.rendering.gaussians), 2)
     assert all(gradient.abs().sum() > 0 for gradient in gradients.values())
+
+
+def test_a_view_that_shows_nothing_has_no_gradients() -> None:
+    scene = random_scene(free=0)
+    opaque = scene.mlps.opacity
+    hidden = opaque._replace(w2=torch.zeros_like(opaque.w2), b2=torch.full_like(opaque.b2, -1.0))
+    scene = replace(scene, mlps=scene.mlps._replace(opacity=hidden))
+    parameters = Parameters.of(scene, trained=parameters_of_fields(PAPER_DYNAMIC))
+    loss, _ = loss_of(parameters, scene, volume=0.0)
+    assert len(loss.rendering.gaussians) == 0
+    gradients, screen = gradients_of(loss, parameters, Stopwatch(CPU))
+    assert all(not gradient.any() for gradient in gradients.values())
+    assert screen is None or not len(screen)
 
 
 def test_the_last_pass_reports_psnr_in_decibels() -> None:

@@ -21,6 +21,7 @@ WHOLE = "compact"
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode on the frame 0 that the compact stream begins with."""
 DISTURBANCE_FIELDS = ("initial.disturbance.dropped_share", "initial.disturbance.noise_scales")
+OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """What is tried where the whole has it not."""
 PAPER_ITERATIONS = 100
@@ -75,6 +76,9 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     undisturbed = replace(full.initial.disturbance, dropped_share=0.0, noise_scales=0.0)
     calm = replace(full.initial, disturbance=undisturbed)
     row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
+    lively = replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False)
+    title = f"{PAPER_OFFSETS} Gaussians an anchor, of which half begin undrawn"
+    row(f"{WHOLE}-offsets", title, replace(full, initial=lively), *OFFSET_FIELDS)
     gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
     share = 0.0 if motion.least_views_share else VIEWS_SHARE
     title = (

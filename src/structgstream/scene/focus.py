@@ -18,6 +18,7 @@ class Focus:
     Args:
         tiles: ``[rows, columns]`` bool (``kernels.raster_types``), those that moving Gaussians reach.
         picture: ``[H, W, 3]`` the rest of the picture, as far as a loss looks beyond the tiles; drawn onto in place.
+            In the tiles it shows what was drawn there last.
         still: Gaussians that reach the tiles and do not move; without gradient.
     """
 

@@ -71,6 +71,9 @@ class InitialConfig:
     random_background: bool = False
     """Whether every iteration has a background of another colour (``training/environment.py``, Note [Honest coverage];
     paper: black)."""
+    all_drawn: bool = False
+    """Whether all of an anchor's Gaussians begin opaque enough to be drawn (``training/seeding.py``, Note [Dead
+    outputs]; Scaffold-GS: no, half of them by chance)."""
     disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
     solidity: SolidityConfig = field(default_factory=SolidityConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
@@ -136,6 +139,7 @@ def fit_first_frame(
         distance_input=config.distance_input,
         device=backend.device,
         generator=generator,
+        all_drawn=config.all_drawn,
     )
     trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
     if not config.camera_color:

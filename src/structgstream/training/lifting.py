@@ -27,8 +27,6 @@ class LiftConfig:
     share a motion. 0: colours do not count."""
     inlier_share: float = 0.4
     """A displacement counts when so much of the flow agrees with it ..."""
-    least_pixels: float = 0.0
-    """A displacement that no view sees to be so long is none: it would cost bytes and gain nothing."""
     agreeing_views: int = 2
     """... in so many views; else a mover begins where its last step leads."""
 
@@ -93,20 +91,7 @@ def lifted_motion(
     )
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
-    if config.least_pixels > 0.0:
-        lengths = displacements.norm(dim=1) * _pixels_per_unit(centers, evidence.weights, views)
-        displacements = torch.where((lengths < config.least_pixels)[:, None], 0.0, displacements)
     return MotionStart(displacements, lifted)
-
-
-def _pixels_per_unit(centers: Tensor, weights: Tensor, views: Sequence[View]) -> Tensor:
-    """Pixels that a unit of length at each of ``centers`` covers in the nearest view that shows it, ``[T]``."""
-    most = centers.new_zeros(len(centers))
-    for view, seen in zip(views, weights, strict=True):
-        viewmat, K, _ = view.camera.beside(centers)
-        z = centers @ viewmat[2, :3] + viewmat[2, 3]
-        most = torch.where(seen > 0, torch.maximum(most, K[0, 0] / z.clamp(min=view.camera.near)), most)
-    return most
 
 
 def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,6 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import pixels_of_tiles
 from structgstream.scene.focus import Focus
-from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.flow_maps import flow_map
 from structgstream.training.lifting import LiftConfig, MotionStart, lifted_motion
@@ -35,7 +34,7 @@ class MotionStartConfig:
     """Lift flow. Off, the paper: everything begins where it was."""
     rounds: int = 2
     """1: flow between the pictures alone; 2: and from the rendering to the pictures."""
-    views: int = 14
+    views: int = 8
     """Flow is looked for in about so many views at most, in every second or third one of more, by turns."""
     lift: LiftConfig = field(default_factory=LiftConfig)
 
@@ -124,7 +123,7 @@ def corrected(
     Args:
         moving: the moving part of a scene, where it is believed to be.
         views: in which flow is looked for.
-        focuses: by view index, where it shows; views without one are not looked at.
+        focuses: by view index, where it shows, with pictures of it as it is now; views without one are not looked at.
         scale: of the pictures on which is gathered.
         config: how.
         backend: what computes.
@@ -136,10 +135,7 @@ def corrected(
         for view in seen:
             focus, small = focuses[view.index], view.reduced(scale)
             gaussians = baked.gaussians(view.camera, backend)
-            onto = replace(focus, picture=focus.picture.clone())
-            behind = moving.background(view.camera)
-            drawn = draw(gaussians, view.camera, backend, focus=onto, background=behind)
-            image = as_recorded(drawn.image, moving.camera_color, view.index)
+            image = as_recorded(focus.picture, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
             inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)
             # Outside the tiles nothing was drawn: there the picture takes the place of the rendering.

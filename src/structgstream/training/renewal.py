@@ -74,7 +74,15 @@ def renewal(
     if not config.enabled or not places:
         return none
     with torch.no_grad():
-        missing = _missing(moving, views, places, floor=floor, config=config, backend=backend)
+        # Places were found before the second round moved things on: what lacked nothing then lacks nothing now.
+        missing = [_missing_of(moving, view, places, None, floor=floor, config=config) for view in views]
+        if not len(moving.free) and not _several(missing, config):
+            return none
+        again = [len(moving.free) > 0 or _lacks(entry) for entry in missing]
+        missing = [
+            _missing_of(moving, view, places, backend, floor=floor, config=config) if drawn else entry
+            for entry, view, drawn in zip(missing, views, again, strict=True)
+        ]
         share = float(torch.stack([(entry.share > 0.5).float().mean() for entry in missing]).mean())
         if share > config.most_missing_share:
             return replace(none, missing_share=share, refused=True)
@@ -83,8 +91,8 @@ def renewal(
             kept = ~_blamed(moving, missing, places, least_pixels=least_pixels, config=config, backend=backend)
         if not kept.all():
             moving = replace(moving, free=moving.free.select(kept))
-            missing = _missing(moving, views, places, floor=floor, config=config, backend=backend)
-        if sum(bool((entry.share > 0.5).any()) for entry in missing) <= config.least_supports:
+            missing = [_missing_of(moving, view, places, backend, floor=floor, config=config) for view in views]
+        if not _several(missing, config):
             return replace(none, kept=kept, missing_share=share)
         still = partition.still.baked()
         depths = {entry.view.index: _depths([moving, still], entry.view.camera, backend) for entry in missing}
@@ -99,28 +107,38 @@ def renewal(
     return Renewal(kept, new, share)
 
 
-def _missing(
+def _lacks(entry: Missing) -> bool:
+    return bool((entry.share > 0.5).any())
+
+
+def _several(missing: Sequence[Missing], config: BirthConfig) -> bool:
+    """Whether enough views lack something for a birth."""
+    return sum(map(_lacks, missing)) > config.least_supports
+
+
+def _missing_of(
     moving: Scene,
-    views: Sequence[View],
+    view: View,
     places: Mapping[int, Focus],
+    backend: Backend | None,
     *,
     floor: ResidualFloor | None,
     config: BirthConfig,
-    backend: Backend,
-) -> list[Missing]:
-    """What each view's rendering lacks; nothing where nothing moves."""
-    found = []
-    for view in views:
-        picture = view.colors
-        focus = places.get(view.index)
-        if focus is not None:
+) -> Missing:
+    """What a view's rendering lacks, and nothing where nothing moves.
+
+    Drawn by ``backend``; without one, as it was when ``places`` were found.
+    """
+    focus, picture = places.get(view.index), view.colors
+    if focus is not None:
+        image = focus.picture
+        if backend is not None:
             onto = replace(focus, picture=focus.picture.clone())
             gaussians, behind = moving.gaussians(view.camera, backend), moving.background(view.camera)
-            drawn = draw(gaussians, view.camera, backend, focus=onto, background=behind)
-            inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)[..., None]
-            picture = torch.where(inside, as_recorded(drawn.image, moving.camera_color, view.index), picture)
-        found.append(missing_in(picture.clamp(0.0, 1.0), view, floor=floor, config=config))
-    return found
+            image = draw(gaussians, view.camera, backend, focus=onto, background=behind).image
+        inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)[..., None]
+        picture = torch.where(inside, as_recorded(image, moving.camera_color, view.index), picture)
+    return missing_in(picture.clamp(0.0, 1.0), view, floor=floor, config=config)
 
 
 def _blamed(

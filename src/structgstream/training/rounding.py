@@ -39,7 +39,7 @@ class RoundingConfig:
     position_pixels: float = 0.25
     """Step of positions, as seen by a typical camera at a typical distance: less cannot be seen."""
     log_scale_step: float = 0.02
-    appearance_step: float = 0.25
+    appearance_step: float = 1 / 16
     """In standard deviations of the features along a direction of the basis."""
     weight_step: float = 0.002
     """Of the weights of MLPs."""
@@ -51,7 +51,7 @@ class RoundingConfig:
     """Noise that rounding frame 0 may add to the pictures: root of the mean square, in 8-bit levels."""
     first_weight_step: float = 1 / 1024
     """Of the weights of MLPs in frame 0."""
-    rate_weight: float = 1.5e-4
+    rate_weight: float = 1.8e-4
     """Weight in the loss of the bits of a moving anchor."""
     free_priced: bool = False
     """Whether a bit of a free Gaussian that was there before costs as much."""

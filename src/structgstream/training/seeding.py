@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene before its first iteration: points become anchors."""
+"""The scene before its first iteration: points become anchors.
+
+Note [Dead outputs]
+~~~~~~~~~~~~~~~~~~~
+F_alpha has one output for each of an anchor's K Gaussians, and all anchors share it. Only what is positive is drawn and
+gets a gradient, as behind a ReLU. Drawn at random, about half of the outputs begin below zero for every anchor, since
+all features begin alike, and an output that nobody draws is never pulled up: of K = 5, one to four are left, by chance
+of the seed, and with them the number of Gaussians. So what is wanted is asked for: a smaller K whose outputs all begin
+above zero.
+"""
 
 import math
 
@@ -54,10 +63,12 @@ def seeded_scene(
     distance_input: bool,
     device: torch.device,
     generator: torch.Generator,
+    all_drawn: bool = False,
 ) -> Scene:
     """A scene of untrained anchors at ``points`` ``[P, 3]``, normalised units.
 
     Offsets and features start at zero, both scales at the distance to the neighbours, the MLPs at random (Scaffold-GS).
+    With ``all_drawn`` the last layer of F_alpha has no negative weight, so that no Gaussian begins transparent.
 
     Raises:
         CaptureError: fewer than four distinct points.
@@ -73,6 +84,8 @@ def seeded_scene(
     positions = positions.to(device)
     inputs = feature_width + 3 + int(distance_input)
     heads = [random_head(inputs, hidden_width, width * k, generator) for width in (1, 3, 7)]
+    if all_drawn:
+        heads[0] = heads[0]._replace(w2=heads[0].w2.abs(), b2=heads[0].b2.abs())
     opacity, color, covariance = (HeadWeights(*(w.to(device) for w in head)) for head in heads)
     return Scene(
         anchors=AnchorCloud(

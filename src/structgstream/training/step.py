@@ -111,8 +111,10 @@ def gradients_of(
 ) -> tuple[dict[ParameterName, Tensor], Tensor | None]:
     """Gradients of the trained parameters, and of the screen positions ``[N, 2]`` in pixels when they were tracked.
 
-    A parameter that the view did not touch has no entry.
+    A parameter that the view did not touch has no entry; where nothing is drawn there is none at all.
     """
+    if not loss.total.requires_grad:
+        return {}, None
     names = parameters.trained
     inputs = [parameters.values[name] for name in names]
     screen = loss.rendering.screen_offsets
