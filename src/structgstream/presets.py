@@ -163,7 +163,7 @@ COMPACT = replace(
     codec="compact",
     online=replace(
         MOTION.online,
-        iterations=60,
+        iterations=75,
         rates=replace(MOTION.online.rates, anchor_positions=2e-4, final_share=0.4),
         patching=replace(MOTION.online.patching, spawn="off"),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),

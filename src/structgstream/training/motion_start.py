@@ -34,7 +34,7 @@ class MotionStartConfig:
     """Lift flow. Off, the paper: everything begins where it was."""
     rounds: int = 2
     """1: flow between the pictures alone; 2: and from the rendering to the pictures."""
-    views: int = 8
+    views: int = 14
     """Flow is looked for in about so many views at most, in every second or third one of more, by turns."""
     lift: LiftConfig = field(default_factory=LiftConfig)
 
