@@ -123,9 +123,8 @@ def test_inspect_prints_the_resolved_configuration(stream: Path, capsys: pytest.
 
 
 def test_inspect_of_a_cut_file_says_so(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cut = tmp_path / "cut.sgs"
-    data = stream.read_bytes()
-    cut.write_bytes(data[: len(data) - len(data) // 20])
+    cut, last = tmp_path / "cut.sgs", open_stream(stream).packets[-1]
+    cut.write_bytes(stream.read_bytes()[: last.offset + last.bytes // 2])
     assert main(["inspect", str(cut)]) == 0
     assert "not finished" in capsys.readouterr().out
 
