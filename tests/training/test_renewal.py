@@ -8,6 +8,7 @@ import torch
 
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig
 from structgstream.training.motion import MotionConfig, moving_parts
@@ -55,6 +56,20 @@ def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
     torch.testing.assert_close(born.colors.median(0).values, ball.colors[0], atol=0.4, rtol=0)  # soft, before others
     assert born.births.tolist() == [BIRTHS_PER_FRAME + n for n in range(len(born))]
     torch.testing.assert_close(born.logit_opacities.sigmoid(), torch.full((len(born),), 0.7))
+
+
+def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+
+    def counting(*arguments, **options):
+        drawn.append("once")
+        return draw(*arguments, **options)
+
+    monkeypatch.setattr("structgstream.training.renewal.draw", counting)
+    assert not len(renewed(reference_backend(), config=replace(CONFIG, residual_threshold=10.0)).born)
+    assert not drawn
+    assert len(renewed(reference_backend()).born)
+    assert drawn, "where something is missing it is"
 
 
 def test_births_keep_to_the_room_there_is() -> None:

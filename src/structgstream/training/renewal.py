@@ -74,7 +74,7 @@ def renewal(
     if not config.enabled or not places:
         return none
     with torch.no_grad():
-        # Places were found before the second round moved things on: what lacked nothing then lacks nothing now.
+        # Places are from before the second round: a view that lacked nothing there is taken to lack nothing.
         missing = [_missing_of(moving, view, places, None, floor=floor, config=config) for view in views]
         if not len(moving.free) and not _several(missing, config):
             return none
