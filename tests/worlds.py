@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small world whose pictures are renderings of a known scene, so that every motion in it is known."""
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +11,12 @@ from rigs import arc_rig, random_scene
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians, concatenate
-from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
+from structgstream.training.motion import MotionConfig, Moving, changes_between, moving_parts
+from structgstream.training.residuals import ResidualFloor
+from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
@@ -76,3 +80,19 @@ def rendered(scene: Scene, world: World, name: str) -> np.ndarray:
     backend = reference_backend()
     image = draw(scene.gaussians(world.rig[name], backend), world.rig[name], backend).image.detach()
     return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def moved_since(
+    scene: Scene,
+    views: Sequence[View],
+    before: Sequence[View],
+    *,
+    config: MotionConfig,
+    backend: Backend,
+    flow_from: Collection[int] = (),
+    older: Scene | None = None,
+    floor: ResidualFloor | None = None,
+) -> Moving:
+    """What may move in ``scene`` between the pictures ``before`` and those of ``views``."""
+    changes = changes_between(views, before, config=config, backend=backend, flow_from=flow_from)
+    return moving_parts(scene, views, changes, config=config, backend=backend, older=older, floor=floor)

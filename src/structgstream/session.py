@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop: frames in, packets out, and the decoded scene is where the next frame starts (Note [Closed loop])."""
+"""The loop: frames in, packets out, and the decoded scene is where the next frame starts (Note [Closed loop]).
+
+While a frame is fitted, the next one is read and what moves in its pictures is looked for (``lookahead``)."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -14,6 +16,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.lookahead import Lookahead
 from structgstream.memory import PeakKind, PeakMeter
 from structgstream.presets import StreamConfig
 from structgstream.rate_control import RateController, pressed
@@ -23,6 +26,7 @@ from structgstream.scene.state import FieldName, on_device
 from structgstream.similarity import normalising_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.online import fit_next_frame, remembers
+from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.views import training_views
@@ -62,12 +66,10 @@ class FrameReport:
 
 @dataclass
 class _Past:
-    """What a frame is fitted after: the last scene, the one before it, the last pictures, and what frame 0 missed, as
-    far as they count."""
+    """What a frame is fitted after: the last scene, the one before it, what frame 0 missed, as far as they count."""
 
     scene: Scene | None = None
     older: Scene | None = None
-    frame: MultiViewFrame | None = None
     floor: ResidualFloor | None = None
 
 
@@ -156,16 +158,30 @@ class Session:
         # What moves shows against the frame before, so a resumed stream reads that one once more.
         again = start > 0 and online.motion.enabled
         frames = self._source.frames(start - again)
-        past.frame = next(frames) if again else None
+        last = next(frames) if again else None
+        with Lookahead(self._shown(frames, last)) as shown:
+            yield from self._fitted(shown, past, encoder, steps, controller)
+
+    def _fitted(
+        self,
+        shown: Iterator[tuple[MultiViewFrame, FramePictures | None]],
+        past: _Past,
+        encoder: SceneEncoder | None,
+        steps: Mapping[str, float],
+        controller: RateController,
+    ) -> Iterator[FrameReport]:
+        """Fit, encode and write every frame that is ``shown``, beginning after ``past``."""
+        online = self._config.online
         while True:
             peaks = PeakMeter(self._backend.device)
             started, cpu_started = time.perf_counter(), time.process_time()
-            frame = next(frames, None)
-            if frame is None:
+            found = next(shown, None)
+            if found is None:
                 return
+            frame, pictures = found
             peaks.end("read")
             read = time.perf_counter()
-            fit = self._fit(past, frame, steps, controller.pressure)
+            fit = self._fit(past, frame, pictures, steps, controller.pressure)
             peaks.end("fit")
             fitted = time.perf_counter()
             fitted_scene = fit.scene
@@ -192,7 +208,6 @@ class Session:
                 scene,
                 floor=past.floor,
                 older=past.scene if remembers(online) else None,
-                frame=frame if online.motion.enabled else None,
             )
             coded = time.perf_counter()
             size = self._sink.write(encoded.packet)
@@ -228,6 +243,20 @@ class Session:
                 cpu_seconds=time.process_time() - cpu_started,
             )
 
+    def _shown(
+        self, frames: Iterator[MultiViewFrame], last: MultiViewFrame | None
+    ) -> Iterator[tuple[MultiViewFrame, FramePictures | None]]:
+        """Each frame, and what its pictures tell by themselves; nothing of the frame that a stream begins with."""
+        online = self._config.online
+        for frame in frames:
+            pictures = None
+            if frame.index > 0:
+                pictures = pictures_of(
+                    frame, self._rig, before=last, motion=online.motion, start=online.start, backend=self._backend
+                )
+            last = frame
+            yield frame, pictures
+
     def _floor(self, scene: Scene, frame: MultiViewFrame) -> ResidualFloor:
         device, scale = self._backend.device, self._config.online.motion.picture_scale
         views = training_views(frame, self._rig, device)
@@ -237,7 +266,14 @@ class Session:
     def _key_interval(self) -> int:
         return max(1, round(self._source.fps * self._config.key_interval_seconds))
 
-    def _fit(self, past: _Past, frame: MultiViewFrame, steps: Mapping[str, float], pressure: float) -> FitResult:
+    def _fit(
+        self,
+        past: _Past,
+        frame: MultiViewFrame,
+        pictures: FramePictures | None,
+        steps: Mapping[str, float],
+        pressure: float,
+    ) -> FitResult:
         seed = frame_seed(self._config.seed, frame.index)
         if past.scene is None:
             if self._first is not None:
@@ -266,7 +302,7 @@ class Session:
             config=pressed(self._config.online, pressure),
             backend=self._backend,
             seed=seed,
-            before=past.frame,
+            pictures=pictures,
             steps=steps,
             floor=past.floor,
             older=None if past.older is None else on_device(past.older, device),

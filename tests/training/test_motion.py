@@ -9,10 +9,10 @@ from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, changed_since, moving_parts
+from structgstream.training.motion import MotionConfig, changed_since
 from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
-from worlds import moving_world
+from worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
 CONFIG = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0)
@@ -21,7 +21,7 @@ WORLD = moving_world(2, speed=0.06, movers=20)
 
 def moving(before: int = 0, now: int = 1, *, config: MotionConfig = CONFIG):
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (now, before))
-    return moving_parts(WORLD.scene, views, earlier, config=config, backend=reference_backend())
+    return moved_since(WORLD.scene, views, earlier, config=config, backend=reference_backend())
 
 
 def test_the_anchors_that_moved_are_found_and_few_others() -> None:
@@ -61,16 +61,16 @@ def test_what_most_views_see_unchanged_stays() -> None:
     changed = [replace(view, image=255 - view.image) if number < 2 else view for number, view in enumerate(views)]
     config = replace(CONFIG, least_share=0.1)
     backend = reference_backend()
-    found = moving_parts(WORLD.scene, changed, same, config=config, backend=backend).anchors
+    found = moved_since(WORLD.scene, changed, same, config=config, backend=backend).anchors
     strict = replace(config, least_views_share=2.5 / len(views))
-    kept = moving_parts(WORLD.scene, changed, same, config=strict, backend=backend).anchors
+    kept = moved_since(WORLD.scene, changed, same, config=strict, backend=backend).anchors
     assert found.sum() > 20
     assert not (kept & ~found).any()
     # What stays in is what few views see at all.
     assert kept.sum() < 0.5 * found.sum()
     everywhere = [replace(view, image=255 - view.image) for view in views]
-    moved = moving_parts(WORLD.scene, everywhere, same, config=strict, backend=backend).anchors
-    assert torch.equal(moved, moving_parts(WORLD.scene, everywhere, same, config=config, backend=backend).anchors)
+    moved = moved_since(WORLD.scene, everywhere, same, config=strict, backend=backend).anchors
+    assert torch.equal(moved, moved_since(WORLD.scene, everywhere, same, config=config, backend=backend).anchors)
 
 
 def test_what_moved_before_moves_more_easily() -> None:
@@ -78,9 +78,7 @@ def test_what_moved_before_moves_more_easily() -> None:
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
 
     def found(older: Scene | None) -> torch.Tensor:
-        return moving_parts(
-            WORLD.scene, views, earlier, config=strict, backend=reference_backend(), older=older
-        ).anchors
+        return moved_since(WORLD.scene, views, earlier, config=strict, backend=reference_backend(), older=older).anchors
 
     shift = torch.zeros_like(WORLD.scene.anchors.positions)
     shift[:20] = 0.01
@@ -120,9 +118,9 @@ def test_free_gaussians_that_no_view_shows_are_gone() -> None:
     scene = replace(WORLD.scene, free=free)
     views = training_views(WORLD.frames[0], WORLD.rig, CPU)
     config = replace(CONFIG, unseen_pixels=0.1)
-    found = moving_parts(scene, views, views, config=config, backend=reference_backend())
+    found = moved_since(scene, views, views, config=config, backend=reference_backend())
     assert found.unseen.tolist() == [False, True, True]
     part = Partition.of(scene, found)
     assert part.together(part.moving).free.births.tolist() == [1]
-    kept = moving_parts(scene, views, views, config=CONFIG, backend=reference_backend())
+    kept = moved_since(scene, views, views, config=CONFIG, backend=reference_backend())
     assert not kept.unseen.any()

@@ -4,11 +4,11 @@
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.motion import MotionConfig
 from structgstream.training.motion_start import MotionStartConfig, displaced, flow_views, started
 from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
-from worlds import World, moving_world
+from worlds import World, moved_since, moving_world
 
 CPU = torch.device("cpu")
 BACKEND = reference_backend()
@@ -23,7 +23,7 @@ def world() -> World:
 def begun(scenery: World, *, rounds: int = 2, enabled: bool = True):
     config = MotionStartConfig(enabled=enabled, rounds=rounds)
     views, before = (training_views(scenery.frames[t], scenery.rig, CPU) for t in (1, 0))
-    which = moving_parts(
+    which = moved_since(
         scenery.scene, views, before, config=MOTION, backend=BACKEND, flow_from=flow_views(views, 1, config)
     )
     partition = Partition.of(scenery.scene, which)

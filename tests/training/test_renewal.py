@@ -11,13 +11,13 @@ from structgstream.kernels.backend import Backend, cpu_backend, reference_backen
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig
-from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.motion import MotionConfig
 from structgstream.training.partition import Partition, focuses
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.renewal import Renewal, renewal
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
-from worlds import emerging_ball, moving_world
+from worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
@@ -31,7 +31,7 @@ BACKENDS = [
 def renewed(backend: Backend, *, scene: Scene = WORLD.scene, config: BirthConfig = CONFIG, room: int = 1000) -> Renewal:
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
-    partition = Partition.of(scene, moving_parts(scene, views, first, config=motion, backend=backend))
+    partition = Partition.of(scene, moved_since(scene, views, first, config=motion, backend=backend))
     return renewal(
         partition,
         views,
@@ -116,7 +116,7 @@ def test_a_ghost_dies() -> None:
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05)
     floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    which = moving_parts(scene, views, first, config=motion, backend=backend, floor=floor)
+    which = moved_since(scene, views, first, config=motion, backend=backend, floor=floor)
     assert which.free.all(), "what is wrong passes the gate"
     partition = Partition.of(scene, which)
     found = renewal(

@@ -6,10 +6,10 @@ from dataclasses import replace
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.motion import MotionConfig
 from structgstream.training.residuals import as_recorded, box_mean, residual, residual_floor
 from structgstream.training.views import training_views
-from worlds import moving_world
+from worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(3, speed=0.06, movers=20)
@@ -60,7 +60,7 @@ def test_slow_change_is_seen_by_the_residual_alone() -> None:
 
     def found(threshold: float):
         wanted = replace(config, residual_threshold=threshold)
-        return moving_parts(WORLD.scene, views(1), views(1), config=wanted, backend=BACKEND, floor=floor)
+        return moved_since(WORLD.scene, views(1), views(1), config=wanted, backend=BACKEND, floor=floor)
 
     assert not found(0.0).anchors.any()
     lagging = found(0.05).anchors
@@ -74,6 +74,6 @@ def test_what_frame_0_already_missed_does_not_count() -> None:
     seen = training_views(other.frames[0], other.rig, CPU)
     floor = residual_floor(wrong, seen, scale=1.0, backend=BACKEND)
     config = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0, residual_threshold=0.05)
-    assert not moving_parts(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()
+    assert not moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()
     free_of_it = replace(floor, maps={index: torch.zeros_like(values) for index, values in floor.maps.items()})
-    assert moving_parts(wrong, seen, seen, config=config, backend=BACKEND, floor=free_of_it).anchors.any()
+    assert moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=free_of_it).anchors.any()

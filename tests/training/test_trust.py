@@ -6,10 +6,10 @@ from dataclasses import replace
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.motion import MotionConfig, moving_parts
+from structgstream.training.motion import MotionConfig
 from structgstream.training.trust import ViewChange, believed, jumped
 from structgstream.training.views import training_views
-from worlds import moving_world
+from worlds import moved_since, moving_world
 
 USUAL = ViewChange(changed=0.05, wrong=0.02, same=False)
 WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)
@@ -47,8 +47,8 @@ def test_a_black_picture_moves_nothing() -> None:
     before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
     spoiled = [replace(v, image=torch.zeros_like(v.image)) if n in (1, 3) else v for n, v in enumerate(views)]
     good = [n for n in range(len(views)) if n not in (1, 3)]
-    found = moving_parts(WORLD.scene, spoiled, before, config=CONFIG, backend=backend)
-    without = moving_parts(
+    found = moved_since(WORLD.scene, spoiled, before, config=CONFIG, backend=backend)
+    without = moved_since(
         WORLD.scene, [views[n] for n in good], [before[n] for n in good], config=CONFIG, backend=backend
     )
     assert found.trusted == tuple(good)
@@ -60,7 +60,7 @@ def test_a_light_switched_on_is_a_jump() -> None:
     cpu, backend = torch.device("cpu"), reference_backend()
     before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
     bright = [replace(v, image=(v.image.int() + 60).clamp(max=255).to(torch.uint8)) for v in views]
-    found = moving_parts(WORLD.scene, bright, before, config=CONFIG, backend=backend, flow_from=range(len(views)))
+    found = moved_since(WORLD.scene, bright, before, config=CONFIG, backend=backend, flow_from=range(len(views)))
     assert found.jumped
     assert found.evidence is None
     assert len(found.trusted) == len(views)

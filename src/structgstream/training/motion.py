@@ -17,8 +17,8 @@ from torch.nn.functional import max_pool2d
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName
-from structgstream.training.flow_maps import flow_map
 from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
+from structgstream.training.picture_change import PictureChange, picture_changes
 from structgstream.training.residuals import ResidualFloor, residual_of
 from structgstream.training.trust import ViewChange, believed, jumped
 from structgstream.training.views import View, area_mean
@@ -117,28 +117,46 @@ def changed_since(older: Scene, scene: Scene) -> Tensor:
     return torch.cat([anchors, free])
 
 
-def moving_parts(
-    scene: Scene,
+def changes_between(
     views: Sequence[View],
     before: Sequence[View],
     *,
     config: MotionConfig,
     backend: Backend,
+    flow_from: Collection[int] = (),
+) -> list[PictureChange]:
+    """:func:`~structgstream.training.picture_change.picture_changes` as ``config`` asks for them."""
+    return picture_changes(
+        views,
+        before,
+        threshold=config.change_threshold,
+        reach_pixels=config.reach_pixels,
+        scale=config.picture_scale,
+        backend=backend,
+        flow_from=flow_from,
+    )
+
+
+def moving_parts(
+    scene: Scene,
+    views: Sequence[View],
+    changes: Sequence[PictureChange],
+    *,
+    config: MotionConfig,
+    backend: Backend,
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
-    flow_from: Collection[int] = (),
 ) -> Moving:
-    """What may move between the pictures ``before`` and those of ``views`` (same cameras, same order).
+    """What may move between the pictures of the frame before and those of ``views``.
 
     Args:
-        scene: as it was in the pictures ``before``.
+        scene: as it was in the frame before.
         views: of the frame.
-        before: of the frame before.
+        changes: of each view since the frame before (:func:`changes_between`).
         config: what counts as moving.
         backend: what computes.
         older: the scene a frame earlier, for ``moved_ease``; None for none.
         floor: what frame 0 missed, for ``residual_threshold``; None for none.
-        flow_from: indices of the views in which flow is looked for too.
     """
     anchors, free = len(scene.anchors), len(scene.free)
     ease = torch.ones(anchors + free, device=scene.anchors.positions.device)
@@ -147,13 +165,10 @@ def moving_parts(
     looks: list[_Look] = []
     with torch.no_grad():
         baked = scene.baked()
-        for view, last in zip(views, before, strict=True):
-            flows = view.index in flow_from
-            looks.append(
-                _look(baked, view, last, config=config, backend=backend, ease=ease, floor=floor, with_flow=flows)
-            )
-    changes = [look.change for look in looks]
-    trusted = [number for number, good in enumerate(believed(changes)) if good]
+        for view, change in zip(views, changes, strict=True):
+            looks.append(_look(baked, view, change, config=config, backend=backend, ease=ease, floor=floor))
+    view_changes = [look.change for look in looks]
+    trusted = [number for number, good in enumerate(believed(view_changes)) if good]
     seen, votes = (torch.stack([getattr(looks[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))
     cover = torch.stack([looks[n].cover for n in trusted])
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
@@ -164,9 +179,9 @@ def moving_parts(
         unseen,
         shown={views[n].index: looks[n].cover > config.least_pixels for n in trusted},
         trusted=tuple(trusted),
-        jumped=jumped(changes),
+        jumped=jumped(view_changes),
     )
-    told = [n for n in trusted if views[n].index in flow_from]
+    told = [n for n in trusted if changes[n].flow is not None]
     if not told or found.jumped:
         return found
     evidence = flow_evidence(
@@ -190,21 +205,17 @@ class _Look:
 def _look(
     scene: Scene,
     view: View,
-    last: View,
+    change: PictureChange,
     *,
     config: MotionConfig,
     backend: Backend,
     ease: Tensor,
     floor: ResidualFloor | None,
-    with_flow: bool,
 ) -> _Look:
     small = view.reduced(config.picture_scale)
     gaussians = scene.gaussians(small.camera, backend)
-    changed = backend.changed_pixels(
-        last.image, view.image, threshold=config.change_threshold, reach_pixels=config.reach_pixels
-    )
     size = (small.camera.height, small.camera.width)
-    part = area_mean(changed[None, None].to(gaussians.means), size)
+    part = area_mean(change.changed[None, None].to(gaussians.means), size)
     difference = float(part.mean())
     wrong_share = 0.0
     if floor is not None and config.residual_threshold > 0.0:
@@ -213,8 +224,8 @@ def _look(
         wrong_share = float(wrong.mean())
         part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
     maps = [torch.ones_like(part[0, 0, :, :, None]), part[0, 0, :, :, None]]
-    if with_flow:
-        maps += [flow_map(last.image, view.image, changed, size), last.reduced(config.picture_scale).colors]
+    if change.flow is not None:
+        maps.append(change.flow)
     sums = gathered(gaussians, scene, small.camera, torch.cat(maps, dim=-1), backend)
     sums *= view.camera.height * view.camera.width / part.numel()
     total, inside = by_mover(sums[:, :2], scene).unbind(1)
@@ -222,6 +233,6 @@ def _look(
         seen=total > config.least_pixels,
         votes=(inside > config.least_pixels * ease) & (inside > config.least_share * ease * total),
         cover=sums[:, 0],
-        flows=by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if with_flow else total,
-        change=ViewChange(difference, wrong_share, same=torch.equal(last.image, view.image)),
+        flows=by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if change.flow is not None else total,
+        change=ViewChange(difference, wrong_share, same=change.same),
     )

@@ -26,7 +26,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, FieldName
 from structgstream.training.births import BirthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
-from structgstream.training.motion_start import MotionStartConfig, displaced, flow_views, started
+from structgstream.training.motion_start import MotionStartConfig, displaced, started
 from structgstream.training.observation import slots_of
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
@@ -39,6 +39,7 @@ from structgstream.training.parameters import (
 )
 from structgstream.training.partition import Partition
 from structgstream.training.patching import PatchingConfig
+from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.population import patched
 from structgstream.training.price import Rate
 from structgstream.training.renewal import renewal
@@ -49,7 +50,7 @@ from structgstream.training.settling import Settling
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import LastPass, gradients_of, view_loss
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import View, shuffled_views, training_views
+from structgstream.training.views import View, shuffled_views
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,7 @@ def fit_next_frame(
     backend: Backend,
     seed: int,
     before: MultiViewFrame | None = None,
+    pictures: FramePictures | None = None,
     steps: Mapping[str, float] | None = None,
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
@@ -151,13 +153,16 @@ def fit_next_frame(
         older: the decoded scene two frames before, for what has a memory (:func:`remembers`); None for none.
         floor: what frame 0 missed, for ``config.motion.residual_threshold`` and for births; None for nothing.
         before: the frame before, which tells what moves (``config.motion``); without it everything may.
+        pictures: of ``frame`` after ``before`` (:func:`~structgstream.training.pictures.pictures_of`), where they were
+            looked at already.
         on_step: called after every iteration.
     """
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
-    views = training_views(frame, rig, backend.device)
-    full = before is None or not config.motion.enabled or _is_full(config.motion, frame.index)
-    earlier = None if before is None or full else training_views(before, rig, backend.device)
+    motion = config.motion
+    if pictures is None:
+        pictures = pictures_of(frame, rig, before=before, motion=motion, start=config.start, backend=backend)
+    views, changes = pictures.views, pictures.changes
 
     def fitted(stepping: Backend) -> FitResult:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
@@ -165,20 +170,10 @@ def fit_next_frame(
         ahead = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
         if older is not None and config.motion_prior:
             ahead[: len(scene.anchors)] = config.motion_prior * (scene.anchors.positions - older.anchors.positions)
-        if earlier is None:
+        if changes is None:
             return fit.run(scene, views, ahead=ahead)
         with watch.stage("find motion"):
-            motion = config.motion
-            which = moving_parts(
-                scene,
-                views,
-                earlier,
-                config=motion,
-                backend=backend,
-                older=older,
-                floor=floor,
-                flow_from=flow_views(views, frame.index, config.start),
-            )
+            which = moving_parts(scene, views, changes, config=motion, backend=backend, older=older, floor=floor)
             partition, ahead = Partition.of(scene, which), ahead[which.movers]
             trusted = [views[number] for number in which.trusted]
         with watch.stage("start motion"):
@@ -229,10 +224,6 @@ def fit_next_frame(
 def remembers(config: OnlineConfig) -> bool:
     """Whether a frame is fitted after the two before it, instead of one."""
     return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
-
-
-def _is_full(motion: MotionConfig, frame_index: int) -> bool:
-    return motion.full_every_frames > 0 and frame_index % motion.full_every_frames == 0
 
 
 @dataclass

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The next item is made in a thread of its own while the present one is worked on."""
+
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Lookahead(Generic[T]):
+    """An iterator over ``items`` that is always one item ahead.
+
+    What goes wrong with an item is raised when it is asked for, not before. Leaving the ``with`` block waits for the
+    item that is being made, and closes ``items`` if they can be closed.
+    """
+
+    def __init__(self, items: Iterator[T]) -> None:
+        self._items = items
+        self._maker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lookahead")
+        self._next: Future[tuple[T] | None] | None = None
+
+    def __enter__(self) -> "Lookahead[T]":
+        self._next = self._maker.submit(self._made)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._maker.shutdown(wait=True, cancel_futures=True)
+        if close := getattr(self._items, "close", None):
+            close()
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        """The item that is ready, or will be next; the one after it is begun.
+
+        Raises:
+            StopIteration: there is none.
+        """
+        if self._next is None:
+            raise StopIteration
+        ready, self._next = self._next, None
+        found = ready.result()
+        if found is None:
+            raise StopIteration
+        self._next = self._maker.submit(self._made)
+        return found[0]
+
+    def _made(self) -> tuple[T] | None:
+        # A future cannot carry StopIteration.
+        for item in self._items:
+            return (item,)
+        return None

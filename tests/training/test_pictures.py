@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.motion import MotionConfig
+from structgstream.training.motion_start import MotionStartConfig
+from structgstream.training.pictures import FramePictures, pictures_of
+from worlds import moving_world
+
+WORLD = moving_world(2, cameras=6, movers=60, speed=0.08, width=128, height=96)
+MOTION = MotionConfig(enabled=True, picture_scale=0.5)
+START = MotionStartConfig(enabled=True, views=3)
+
+
+def pictures(*, motion: MotionConfig = MOTION, start: MotionStartConfig = START, first: bool = False) -> FramePictures:
+    before = None if first else WORLD.frames[0]
+    backend = reference_backend()
+    return pictures_of(WORLD.frames[1], WORLD.rig, before=before, motion=motion, start=start, backend=backend)
+
+
+def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
+    found = pictures()
+    assert found.changes is not None
+    assert len(found.changes) == len(found.views) == len(WORLD.rig.training)
+    told = [view.index for view, change in zip(found.views, found.changes) if change.flow is not None]
+    assert 2 <= len(told) <= 3
+    for view, change in zip(found.views, found.changes):
+        assert change.changed.shape == view.image.shape[:2]
+        assert 0.0 < float(change.changed.float().mean()) < 0.9
+        assert not change.same
+        if change.flow is not None:
+            assert change.flow.shape == (48, 64, 6)
+            confidence, shift = change.flow[..., 0], change.flow[..., 1:3]
+            assert confidence.max() > 0.5
+            assert shift.abs().max() > 0.5
+
+
+def test_equal_pictures_are_the_same() -> None:
+    backend = reference_backend()
+    frozen = replace(WORLD.frames[0], index=1)
+    found = pictures_of(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
+    assert found.changes is not None
+    assert all(change.same and not change.changed.any() for change in found.changes)
+    assert all(change.flow is None or not change.flow[..., :3].any() for change in found.changes)
+
+
+def test_everything_may_move_without_a_frame_before_without_a_gate_and_in_full_frames() -> None:
+    assert pictures(first=True).changes is None
+    assert pictures(motion=replace(MOTION, enabled=False)).changes is None
+    assert pictures(motion=replace(MOTION, full_every_frames=1)).changes is None
+    assert pictures(motion=replace(MOTION, full_every_frames=2)).changes is not None
+
+
+def test_without_a_motion_start_nobody_looks_for_flow() -> None:
+    found = pictures(start=replace(START, enabled=False))
+    assert found.changes is not None
+    assert all(change.flow is None for change in found.changes)
+    assert all(torch.equal(a.changed, b.changed) for a, b in zip(found.changes, pictures().changes or [], strict=True))
