@@ -129,6 +129,8 @@ Pinhole pinhole(const float* viewmat, const float* K, int width, int height, flo
 
 extern "C" {
 
+int sgs_abi_version(void) { return SGS_ABI_VERSION; }
+
 int sgs_best_isa(void) { return best_isa(); }
 
 int sgs_isa(void) {

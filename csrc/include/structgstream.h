@@ -11,6 +11,11 @@
 extern "C" {
 #endif
 
+/* Which version of this interface the library has. It rises with every change of what stands in this file or in
+ * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
+#define SGS_ABI_VERSION 1
+int sgs_abi_version(void);
+
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
 int sgs_isa(void);           /* the one in use */
 int sgs_best_isa(void);      /* the widest that was compiled and that this processor has */

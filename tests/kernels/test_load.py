@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,6 +28,36 @@ def test_a_broken_library_says_what_the_loader_said(monkeypatch: pytest.MonkeyPa
     broken.write_bytes(b"no library")
     monkeypatch.setattr(_load, "library_path", lambda: broken)
     assert "do not load" in str(_load.native_reason())
+
+
+class _Stale:
+    """A library as it was before its interface had a version, or with another one."""
+
+    def __init__(self, version: int | None) -> None:
+        if version is not None:
+            self.sgs_abi_version = lambda: version
+
+
+@pytest.mark.parametrize("version", [None, _load.ABI_VERSION + 1])
+def test_a_library_of_another_version_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, version: int | None
+) -> None:
+    stale = tmp_path / "stale.so"
+    stale.write_bytes(b"")
+    monkeypatch.setattr(_load, "library_path", lambda: stale)
+    monkeypatch.setattr(_load.ctypes, "CDLL", lambda path: _Stale(version))
+    reason = str(_load.native_reason())
+    assert f"version {version or 0} of their interface" in reason
+    assert "install structgstream again" in reason
+
+
+def test_the_version_rises_with_the_interface() -> None:
+    """When this fails the interface has changed: raise SGS_ABI_VERSION and ABI_VERSION, and note the new hash here."""
+    sources = Path(__file__).parents[2] / "csrc"
+    text = b"".join((sources / name).read_bytes() for name in ("include/structgstream.h", "cpu/anchors.h"))
+    noted = {1: "644f6ba04425e5e46168a4cfe4fead227c11076fef77a14a6a0edaa0add54c17"}
+    assert f"#define SGS_ABI_VERSION {_load.ABI_VERSION}\n".encode() in text
+    assert hashlib.sha256(text).hexdigest() == noted[_load.ABI_VERSION]
 
 
 def test_the_instruction_set_has_a_name() -> None:

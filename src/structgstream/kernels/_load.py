@@ -11,6 +11,8 @@ from structgstream.errors import BackendError
 
 _NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
 _POINTER_RESULTS = ("sgs_raster_forward",)
+ABI_VERSION = 1
+"""Of csrc/include/structgstream.h, which says when it rises."""
 
 
 def library_path() -> Path:
@@ -30,6 +32,12 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
         library = ctypes.CDLL(str(path))
     except OSError as error:
         return None, f"The CPU kernels at {path} do not load ({error}); install structgstream again on this machine."
+    version = library.sgs_abi_version() if hasattr(library, "sgs_abi_version") else 0
+    if version != ABI_VERSION:
+        return None, (
+            f"The CPU kernels at {path} have version {version} of their interface, and this structgstream calls version "
+            f"{ABI_VERSION}; install structgstream again, so that both are of one version."
+        )
     for name in _POINTER_RESULTS:
         getattr(library, name).restype = ctypes.c_void_p
     library.sgs_anchors_visible.restype = ctypes.c_int64
