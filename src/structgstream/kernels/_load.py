@@ -35,8 +35,8 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
     version = library.sgs_abi_version() if hasattr(library, "sgs_abi_version") else 0
     if version != ABI_VERSION:
         return None, (
-            f"The CPU kernels at {path} have version {version} of their interface, and this structgstream calls version "
-            f"{ABI_VERSION}; install structgstream again, so that both are of one version."
+            f"The CPU kernels at {path} have version {version} of their interface, and this structgstream calls "
+            f"version {ABI_VERSION}; install structgstream again, so that both are of one version."
         )
     for name in _POINTER_RESULTS:
         getattr(library, name).restype = ctypes.c_void_p
