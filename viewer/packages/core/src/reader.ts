@@ -152,6 +152,18 @@ export class StreamReader {
     for (; this.kept < end; this.kept++) this.payloads[this.kept] = undefined;
   }
 
+  /**
+   * The packet of one frame, which the reader then lets go of: for who keeps packets himself, in as many bytes as he
+   * wants.
+   *
+   * @throws StreamError there is no such packet, or it was let go of before
+   */
+  take(index: number): Packet {
+    const packet = this.packet(index);
+    this.payloads[index] = undefined;
+    return packet;
+  }
+
   private missing(index: number): StreamError {
     for (const { offset, first, end } of this.damage) {
       if (index < first || index >= end) continue;
