@@ -1,6 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
 
+export {
+  axes,
+  between,
+  center,
+  fitted,
+  frustum,
+  lookAt,
+  projected,
+  resized,
+  rigCamera,
+  rigCameras,
+  sameCamera,
+  unprojected,
+  viewmatOf,
+} from "./cameraMath.js";
 export { GlError } from "./errors.js";
+export { SplatRenderer } from "./renderer.js";
+export { focusPoint, upAxis } from "./rig.js";
 export type {
   Camera,
   Intrinsics,
@@ -12,3 +29,16 @@ export type {
   ResourceCounts,
   SceneUpdate,
 } from "./types.js";
+export {
+  across,
+  along,
+  cross,
+  directionBetween,
+  dot,
+  length,
+  type Rotation,
+  rotationBetween,
+  scaled,
+  unit,
+  type Vector,
+} from "./vectors.js";

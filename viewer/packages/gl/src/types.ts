@@ -107,5 +107,7 @@ export interface Renderer {
   /** The last picture rendered, as PNG. */
   screenshot(): Promise<Blob>;
   readonly resources: ResourceCounts;
+  /** Sentences about what this device draws worse than others; empty on most. */
+  readonly limitations: readonly string[];
   destroy(): void;
 }

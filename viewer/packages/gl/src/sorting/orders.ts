@@ -29,7 +29,10 @@ export class Orders {
   private arrived: Sorted | undefined;
   private asked: Wanted | undefined;
   private next: Wanted | undefined;
+  private last: Wanted | undefined;
   private id = 0;
+  /** Whose answer nobody waits for. */
+  private stale = 0;
   /** What the worker has. */
   private readonly sent = new Map<PlacingField, Float32Array>();
   private readonly spare: ArrayBuffer[][] = [];
@@ -53,8 +56,8 @@ export class Orders {
 
   /** Asks for an order, unless it is the one that was asked for last. */
   want(wanted: Wanted): void {
-    const last = this.next ?? this.asked ?? this.arrived;
-    if (last && sameWanted(last, wanted)) return;
+    if (this.last && sameWanted(this.last, wanted)) return;
+    this.last = wanted;
     this.next = wanted;
     this.send();
   }
@@ -64,6 +67,14 @@ export class Orders {
     const { arrived } = this;
     this.arrived = undefined;
     return arrived;
+  }
+
+  /** What was asked for is of a stream that is played no more. */
+  forget(): void {
+    this.arrived = undefined;
+    this.next = undefined;
+    this.last = undefined;
+    this.stale = this.asked ? this.id : 0;
   }
 
   /** An order that is drawn no more: its memory is used again. */
@@ -111,8 +122,9 @@ export class Orders {
       return;
     }
     if (this.arrived) this.release(this.arrived);
-    this.arrived = { ...asked, order: answer };
+    this.arrived = undefined;
+    if (answer.id !== this.stale) this.arrived = { ...asked, order: answer };
     this.send();
-    this.onOrder();
+    if (this.arrived) this.onOrder();
   }
 }
