@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 
+export { ByteQueue } from "./byteQueue.js";
 export type { Damage } from "./damage.js";
 export { checkFollows, type Frame, fieldBytes, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 export { StreamError } from "./errors.js";
