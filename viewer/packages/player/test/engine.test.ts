@@ -254,17 +254,18 @@ describe("a growing file", () => {
     play.engine.play();
     const ticking = () => {
       play.seconds += 1 / 60;
+      return true;
     };
-    await play.until(() => (ticking(), play.shown.at(-1) === 1));
-    await play.until(() => (ticking(), play.engine.stalled));
+    await play.until(() => ticking() && play.shown.at(-1) === 1);
+    await play.until(() => ticking() && play.engine.stalled);
     expect(play.engine.nextFrameSeconds).toBeUndefined();
     for (const frames of [3, 4, 5]) {
       file.bytes = cut(frames);
-      await play.until(() => (ticking(), play.shown.at(-1) === frames - 1), `frame ${frames - 1}`);
+      await play.until(() => ticking() && play.shown.at(-1) === frames - 1, `frame ${frames - 1}`);
     }
     expect(play.engine.nextFrameSeconds).toBeGreaterThanOrEqual(0);
     file.bytes = CLIP;
-    await play.until(() => (ticking(), play.engine.ended), "end");
+    await play.until(() => ticking() && play.engine.ended, "end");
     expect(play.engine.frames.complete).toBe(true);
     expect(play.errors).toEqual([]);
   });

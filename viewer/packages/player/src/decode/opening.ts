@@ -88,11 +88,17 @@ export class Opening {
   private lookAtTail(tail: Uint8Array, start: number, fileBytes: number): void {
     const footer = tail.subarray(-FOOTER_BYTES);
     const offset = start + tail.length === fileBytes ? indexOffset(footer, fileBytes) : undefined;
-    if (offset === undefined || fileBytes - offset > MOST_INDEX_BYTES) return this.scan();
-    if (offset < start) return this.readTail(offset, fileBytes);
-    const entries = indexEntries(tail.subarray(offset - start, -FOOTER_BYTES), offset);
+    if (offset === undefined || fileBytes - offset > MOST_INDEX_BYTES) this.scan();
+    else if (offset < start) this.readTail(offset, fileBytes);
+    else this.useIndex(indexEntries(tail.subarray(offset - start, -FOOTER_BYTES), offset), offset);
+  }
+
+  private useIndex(entries: IndexEntry[] | undefined, offset: number): void {
     const first = entries?.[0];
-    if (!entries || !first) return this.scan();
+    if (!entries || !first) {
+      this.scan();
+      return;
+    }
     this.index = { entries, end: offset };
     this.lookedForIndex = true;
     const end = this.fromStart ? (entries[1]?.offset ?? offset) : first.offset;

@@ -246,12 +246,16 @@ export class Engine extends Emitter<EngineEvents> {
 
   private stopAtEnd(now: number): void {
     const { clock, timeline } = this;
-    if (timeline.complete && this.loop) return this.seekFrame(0);
+    if (timeline.complete && this.loop) {
+      this.seekFrame(0);
+      return;
+    }
     clock.stop(now);
     if (!timeline.complete) {
       // The last frame is held until the next one has been written.
       clock.set(Math.max(timeline.duration - 1e-3, 0), now);
-      return this.setStalled(true);
+      this.setStalled(true);
+      return;
     }
     clock.set(timeline.duration, now);
     this.hasEnded = true;
@@ -344,7 +348,10 @@ export class Engine extends Emitter<EngineEvents> {
     for (const packet of packets) this.facts.set(packet.index, packet);
     while (this.facts.size > REMEMBERED_PACKETS) this.facts.delete(this.facts.keys().next().value as number);
     this.lastDecodeMilliseconds = message.decodeMilliseconds;
-    if (serial !== this.serial) return this.queue.carry(update);
+    if (serial !== this.serial) {
+      this.queue.carry(update);
+      return;
+    }
     this.queue.add(update, this.isSeeking);
     this.reached = Math.max(this.reached, update.index);
     if (exact && this.isSeeking) this.arrive();

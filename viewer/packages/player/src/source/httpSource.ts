@@ -34,7 +34,10 @@ export class HttpSource implements ByteSource {
   async read(start: number, options: ReadOptions, sink: ByteSink, signal: AbortSignal): Promise<void> {
     const response = await this.answer(start, options.end, signal);
     this.noticeAge(response);
-    if (response.status === 416) return this.takeNothing(start, response, sink);
+    if (response.status === 416) {
+      this.takeNothing(start, response, sink);
+      return;
+    }
     if (response.status !== 206 && response.status !== 200) throw this.refused(response.status);
     const found = response.status === 206 ? rangeOf(response.headers.get("Content-Range")) : undefined;
     if (found) {
