@@ -21,7 +21,7 @@ export function splatRanges(splats: number, most: number): SplatRange[] {
 }
 
 /** `dressed(k)` writes (opacity, rgb), (scale shares, qw), (qxyz, 0) of Gaussian k to `a`, `b`, `c`, head by head. */
-function evaluation(shape: Shape, layout: MlpLayout, range: SplatRange): string {
+export function evaluation(shape: Shape, layout: MlpLayout, range: SplatRange): string {
   return `${TABLE_GLSL}
 uniform sampler2D positions, features, appearance, weights;
 uniform usampler2D anchors;
