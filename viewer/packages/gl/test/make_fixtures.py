@@ -89,7 +89,8 @@ def patch(path: Path) -> bytes:
     for scene in scenes:
         free = scene.free.select(inside(camera, scene.free.means))
         state = state_of(replace(scene, free=free))
-        states.append(rows_of(state, rows) | {"camera_color": small.static["camera_color"]})
+        state["camera_color"] = small.static["camera_color"]
+        states.append(rows_of(state, rows))
     return written(small, [scene_of(state, distance_input=header.distance_input) for state in states])
 
 
@@ -156,11 +157,11 @@ def main() -> None:
     parser.add_argument("clip", type=Path)
     clip: Path = parser.parse_args().clip
     for name, data in (("patch", patch(clip)), ("odd", odd())):
-        folder = FOLDER / name
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "stream.sgs").write_bytes(data)
+        FOLDER.mkdir(exist_ok=True)
+        stream = FOLDER / f"{name}.sgs"
+        stream.write_bytes(data)
         script = Path(__file__).with_name("make_references.py")
-        arguments = [str(folder / "stream.sgs"), str(folder), "--frames", "3", "--arc", "3", "--outputs", "100"]
+        arguments = [str(stream), str(FOLDER / name), "--frames", "3", "--arc", "3", "--outputs", "100"]
         subprocess.run([sys.executable, str(script), *arguments], check=True)
 
 
