@@ -3,7 +3,13 @@
 
 /** A stream to play; `name` is what messages call it. */
 export type SourceDescription =
-  | { readonly kind: "url"; readonly url: string; readonly name: string }
+  | {
+      readonly kind: "url";
+      readonly url: string;
+      readonly name: string;
+      /** Refuse other origins, also those that a server redirects to: for addresses that are not the page's own. */
+      readonly sameOrigin?: boolean;
+    }
   | { readonly kind: "blob"; readonly blob: Blob; readonly name: string }
   | { readonly kind: "base64"; readonly text: string; readonly name: string };
 

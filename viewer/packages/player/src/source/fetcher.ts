@@ -72,7 +72,7 @@ export class Fetcher {
 
   private opened(): ByteSource {
     const source = this.description!;
-    if (source.kind === "url") return new HttpSource(source.url, source.name, this.request);
+    if (source.kind === "url") return new HttpSource(source.url, source.name, this.request, source.sameOrigin);
     const blob = source.kind === "blob" ? source.blob : blobOfBase64(source.text, source.name);
     return new BlobSource(blob, source.name);
   }

@@ -25,6 +25,7 @@ export class HttpSource implements ByteSource {
     private readonly url: string,
     private readonly name: string,
     private readonly request: typeof fetch,
+    private readonly sameOrigin = false,
   ) {}
 
   get mayGrow(): boolean {
@@ -60,7 +61,8 @@ export class HttpSource implements ByteSource {
   private async answer(start: number, end: number | undefined, signal: AbortSignal): Promise<Response> {
     const range = `bytes=${start}-${end === undefined ? "" : end - 1}`;
     try {
-      return await this.request(this.url, { headers: { Range: range }, signal, cache: "no-store" });
+      const mode = this.sameOrigin ? "same-origin" : "cors";
+      return await this.request(this.url, { headers: { Range: range }, signal, mode, cache: "no-store" });
     } catch (error) {
       if (signal.aborted) throw error;
       throw new SourceError(
