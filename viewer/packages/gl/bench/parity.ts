@@ -22,7 +22,7 @@ if (!stream || !folder || !executable)
 
 const LIMITS: Readonly<Record<MlpPath, number>> = { "transform-feedback": 1e-4, mrt: 2e-3 };
 const files: Record<string, string> = { stream };
-for (const name of readdirSync(folder)) files[`references/${name}`] = join(folder, name);
+for (const name of readdirSync(folder)) files[`stream/${name}`] = join(folder, name);
 const sizes = new Map(viewsOf(folder).map(({ name, camera }) => [name, [camera.width, camera.height] as const]));
 const offsets = readStream(new Uint8Array(readFileSync(stream))).header!.static.get("anchor_offsets")!.shape[1]!;
 const stage = await openStage(executable, files);

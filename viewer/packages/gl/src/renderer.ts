@@ -5,6 +5,7 @@ import type { StreamHeader, Tensor } from "@structgstream/core";
 import { sameCamera } from "./cameraMath.js";
 import { GlError } from "./errors.js";
 import { type Device, deviceOf, openDevice } from "./gpu/device.js";
+import { Pace } from "./gpu/pace.js";
 import type { Look } from "./gpu/picturePass.js";
 import { Pipeline } from "./gpu/pipeline.js";
 import { LiveScene } from "./scene.js";
@@ -41,6 +42,7 @@ export class SplatRenderer implements Renderer {
   private pipeline: Pipeline | undefined;
   private readonly worker: Worker;
   private readonly orders: Orders;
+  private readonly pace: Pace;
   private scene: LiveScene | undefined;
   /** The order that pictures are drawn in, and the scene it belongs to. */
   private sorted: Sorted | undefined;
@@ -59,6 +61,7 @@ export class SplatRenderer implements Renderer {
     this.pipeline = this.newPipeline();
     this.worker = workerOf(options.sorter);
     this.orders = this.newOrders();
+    this.pace = new Pace(this.device.gl, this.ready);
     canvas.addEventListener("webglcontextlost", this.lost);
     canvas.addEventListener("webglcontextrestored", this.restored);
   }
@@ -92,13 +95,15 @@ export class SplatRenderer implements Renderer {
     const began = performance.now();
     const snapshot = this.scene?.latest;
     if (snapshot) this.orders.want({ snapshot, camera, maxSplats: this.maxSplats });
-    const drawn = this.pipeline ? this.drawn(this.pipeline, camera, this.lookNamed(options.cameraName)) : false;
+    const look = this.lookNamed(options.cameraName);
+    const drawn = this.pipeline ? this.drawn(this.pipeline, camera, look) : false;
     const { sorted } = this;
     const settled =
       sorted !== undefined &&
       snapshot !== undefined &&
       this.pipeline !== undefined &&
-      sameWanted(sorted, { snapshot, camera, maxSplats: this.maxSplats });
+      sameWanted(sorted, { snapshot, camera, maxSplats: this.maxSplats }) &&
+      this.shows(sorted, camera, look);
     return {
       frameIndex: sorted?.snapshot.index,
       ptsSeconds: sorted?.snapshot.ptsSeconds,
@@ -145,6 +150,7 @@ export class SplatRenderer implements Renderer {
     this.canvas.removeEventListener("webglcontextlost", this.lost);
     this.canvas.removeEventListener("webglcontextrestored", this.restored);
     this.orders.close();
+    this.pace.stop();
     this.pipeline?.resources.deleteAll();
     this.pipeline = undefined;
     this.scene = undefined;
@@ -162,23 +168,26 @@ export class SplatRenderer implements Renderer {
   }
 
   private newOrders(): Orders {
-    const arrived = () => {
-      this.onOrder?.();
-      this.settle();
-    };
     const failed = (error: Error) => {
       for (const waiting of this.settling.splice(0)) waiting.reject(error);
       this.onError?.(error);
     };
-    return new Orders(this.worker, arrived, failed);
+    return new Orders(this.worker, this.ready, failed);
   }
 
   private settle(): void {
     for (const waiting of this.settling.splice(0)) waiting.resolve();
   }
 
-  /** Whether anything had to be drawn. */
+  private readonly ready = (): void => {
+    this.onOrder?.();
+    this.settle();
+  };
+
+  /** Whether anything had to be drawn, and could be. */
   private drawn(pipeline: Pipeline, camera: Camera, look: Look): boolean {
+    if (this.shows(this.sorted, camera, look) && !this.orders.waiting) return false;
+    if (this.pace.busy()) return false;
     const arrived = this.orders.take();
     if (arrived && this.scene) {
       if (this.sorted) this.orders.release(this.sorted);
@@ -188,14 +197,20 @@ export class SplatRenderer implements Renderer {
     }
     const { shown, sorted, pixelScale } = this;
     const same = shown && shown.sorted === sorted && sameCamera(shown.camera, camera);
-    if (same && shown.pixelScale === pixelScale && sameLook(shown.look, look)) return false;
     if (this.canvas.width !== camera.width) this.canvas.width = camera.width;
     if (this.canvas.height !== camera.height) this.canvas.height = camera.height;
     if (sorted && !same) pipeline.evaluate(camera);
     if (!same || shown.pixelScale !== pixelScale) pipeline.draw(camera, pixelScale);
     pipeline.show(camera, look);
+    this.pace.mark();
     this.shown = { sorted, camera, pixelScale, look };
     return true;
+  }
+
+  private shows(sorted: Sorted | undefined, camera: Camera, look: Look): boolean {
+    const { shown, pixelScale } = this;
+    if (!shown || shown.sorted !== sorted || shown.pixelScale !== pixelScale) return false;
+    return sameCamera(shown.camera, camera) && sameLook(shown.look, look);
   }
 
   /** Held-out cameras have no correction of their own: theirs is the mean. */
@@ -214,6 +229,7 @@ export class SplatRenderer implements Renderer {
 
   private readonly lost = (event: Event): void => {
     event.preventDefault(); // else it would not be restored
+    this.pace.stop();
     this.pipeline = undefined;
     this.shown = undefined;
     this.onContextLost?.();

@@ -62,9 +62,9 @@ export interface RenderStats {
   /** The frame that the picture shows; undefined until the first order has come. It may lag behind the last update. */
   readonly frameIndex: number | undefined;
   readonly ptsSeconds: number | undefined;
-  /** False when neither camera nor scene had changed, so that the canvas was left as it is. */
+  /** False when nothing had changed, or the GPU is still at the picture before: the canvas was left as it is. */
   readonly drawn: boolean;
-  /** Whether the picture shows the last update in the order of this very camera; otherwise `onOrder` will follow. */
+  /** Whether the canvas shows the last update, seen and sorted from this very camera; otherwise `onOrder` will follow. */
   readonly settled: boolean;
   /** Anchors whose MLPs were evaluated. */
   readonly anchors: number;
@@ -87,7 +87,7 @@ export interface ResourceCounts {
 
 /** What `SplatRenderer` is to a player. */
 export interface Renderer {
-  /** Called when the sorting worker brought an order: the next `render` shows something new. */
+  /** The next `render` can show something new: an order has come, or the GPU has time again. */
   onOrder: (() => void) | undefined;
   onContextLost: (() => void) | undefined;
   /** Everything is on the GPU again: `render` as before. */

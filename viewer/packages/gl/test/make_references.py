@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures and MLP outputs of a stream as the CPU back-end has them: what the browser's are held to.
 
-``python viewer/packages/gl/test/make_references.py STREAM FOLDER`` writes, for held-out cameras and on an arc, PNGs, the
-outputs of the MLPs of some Gaussians, and ``views.json``, which names both.
+``python viewer/packages/gl/test/make_references.py STREAM FOLDER`` writes, for held-out cameras and on an arc, PNGs,
+the outputs of the MLPs of some Gaussians, and ``views.json``, which names both.
 """
 
 import argparse

@@ -38,7 +38,7 @@ export class Table {
     const { maxTextureSize } = this.device;
     if (rows > maxTextureSize) {
       throw new GlError(
-        `The scene is too large for this device: ${texels} numbers of ${this.name}, at most ${WIDTH * maxTextureSize} ` +
+        `The scene is too large for this device: ${texels} entries of ${this.name}, at most ${WIDTH * maxTextureSize} ` +
           "fit its textures; play a stream with fewer anchors.",
       );
     }

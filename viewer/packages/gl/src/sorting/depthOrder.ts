@@ -7,13 +7,14 @@ const LONGEST_WALK = 64;
 
 /** Buffers of one size after another, so that sorting makes no garbage. */
 export class DepthSorter {
-  private coarse = new Uint32Array(COARSE_BINS);
+  private readonly coarse = new Uint32Array(COARSE_BINS);
+  private readonly firsts = new Uint32Array(COARSE_BINS);
   private starts = new Uint32Array(0);
   private bins = new Uint32Array(0);
 
   /**
    * Writes the places 0 to `count` - 1 of `depths` to `order`: far ones first, and of equal ones the later first, so that
-   * the order is the reverse of a stable ascending one. Depths must be finite.
+   * the order is the reverse of a stable ascending one. Depths must be finite and not negative.
    */
   sort(depths: Float32Array, count: number, order: Uint32Array): void {
     if (count === 0) return;
@@ -33,22 +34,25 @@ export class DepthSorter {
     walk(depths, count, order);
   }
 
-  /** Every coarse bin has as many fine ones as it holds numbers: `bins`, ascending with the depth. */
+  /**
+   * Every coarse bin has as many fine ones as it holds numbers: `bins`, ascending with the depth. Bits of positive floats
+   * ascend as they do and about as their logarithms, so that a far background leaves bins to what is near.
+   */
   private assignBins(depths: Float32Array, count: number): void {
-    let [low, high] = [Number.POSITIVE_INFINITY, Number.NEGATIVE_INFINITY];
-    for (let i = 0; i < count; i++) {
-      const depth = depths[i]!;
-      if (depth < low) low = depth;
-      if (depth > high) high = depth;
+    const bits = new Uint32Array(depths.buffer, depths.byteOffset, count);
+    let [low, high] = [bits[0]!, bits[0]!];
+    for (let i = 1; i < count; i++) {
+      const found = bits[i]!;
+      if (found < low) low = found;
+      if (found > high) high = found;
     }
-    const { coarse, bins } = this;
+    const { coarse, firsts, bins } = this;
     const scale = high > low ? (COARSE_BINS * (1 - 2 ** -20)) / (high - low) : 0;
     coarse.fill(0);
-    for (let i = 0; i < count; i++) coarse[((depths[i]! - low) * scale) | 0]!++;
-    const firsts = new Uint32Array(COARSE_BINS);
+    for (let i = 0; i < count; i++) coarse[((bits[i]! - low) * scale) | 0]!++;
     for (let c = 0, sum = 0; c < COARSE_BINS; sum += coarse[c++]!) firsts[c] = sum;
     for (let i = 0; i < count; i++) {
-      const at = (depths[i]! - low) * scale;
+      const at = (bits[i]! - low) * scale;
       const c = at | 0;
       bins[i] = firsts[c]! + (((at - c) * coarse[c]!) | 0);
     }

@@ -62,6 +62,11 @@ export class Orders {
     this.send();
   }
 
+  /** Whether `take` has something. */
+  get waiting(): boolean {
+    return this.arrived !== undefined;
+  }
+
   /** The newest order that came since the last call. */
   take(): Sorted | undefined {
     const { arrived } = this;

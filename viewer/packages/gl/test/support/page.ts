@@ -10,10 +10,19 @@ import {
   rigCamera,
   SplatRenderer,
 } from "../../src/main.js";
+import { timed } from "./timing.js";
 
 /** A camera as JSON has it. */
 export type PlainCamera = Omit<Camera, "viewmat"> & { readonly viewmat: readonly number[] };
-type PlainOptions = Omit<RendererOptions, "sorter">;
+type PlainOptions = Omit<RendererOptions, "sorter"> & { readonly device?: Lesser; readonly sorterPath?: string };
+
+/** A device that can do less than this one. */
+export interface Lesser {
+  /** By the names of `getParameter`'s constants. */
+  readonly limits?: Readonly<Record<string, number>>;
+  readonly withoutExtensions?: readonly string[];
+  readonly withoutWebGL2?: boolean;
+}
 
 export function cameraOf(plain: PlainCamera): Camera {
   return { ...plain, viewmat: Float64Array.from(plain.viewmat) };
@@ -31,7 +40,11 @@ export class Play {
     options: PlainOptions,
   ) {
     document.body.append(this.canvas);
-    this.renderer = new SplatRenderer(this.canvas, { ...options, sorter: new URL("/sorter.js", location.href) });
+    if (options.device) lessen(this.canvas, options.device);
+    this.renderer = new SplatRenderer(this.canvas, {
+      ...options,
+      sorter: new URL(options.sorterPath ?? "/sorter.js", location.href),
+    });
     this.renderer.onContextLost = () => this.events.push("lost");
     this.renderer.onContextRestored = () => this.events.push("restored");
     this.renderer.onError = (error) => this.events.push(`error: ${error.message}`);
@@ -83,6 +96,56 @@ export async function open(url: string, options: PlainOptions = {}): Promise<Pla
   return new Play(readStream(new Uint8Array(await answer.arrayBuffer())), options);
 }
 
+/** Milliseconds on this thread of each of `repeats` frames in a row, from update to settled picture. */
+export async function played(play: Play, camera: Camera, repeats: number): Promise<{ calls: number[]; shown: number }> {
+  const frames = play.reader.packets.length;
+  const updates = Array.from({ length: Math.min(frames, 8) }, (_, index) => play.reader.frame(index));
+  const calls: number[] = [];
+  const seen = new Set<number | undefined>();
+  for (let i = 0; i < repeats; i++) {
+    const frame = updates[i % updates.length]!;
+    const fields = new Map(
+      [...frame.fields]
+        .filter(([name]) => play.reader.header!.dynamic.has(name))
+        .map(([name, { shape, data }]) => [name, { shape, data: data.slice() }] as const),
+    );
+    const viewmat = camera.viewmat.map((value, at) => (at === 3 ? value + 0.001 * i : value));
+    let began = performance.now();
+    play.renderer.update({ index: i, ptsSeconds: i, fields });
+    let spent = performance.now() - began;
+    for (;;) {
+      began = performance.now();
+      const stats = play.renderer.render({ ...camera, viewmat });
+      spent += performance.now() - began;
+      if (stats.drawn) seen.add(stats.frameIndex);
+      if (stats.settled) break;
+      await new Promise<void>((resolve) => {
+        play.renderer.onOrder = resolve;
+      });
+    }
+    calls.push(spent);
+  }
+  return { calls, shown: seen.size };
+}
+
+function lessen(canvas: HTMLCanvasElement, device: Lesser): void {
+  const open = canvas.getContext.bind(canvas) as (kind: string, attributes?: unknown) => WebGL2RenderingContext | null;
+  const lesser = (kind: string, attributes?: unknown) => {
+    if (device.withoutWebGL2) return null;
+    const gl = open(kind, attributes)!;
+    const getParameter = gl.getParameter.bind(gl);
+    const getExtension = gl.getExtension.bind(gl) as (name: string) => unknown;
+    const limits = new Map(
+      Object.entries(device.limits ?? {}).map(([name, limit]) => [gl[name as keyof WebGL2RenderingContext], limit]),
+    );
+    gl.getParameter = (name: number) => limits.get(name) ?? getParameter(name);
+    gl.getExtension = ((name: string) =>
+      device.withoutExtensions?.includes(name) ? null : getExtension(name)) as typeof gl.getExtension;
+    return gl;
+  };
+  canvas.getContext = lesser as unknown as typeof canvas.getContext;
+}
+
 /** RGBA of a PNG. */
 export async function pixelsOf(png: Blob): Promise<Uint8ClampedArray> {
   const bitmap = await createImageBitmap(png, { premultiplyAlpha: "none", colorSpaceConversion: "none" });
@@ -103,7 +166,7 @@ function base64(array: ArrayBufferView): string {
   return btoa(text);
 }
 
-const api = { open, pngPixels, plays: [] as Play[] };
+const api = { open, pngPixels, timed, played, plays: [] as Play[] };
 declare global {
   var stage: typeof api;
 }

@@ -6,7 +6,7 @@ import { join } from "node:path";
 import type { MlpPath, RenderStats } from "../../src/main.js";
 import type { Stage } from "./browser.js";
 import { bytesOf, type Difference, difference } from "./compare.js";
-import type { PlainCamera } from "./page.js";
+import type { Lesser, PlainCamera } from "./page.js";
 
 export interface View {
   readonly name: string;
@@ -38,7 +38,7 @@ export interface Compared extends Difference {
 /**
  * Every view of a stream in the browser against its reference.
  *
- * @param stream what the page fetches it as; references are under `references/`
+ * @param stream what the page fetches it as; references are under `STREAM/`
  */
 export async function* compared(
   stage: Stage,
@@ -46,14 +46,15 @@ export async function* compared(
   folder: string,
   mlpPath: MlpPath,
   offsetsPerAnchor: number,
+  device: Lesser = {},
 ): AsyncGenerator<Compared> {
   const { page } = stage;
   const outputs = readFileSync(join(folder, "outputs.bin"));
   await page.evaluate(
-    async ([url, path]) => {
-      globalThis.stage.plays = [await globalThis.stage.open(url, { mlpPath: path })];
+    async ([url, path, lesser]) => {
+      globalThis.stage.plays = [await globalThis.stage.open(url, { mlpPath: path, device: lesser })];
     },
-    [stream, mlpPath] as const,
+    [stream, mlpPath, device] as const,
   );
   for (const view of viewsOf(folder)) {
     const { camera } = view;
@@ -64,7 +65,7 @@ export async function* compared(
         const { stats, rgba } = await play!.picture(plain);
         return { stats, rgba, truth: await globalThis.stage.pngPixels(png), ...play!.outputs() };
       },
-      [view.frame, camera, `references/${view.name}.png`] as const,
+      [view.frame, camera, `${stream}/${view.name}.png`] as const,
     );
     const [rgba, truth] = [bytesOf(found.rgba), bytesOf(found.truth)];
     yield {
