@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check viewer-test clean
+.PHONY: demo test check viewer-test player clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
@@ -20,6 +20,10 @@ check: $(VENV)/.test-ready
 # As in `make test`, which skips it where there is no Node 20 or newer; this fails there.
 viewer-test:
 	scripts/viewer-test
+
+# The player that comes with the package, from viewer/packages; commit what changes.
+player:
+	scripts/build-player
 
 # A plain (not editable) install: what is tested is what a user gets. Sources are listed so that a change reinstalls.
 SOURCES := pyproject.toml CMakeLists.txt $(shell find csrc src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
