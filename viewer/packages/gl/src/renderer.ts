@@ -137,13 +137,6 @@ export class SplatRenderer implements Renderer {
     return blob;
   }
 
-  /** Waits for the GPU: 12 numbers for each Gaussian of the anchors of the order shown (`shaders/mlp.ts`). For tests. */
-  mlpOutputs(): { readonly anchors: Uint32Array; readonly outputs: Float32Array } {
-    const order = this.sorted?.order;
-    const anchors = order ? order.anchors.slice(0, order.anchorCount) : new Uint32Array(0);
-    return { anchors, outputs: this.pipeline?.mlpOutputs() ?? new Float32Array(0) };
-  }
-
   destroy(): void {
     if (this.destroyed) return;
     this.destroyed = true;

@@ -2,10 +2,10 @@
 
 import type { FieldName, Tensor } from "@structgstream/core";
 import { expect, test } from "vitest";
-import { halfFloat } from "../src/gpu/halfFloat.ts";
 import { mlpLayout, packedWeights, paddedRows } from "../src/gpu/weights.ts";
 import { shapeOf } from "../src/scene.ts";
 import { splatRanges } from "../src/shaders/mlp.ts";
+import { halfFloat } from "./support/halfFloat.ts";
 
 const [D, R, K, H] = [5, 2, 2, 6];
 

@@ -66,30 +66,9 @@ export class FeedbackPass implements MlpPass {
     return { textures: { outputs: this.texture }, arrays: {} };
   }
 
-  set(program: Program): void {
-    this.resources.gl.uniform1i(program.at("passTexels"), this.passRows * WIDTH);
-  }
-
-  read(count: number): Float32Array {
-    const { gl } = this.resources;
-    const rows = this.passRows * this.passes.length;
-    const texels = new Float32Array(4 * WIDTH * rows);
-    const framebuffer = this.resources.framebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.texture!, 0);
-    gl.readPixels(0, 0, WIDTH, rows, gl.RGBA, gl.FLOAT, texels);
-    this.resources.deleteFramebuffer(framebuffer);
-    const splats = this.passes.reduce((sum, { range }) => sum + range.count, 0);
-    const size = 4 * SPLAT_VECTORS;
-    const all = new Float32Array(count * splats * size);
-    for (const [number, { range }] of this.passes.entries()) {
-      const start = number * this.passRows * WIDTH * 4;
-      for (let v = 0; v < count; v++) {
-        const from = start + v * range.count * size;
-        all.set(texels.subarray(from, from + range.count * size), (v * splats + range.first) * size);
-      }
-    }
-    return all;
+  /** Texels from where one pass writes to where the next one does. */
+  get passTexels(): number {
+    return this.passRows * WIDTH;
   }
 
   delete(): void {

@@ -95,11 +95,6 @@ export class Pipeline {
     this.picture.draw(this.splats.target, camera, environment ?? NOTHING, this.background, look);
   }
 
-  /** Waits for the GPU; for tests. */
-  mlpOutputs(): Float32Array {
-    return this.stage ? this.stage.mlp.read(this.stage.scene.anchorCount) : NOTHING;
-  }
-
   private stageFor(shape: Shape): Stage {
     const { resources, device } = this;
     const most = device.splatsPerPass[this.path];

@@ -53,7 +53,7 @@ export class ProjectionPass {
       },
       arrays,
     );
-    this.mlp.set(program);
+    gl.uniform1i(program.at("passTexels"), this.mlp.passTexels);
     gl.uniform1i(program.at("anchorCount"), scene.anchorCount);
     gl.uniform1i(program.at("slotCount"), count);
     const [right, down, forward] = axes(camera);

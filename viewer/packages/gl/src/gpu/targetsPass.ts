@@ -7,8 +7,7 @@ import { LAYER_WIDTH_BITS, splatRanges, targetsProgram } from "../shaders/mlp.js
 import { readingGlsl } from "../shaders/reading.js";
 import type { Vector } from "../vectors.js";
 import { bindInputs } from "./binding.js";
-import { type Device, PAIR_TARGETS, SPLAT_VECTORS } from "./device.js";
-import { halfFloat } from "./halfFloat.js";
+import { type Device, PAIR_TARGETS } from "./device.js";
 import type { MlpPass } from "./mlpPass.js";
 import type { Program, Resources } from "./resources.js";
 import type { SceneTextures } from "./sceneTextures.js";
@@ -26,9 +25,9 @@ interface Pass {
 
 export class TargetsPass implements MlpPass {
   readonly reading: string;
+  readonly passTexels = 0;
   private readonly passes: Pass[];
   private readonly layers: number;
-  private readonly splats: number;
   private texture: WebGLTexture | undefined;
   private rows = 0;
 
@@ -38,11 +37,11 @@ export class TargetsPass implements MlpPass {
     shape: Shape,
     most: number,
   ) {
-    this.splats = shape.offsetsPerAnchor;
-    this.reading = readingGlsl("mrt", this.splats, most);
-    this.layers = PAIR_TARGETS * Math.ceil(this.splats / 2);
+    const splats = shape.offsetsPerAnchor;
+    this.reading = readingGlsl("mrt", splats, most);
+    this.layers = PAIR_TARGETS * Math.ceil(splats / 2);
     const layout = mlpLayout(shape);
-    this.passes = splatRanges(this.splats, most).map((range) => ({
+    this.passes = splatRanges(splats, most).map((range) => ({
       program: resources.program(targetsProgram(shape, layout, range)),
       firstLayer: (PAIR_TARGETS * range.first) / 2,
       targets: Math.ceil((PAIR_TARGETS * range.count) / 2),
@@ -69,37 +68,6 @@ export class TargetsPass implements MlpPass {
 
   outputs(): ReturnType<MlpPass["outputs"]> {
     return { textures: {}, arrays: { outputs: this.texture } };
-  }
-
-  set(): void {
-    // The reading shader has all it needs in its text.
-  }
-
-  read(count: number): Float32Array {
-    const { gl } = this.resources;
-    const { rows, splats } = this;
-    const size = 4 * SPLAT_VECTORS;
-    const all = new Float32Array(count * splats * size);
-    const texels = new Uint32Array(4 * WIDTH * rows);
-    const framebuffer = this.resources.framebuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    for (let layer = 0; layer < this.layers; layer++) {
-      gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, this.texture!, 0, layer);
-      gl.readPixels(0, 0, WIDTH, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, texels);
-      // Number `n` of an anchor's 32-bit ones, six to a Gaussian, is half floats 2n and 2n + 1.
-      for (let v = 0; v < count; v++) {
-        for (let i = 0; i < 4; i++) {
-          const n = 4 * layer + i;
-          if (n >= 6 * splats) continue;
-          const bits = texels[4 * v + i]!;
-          const at = v * splats * size + 2 * n;
-          all[at] = halfFloat(bits & 0xffff);
-          all[at + 1] = halfFloat(bits >>> 16);
-        }
-      }
-    }
-    this.resources.deleteFramebuffer(framebuffer);
-    return all;
   }
 
   delete(): void {

@@ -10,6 +10,7 @@ import {
   rigCamera,
   SplatRenderer,
 } from "../../src/main.js";
+import { mlpOutputs } from "./mlpOutputs.js";
 import { timed } from "./timing.js";
 
 /** A camera as JSON has it. */
@@ -81,7 +82,7 @@ export class Play {
 
   /** What the MLPs say, and of which anchors, as base64 of numbers. */
   outputs(): { anchors: string; outputs: string } {
-    const { anchors, outputs } = this.renderer.mlpOutputs();
+    const { anchors, outputs } = mlpOutputs(this.renderer);
     return { anchors: base64(anchors), outputs: base64(outputs) };
   }
 
