@@ -29,26 +29,33 @@ describe.skipIf(!executable)("in a browser", () => {
     "no picture shows one frame in the order of another",
     async () => {
       const found = await stage.page.evaluate(async (camera) => {
+        const viewmat = camera.viewmat.map((value, i) => (i === 3 ? value + 0.3 : value));
+        const moved = { ...camera, viewmat };
         const play = await globalThis.stage.open("odd");
-        globalThis.stage.plays.push(play);
-        const plain = { ...camera, viewmat: Float64Array.from(camera.viewmat) };
+        const other = await globalThis.stage.open("odd");
+        globalThis.stage.plays.push(play, other);
         play.frame(0);
-        const early = play.renderer.render(plain);
+        const early = play.renderer.render({ ...camera, viewmat: Float64Array.from(camera.viewmat) });
         const first = await play.picture(camera);
+        // Frame 2 is there and its order is not: whatever is drawn is frame 0.
+        play.sorter.held = true;
         play.frame(2);
-        // The order for frame 2 cannot have come yet: the canvas stays as it is.
-        const between = play.renderer.render(plain);
-        const still = await play.pixels();
-        const second = await play.picture(camera);
-        const again = play.renderer.render(plain);
-        return { early, first, between, still, second, again };
+        const between = await play.unsorted(moved);
+        play.sorter.release();
+        const second = await play.picture(moved);
+        const again = play.renderer.render({ ...moved, viewmat: Float64Array.from(viewmat) });
+        other.frame(0);
+        await other.picture(camera);
+        other.sorter.held = true;
+        const wanted = await other.unsorted(moved);
+        return { early, first, between, second, again, wanted };
       }, view);
       expect(found.early).toMatchObject({ frameIndex: undefined, settled: false, splats: 0 });
       expect(found.first.stats).toMatchObject({ frameIndex: 0, settled: true });
-      expect(found.between).toMatchObject({ frameIndex: 0, settled: false, drawn: false });
-      expect(found.still).toBe(found.first.rgba);
+      expect(found.between.stats).toMatchObject({ frameIndex: 0, settled: false, drawn: true });
+      expect(found.between.rgba).toBe(found.wanted.rgba);
       expect(found.second.stats).toMatchObject({ frameIndex: 2, settled: true });
-      expect(found.second.rgba).not.toBe(found.first.rgba);
+      expect(found.second.rgba).not.toBe(found.between.rgba);
       expect(found.again).toMatchObject({ drawn: false, settled: true });
     },
     TIMEOUT,

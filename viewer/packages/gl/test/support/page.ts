@@ -10,6 +10,7 @@ import {
   rigCamera,
   SplatRenderer,
 } from "../../src/main.js";
+import { HeldWorker } from "./heldWorker.js";
 import { mlpOutputs } from "./mlpOutputs.js";
 import { timed } from "./timing.js";
 
@@ -33,6 +34,7 @@ export function cameraOf(plain: PlainCamera): Camera {
 export class Play {
   readonly canvas = document.createElement("canvas");
   readonly renderer: SplatRenderer;
+  readonly sorter: HeldWorker;
   readonly events: string[] = [];
   private given = new Map<string, unknown>();
 
@@ -42,10 +44,8 @@ export class Play {
   ) {
     document.body.append(this.canvas);
     if (options.device) lessen(this.canvas, options.device);
-    this.renderer = new SplatRenderer(this.canvas, {
-      ...options,
-      sorter: new URL(options.sorterPath ?? "/sorter.js", location.href),
-    });
+    this.sorter = new HeldWorker(new Worker(options.sorterPath ?? "/sorter.js", { type: "module" }));
+    this.renderer = new SplatRenderer(this.canvas, { ...options, sorter: this.sorter as unknown as Worker });
     this.renderer.onContextLost = () => this.events.push("lost");
     this.renderer.onContextRestored = () => this.events.push("restored");
     this.renderer.onError = (error) => this.events.push(`error: ${error.message}`);
@@ -73,6 +73,15 @@ export class Play {
   async picture(plain: PlainCamera, options?: RenderOptions): Promise<{ stats: RenderStats; rgba: string }> {
     const stats = await this.renderer.renderSettled(cameraOf(plain), options);
     return { stats, rgba: await this.pixels() };
+  }
+
+  /** A picture in the order there is, whatever it is the order for. */
+  async unsorted(plain: PlainCamera): Promise<{ stats: RenderStats; rgba: string }> {
+    for (;;) {
+      const stats = this.renderer.render(cameraOf(plain));
+      if (stats.drawn) return { stats, rgba: await this.pixels() };
+      await new Promise((resolve) => setTimeout(resolve, 5)); // the GPU is still at the one before
+    }
   }
 
   /** The picture shown last, RGBA, as base64. */
