@@ -41,10 +41,17 @@ export interface Stage {
   close(): Promise<void>;
 }
 
-/** @param files what the server gives besides the page, by name: paths on this machine */
-export async function openStage(executablePath: string, files: Readonly<Record<string, string>>): Promise<Stage> {
-  const here = (path: string) => fileURLToPath(new URL(path, import.meta.url));
-  const [page, sorter] = await Promise.all([bundled(here("page.ts")), bundled(here("../../src/sorter.worker.ts"))]);
+/**
+ * @param files what the server gives besides the page, by name: paths on this machine
+ * @param script what runs in the page; it sets `globalThis.stage`
+ */
+export async function openStage(
+  executablePath: string,
+  files: Readonly<Record<string, string>>,
+  script = new URL("page.ts", import.meta.url),
+): Promise<Stage> {
+  const sorterScript = new URL("../../src/sorter.worker.ts", import.meta.url);
+  const [page, sorter] = await Promise.all([script, sorterScript].map((url) => bundled(fileURLToPath(url))));
   const content: Record<string, Uint8Array | string> = {
     "/": '<!doctype html><meta charset="utf-8"><title>stage</title><link rel="icon" href="data:,"><script type="module" src="/page.js"></script>',
     "/page.js": page,
