@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Makes dist/player.js: one module that holds the player, its workers and its styles, and needs nothing else.
-// `node build.mjs` after `tsc --build`; the same sources give the same bytes.
+// `node build.mjs [FILE]` after `tsc --build`; the same sources give the same bytes.
 
 import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
+import { basename, dirname } from "node:path";
+import { fileURLToPath } from "node:url";
 import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 import { minify } from "terser";
@@ -20,9 +22,8 @@ const terse = {
   },
 };
 
-const here = new URL("./", import.meta.url).pathname;
 const common = {
-  absWorkingDir: here,
+  absWorkingDir: fileURLToPath(new URL("./", import.meta.url)),
   bundle: true,
   minify: true,
   write: false,
@@ -35,7 +36,7 @@ const common = {
 
 /** What a second minifier still finds: some 1500 bytes with gzip. */
 async function shorter({ outputFiles }, module) {
-  const compress = { passes: 3, unsafe_arrows: true, unsafe_methods: true, keep_fargs: false };
+  const compress = { passes: 2, unsafe_arrows: true, unsafe_methods: true, keep_fargs: false };
   const { code } = await minify(outputFiles[0].text, { module, toplevel: true, ecma: 2020, compress });
   return code.trim();
 }
@@ -56,7 +57,8 @@ const module = await build({
 const bundle = `// SPDX-License-Identifier: Apache-2.0\n${await shorter(module, true)}\n`;
 // In an HTML page a script ends where this stands, whatever it is part of.
 if (/<\/script|<!--/i.test(bundle)) throw new Error("The bundle holds what would end a script element.");
-mkdirSync(new URL("dist/", import.meta.url), { recursive: true });
-writeFileSync(new URL("dist/player.js", import.meta.url), bundle);
+const file = process.argv[2] ?? fileURLToPath(new URL("dist/player.js", import.meta.url));
+mkdirSync(dirname(file), { recursive: true });
+writeFileSync(file, bundle);
 const size = (text) => `${Buffer.byteLength(text)} bytes, ${gzipSync(text, { level: 9 }).length} with gzip`;
-console.error(`dist/player.js: ${size(bundle)} (decoder ${size(worker)}; sorter ${size(sorter)})`);
+console.error(`${basename(file)}: ${size(bundle)} (decoder ${size(worker)}; sorter ${size(sorter)})`);

@@ -13,7 +13,7 @@
  * | `isolated` | the page's address (`?src=&t=&view=&embed=1`) means nothing to this player |
  */
 
-import { type Camera, type RenderStats, SplatRenderer } from "@structgstream/gl";
+import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
 import type { Engine } from "./engine/engine.js";
 import type { TimeRange } from "./engine/events.js";
 import { startedPipeline } from "./pipeline.js";
@@ -144,6 +144,11 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.running?.player.stats;
   }
 
+  /** What the renderer holds. */
+  get resources(): ResourceCounts | undefined {
+    return this.running?.player.resources;
+  }
+
   /** Listens to the player; what comes back ends the listening. Kept when another stream is loaded. */
   on<EventName extends Name>(name: EventName, listener: (event: PlayerEvents[EventName]) => void): () => void {
     const entry: (typeof this.listeners)[number] = { name, listener: listener as (event: never) => void };
@@ -207,8 +212,9 @@ export class StructgstreamPlayer extends HTMLElement {
     player.setLoop(this.hasAttribute("loop"));
     this.applyAttributes(surface);
     this.resized();
+    const refused = this.link?.refused ?? [];
     this.openAttribute();
-    for (const sentence of this.link?.refused ?? []) surface.say(sentence);
+    for (const sentence of refused) surface.say(sentence);
     const truth = this.getAttribute("truth");
     if (truth !== null) surface.compare.attach(new URL(truth, document.baseURI)).catch(() => undefined);
   }

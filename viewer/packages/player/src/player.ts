@@ -2,7 +2,7 @@
 /** A stream on a canvas: engine, renderer and a camera that moves. It knows nothing of buttons. */
 
 import type { StreamHeader } from "@structgstream/core";
-import { type Camera, fitted, type Renderer, type RenderStats } from "@structgstream/gl";
+import { type Camera, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
 import { Engine, type Pipeline } from "./engine/engine.js";
 import type { EngineEvents } from "./engine/events.js";
@@ -42,6 +42,8 @@ export class Player extends Emitter<PlayerEvents> {
   exposed = false;
   engine: Engine | undefined;
   stats: RenderStats | undefined;
+  /** Those of the last call that drew something. */
+  drawnStats: RenderStats | undefined;
   /** Time between the last pictures, smoothed; undefined while none follow each other. */
   pictureSeconds: number | undefined;
   loop = false;
@@ -173,6 +175,10 @@ export class Player extends Emitter<PlayerEvents> {
     if (this.stats.drawn) this.measure(time, this.stats);
   }
 
+  get resources(): ResourceCounts {
+    return this.options.renderer.resources;
+  }
+
   /** The picture as it is, as PNG. */
   screenshot(): Promise<Blob> {
     return this.options.renderer.screenshot();
@@ -220,6 +226,7 @@ export class Player extends Emitter<PlayerEvents> {
       if (this.view !== this.drawnView) this.options.quality.picture(since);
     } else this.pictureSeconds = undefined;
     this.drawnView = this.view;
+    this.drawnStats = stats;
     this.emit("drawn", { stats });
   }
 }

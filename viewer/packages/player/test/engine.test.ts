@@ -2,8 +2,10 @@
 /** Engine, decoder and fetcher together, without a browser. */
 
 import { readStream, type Tensor } from "@structgstream/core";
-import { afterEach, describe, expect, test } from "vitest";
+import { afterEach, describe, expect, test, vi } from "vitest";
 import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
+
+vi.setConfig({ testTimeout: 60_000 });
 
 const WHOLE = readStream(CLIP);
 const PACKETS = WHOLE.packets;

@@ -69,7 +69,7 @@ export class Bar {
         this.compare,
         panel("cameras", "cameras", "Cameras", "noembed"),
         panel("statistics", "chart", "Statistics", "noembed wide"),
-        panel("settings", "settings", "Picture", "noembed medium"),
+        panel("settings", "settings", "Picture", "noembed"),
         button("photo", "Save a screenshot", () => actions.screenshot(), "noembed wide"),
         button("link", "Copy a link to this view and time", () => actions.share(), "noembed wide"),
         panel("help", "help", "Keys", "noembed wide"),

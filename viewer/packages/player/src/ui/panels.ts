@@ -58,9 +58,10 @@ export class CameraPanel {
       return made("label", {}, label, box);
     };
     return [
-      this.list,
       toggle("Show them in the picture", frusta, (on) => this.actions.showFrusta(on)),
       toggle("Fly from one to the next", touring, (on) => this.actions.tour(on)),
+      this.list,
+      made("p", { class: "remark" }, "Dashed: not used for training."),
     ];
   }
 
@@ -84,6 +85,8 @@ export interface PictureActions {
   readonly theme: string;
   setTheme(theme: string): void;
   openFile(): void;
+  /** What the bar has no room for on a small screen: labels and what they do. */
+  readonly more: readonly (readonly [label: string, act: () => void])[];
 }
 
 export function pictureContent(quality: QualityControl, player: Player, actions: PictureActions): Node[] {
@@ -96,8 +99,11 @@ export function pictureContent(quality: QualityControl, player: Player, actions:
     (name) => [name, name === "auto" ? "automatic" : Number(name).toLocaleString("en")] as const,
   );
   const scales = SCALES.map((name) => [name, name === "auto" ? "automatic" : `${Number(name) * 100} %`] as const);
-  const file = made("button", { type: "button" }, "Open a file of yours");
-  file.addEventListener("click", () => actions.openFile());
+  const acting = (label: string, act: () => void, name = "") => {
+    const element = made("button", { type: "button", class: name }, label);
+    element.addEventListener("click", act);
+    return element;
+  };
   return [
     choice("Splats, at most", splats, String(maxSplats) as "auto", (text) => set({ maxSplats: value(text) })),
     choice("Resolution", scales, String(pixelScale) as "auto", (text) => set({ pixelScale: value(text) })),
@@ -127,7 +133,8 @@ export function pictureContent(quality: QualityControl, player: Player, actions:
         player.still = motion === "still";
       },
     ),
-    file,
+    acting("Open a file of yours", () => actions.openFile(), "file"),
+    made("div", { class: "more" }, ...actions.more.map(([label, act]) => acting(label, act))),
   ];
 }
 

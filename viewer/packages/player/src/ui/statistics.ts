@@ -27,7 +27,8 @@ export class Statistics {
   update(now: number): void {
     if (now - this.updatedAt < EVERY_SECONDS) return;
     this.updatedAt = now;
-    const { engine, stats, pictureSeconds } = this.player;
+    const { engine, pictureSeconds } = this.player;
+    const stats = this.player.drawnStats;
     if (!engine) return;
     const index = stats?.frameIndex ?? engine.frameIndex;
     this.set("Frame", `${index} of ${engine.frames.count}`);

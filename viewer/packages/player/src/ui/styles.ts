@@ -48,6 +48,7 @@ button[aria-pressed="true"], button[aria-expanded="true"] { color: var(--accent)
 .tip { position: absolute; bottom: 20px; transform: translateX(-50%); padding: 2px 7px; border-radius: 6px; font-size: 12px;
   font-variant-numeric: tabular-nums; white-space: nowrap; pointer-events: none; }
 select { background: none; border: 1px solid transparent; border-radius: 7px; height: 32px; padding: 0 4px; cursor: pointer; }
+.bar select { width: 62px; }
 select:hover { background: var(--hover); }
 option { background: Canvas; color: CanvasText; }
 .panel { position: absolute; right: 10px; top: 10px; bottom: 80px; width: min(290px, calc(100% - 20px)); overflow: auto; padding: 10px 12px;
@@ -93,6 +94,10 @@ progress::-moz-progress-bar { background: var(--accent); }
 .idle .bar { opacity: 0; } .idle .bar:focus-within { opacity: 1; } .idle .stage { cursor: none; }
 .narrow .wide { display: none; }
 .tiny .time .soft, .tiny .medium { display: none; }
+.more { display: none; flex-wrap: wrap; gap: 4px; margin-top: 8px; } .narrow .more { display: flex; }
+.more button, .file { border: 1px solid var(--line); }
+.file { margin-top: 8px; width: 100%; }
+.remark { color: var(--soft); font-size: 12px; margin: 8px 0 0; }
 .embed .noembed { display: none; }
 [hidden] { display: none !important; }
 .quiet { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); white-space: nowrap; }

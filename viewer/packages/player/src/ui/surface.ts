@@ -281,6 +281,12 @@ export class Surface {
       theme: host.getAttribute("theme") ?? "auto",
       setTheme: (theme) => host.setAttribute("theme", theme),
       openFile: () => this.chooseFile(),
+      more: [
+        ["Statistics", () => this.toggle("statistics")],
+        ["Save a screenshot", () => this.options.saveScreenshot()],
+        ["Copy a link", () => void this.share()],
+        ["Keys and gestures", () => this.toggle("help")],
+      ],
     });
   }
 
