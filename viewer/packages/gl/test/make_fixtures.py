@@ -27,7 +27,7 @@ from structgstream.similarity import Similarity
 FOLDER = Path(__file__).parent / "fixtures"
 FRAMES = (0, 3, 6, 9)
 KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY)
-WINDOW_PIXELS, WINDOW_CENTER = (56, 44), (58.0, 160.0)
+WINDOW_PIXELS, WINDOW_CENTER = (56, 44), (62.0, 180.0)
 CAMERAS = 5
 ROWS: tuple[FieldName, ...] = (
     "anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "anchor_features", "appearance"
@@ -85,10 +85,10 @@ def patch(path: Path) -> bytes:
         static=rows_of(dict(header.static), rows) | {"camera_color": header.static["camera_color"][training]},
         reference=rows_of(dict(header.reference), rows),
     )
+    births = torch.cat([scene.free.births[inside(camera, scene.free.means)] for scene in scenes])
     states: list[dict[FieldName, Tensor]] = []
     for scene in scenes:
-        free = scene.free.select(inside(camera, scene.free.means))
-        state = state_of(replace(scene, free=free))
+        state = state_of(replace(scene, free=scene.free.select(torch.isin(scene.free.births, births))))
         state["camera_color"] = small.static["camera_color"]
         states.append(rows_of(state, rows))
     return written(small, [scene_of(state, distance_input=header.distance_input) for state in states])

@@ -12,6 +12,7 @@ import {
 } from "../../src/main.js";
 import { HeldWorker } from "./heldWorker.js";
 import { mlpOutputs } from "./mlpOutputs.js";
+import { base64, pixelsOf } from "./pixels.js";
 import { timed } from "./timing.js";
 
 /** A camera as JSON has it. */
@@ -156,24 +157,8 @@ function lessen(canvas: HTMLCanvasElement, device: Lesser): void {
   canvas.getContext = lesser as unknown as typeof canvas.getContext;
 }
 
-/** RGBA of a PNG. */
-export async function pixelsOf(png: Blob): Promise<Uint8ClampedArray> {
-  const bitmap = await createImageBitmap(png, { premultiplyAlpha: "none", colorSpaceConversion: "none" });
-  const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
-  const context = canvas.getContext("2d")!;
-  context.drawImage(bitmap, 0, 0);
-  return context.getImageData(0, 0, bitmap.width, bitmap.height).data;
-}
-
 export async function pngPixels(url: string): Promise<string> {
   return base64(await pixelsOf(await (await fetch(url)).blob()));
-}
-
-function base64(array: ArrayBufferView): string {
-  const bytes = new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
-  let text = "";
-  for (let i = 0; i < bytes.length; i += 0x8000) text += String.fromCharCode(...bytes.subarray(i, i + 0x8000));
-  return btoa(text);
 }
 
 const api = { open, pngPixels, timed, played, plays: [] as Play[] };
