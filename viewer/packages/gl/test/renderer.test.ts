@@ -272,6 +272,20 @@ describe.skipIf(!executable)("in a browser", () => {
   );
 
   test(
+    "without a worker given, the renderer starts its own",
+    async () => {
+      const stats = await stage.page.evaluate(async (camera) => {
+        const play = await globalThis.stage.open("odd", { ownSorter: true });
+        globalThis.stage.plays.push(play);
+        play.frame(0);
+        return (await play.picture(camera)).stats;
+      }, view);
+      expect(stats.splats).toBeGreaterThan(100);
+    },
+    TIMEOUT,
+  );
+
+  test(
     "a sorting worker that cannot be loaded is reported, and nobody waits for it",
     async () => {
       const said = await stage.page.evaluate(async (camera) => {

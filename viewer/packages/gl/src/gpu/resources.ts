@@ -5,8 +5,8 @@ import { GlError } from "../errors.js";
 import type { ResourceCounts } from "../types.js";
 
 /** What GLSL and the host agree on before the shader's own text. */
-const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n";
-const HEAD_UINT = "precision highp usampler2D;\nprecision highp usampler2DArray;\n";
+const HEAD = `#version 300 es
+${["float", "int", "sampler2D", "usampler2D", "usampler2DArray"].map((type) => `precision highp ${type};\n`).join("")}`;
 
 export interface ProgramSource {
   readonly vertex: string;
@@ -84,7 +84,7 @@ export class Resources {
     ] as const) {
       const shader = gl.createShader(type);
       if (!shader) continue; // only a lost context has none
-      gl.shaderSource(shader, HEAD + HEAD_UINT + text);
+      gl.shaderSource(shader, HEAD + text);
       gl.compileShader(shader);
       gl.attachShader(handle, shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {

@@ -20,7 +20,7 @@ export function splatRanges(splats: number, most: number): SplatRange[] {
   return ranges;
 }
 
-/** `dressed(k)` writes (opacity, rgb), (scale shares, qw), (qxyz, 0) of Gaussian k to `a`, `b`, `c`, head by head. */
+/** `evaluate(anchor)` writes (opacity, rgb), (shares of the scales, qw), (qxyz, 0) of each Gaussian to `a`, `b`, `c`. */
 export function evaluation(shape: Shape, layout: MlpLayout, range: SplatRange): string {
   return `${TABLE_GLSL}
 uniform sampler2D positions, features, appearance, weights;

@@ -56,6 +56,7 @@ export async function openStage(
     "/": '<!doctype html><meta charset="utf-8"><title>stage</title><link rel="icon" href="data:,"><script type="module" src="/page.js"></script>',
     "/page.js": page,
     "/sorter.js": sorter,
+    "/sorter.worker.js": sorter,
   };
   const server = createServer(async (request, response) => {
     const name = new URL(request.url ?? "/", "http://localhost").pathname;

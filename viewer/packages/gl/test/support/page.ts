@@ -17,7 +17,11 @@ import { timed } from "./timing.js";
 
 /** A camera as JSON has it. */
 export type PlainCamera = Omit<Camera, "viewmat"> & { readonly viewmat: readonly number[] };
-type PlainOptions = Omit<RendererOptions, "sorter"> & { readonly device?: Lesser; readonly sorterPath?: string };
+type PlainOptions = Omit<RendererOptions, "sorter"> & {
+  readonly device?: Lesser;
+  readonly sorterPath?: string;
+  readonly ownSorter?: boolean;
+};
 
 /** A device that can do less than this one. */
 export interface Lesser {
@@ -46,7 +50,9 @@ export class Play {
     document.body.append(this.canvas);
     if (options.device) lessen(this.canvas, options.device);
     this.sorter = new HeldWorker(new Worker(options.sorterPath ?? "/sorter.js", { type: "module" }));
-    this.renderer = new SplatRenderer(this.canvas, { ...options, sorter: this.sorter as unknown as Worker });
+    // Without one, the renderer starts the file that lies beside its own.
+    const sorter = options.ownSorter ? {} : { sorter: this.sorter as unknown as Worker };
+    this.renderer = new SplatRenderer(this.canvas, { ...options, ...sorter });
     this.renderer.onContextLost = () => this.events.push("lost");
     this.renderer.onContextRestored = () => this.events.push("restored");
     this.renderer.onError = (error) => this.events.push(`error: ${error.message}`);
