@@ -73,6 +73,12 @@ class Tab:
             time.sleep(0.1)
         raise AssertionError(f"{expression} never came true; the page says {self.complaints}")
 
+    def drag(self, *points: tuple[int, int]) -> None:
+        """Presses the mouse's button at the first pixel, goes by the others, and lets it go at the last."""
+        kinds = ["mousePressed", *["mouseMoved"] * (len(points) - 1), "mouseReleased"]
+        for kind, (x, y) in zip(kinds, (*points, points[-1]), strict=True):
+            self._call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
     def screenshot(self) -> NDArray[np.uint8]:
         """What the window shows, ``[H, W, 3]`` sRGB."""
         return decoded_picture(base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"]))
