@@ -9,7 +9,7 @@ const sorter = new Sorter();
 function answer(request: OrderRequest): [OrderAnswer, Transferable[]] {
   try {
     const order = sorter.order(request);
-    return [order, [order.anchors.buffer, order.slots.buffer]];
+    return [order, [order.anchors.buffer, order.slots.buffer, ...order.returned]];
   } catch (error) {
     return [{ id: request.id, failure: error instanceof Error ? error.message : String(error) }, []];
   }

@@ -55,9 +55,9 @@ const CAMERA: Camera = {
 const K = 3;
 const ANCHORS = 2000;
 
-function scene(): Map<PlacingField, Float32Array> {
+function scene(): Map<PlacingField, Float32Array<ArrayBuffer>> {
   const within = (low: number, high: number) => (x: number) => low + (high - low) * x;
-  return new Map<PlacingField, Float32Array>([
+  return new Map<PlacingField, Float32Array<ArrayBuffer>>([
     ["anchor_positions", numbers(3 * ANCHORS, 1).map(within(-4, 4))],
     ["offset_scales", numbers(3 * ANCHORS, 2).map(within(-4, -2))],
     ["base_scales", numbers(3 * ANCHORS, 3).map(within(-6, -2))],

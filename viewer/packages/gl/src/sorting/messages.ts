@@ -7,8 +7,8 @@ import type { PlacingField } from "./placement.js";
 /** Asks for an order. */
 export interface OrderRequest {
   readonly id: number;
-  /** What has changed of the scene since the last request. */
-  readonly changed: ReadonlyMap<PlacingField, Float32Array>;
+  /** What has changed of the scene since the last request, in buffers that are transferred. */
+  readonly changed: ReadonlyMap<PlacingField, Float32Array<ArrayBuffer>>;
   readonly offsetsPerAnchor: number;
   readonly freeColumns: number;
   readonly camera: Camera;
@@ -27,6 +27,8 @@ export interface Order {
   readonly slots: Uint32Array<ArrayBuffer>;
   readonly splats: number;
   readonly milliseconds: number;
+  /** Of what had changed before, to be filled again. */
+  readonly returned: readonly ArrayBuffer[];
 }
 
 export interface OrderFailure {

@@ -36,6 +36,7 @@ export class Orders {
   /** What the worker has. */
   private readonly sent = new Map<PlacingField, Float32Array>();
   private readonly spare: ArrayBuffer[][] = [];
+  private returned: ArrayBuffer[] = [];
   private closed = false;
 
   /**
@@ -98,11 +99,11 @@ export class Orders {
     this.asked = next;
     this.next = undefined;
     const { fields } = next.snapshot;
-    const changed = new Map<PlacingField, Float32Array>();
+    const changed = new Map<PlacingField, Float32Array<ArrayBuffer>>();
     for (const name of PLACING_FIELDS) {
       const array = fields.get(name)!.data as Float32Array;
       if (this.sent.get(name) === array) continue;
-      changed.set(name, array);
+      changed.set(name, this.copied(array));
       this.sent.set(name, array);
     }
     const buffers = this.spare.pop() ?? [];
@@ -115,7 +116,17 @@ export class Orders {
       maxSplats: next.maxSplats,
       buffers,
     };
-    this.worker.postMessage(request, buffers);
+    this.worker.postMessage(request, [...buffers, ...[...changed.values()].map(({ buffer }) => buffer)]);
+  }
+
+  /** Copied into memory that is used over and over: fresh memory costs a page's thread more than the copy. */
+  private copied(array: Float32Array): Float32Array<ArrayBuffer> {
+    const bytes = array.byteLength;
+    const found = this.returned.findIndex(({ byteLength }) => byteLength >= bytes && byteLength <= 2 * bytes);
+    const buffer = found < 0 ? new ArrayBuffer(bytes) : this.returned.splice(found, 1)[0]!;
+    const copy = new Float32Array(buffer, 0, array.length);
+    copy.set(array);
+    return copy;
   }
 
   private answered(answer: OrderAnswer): void {
@@ -126,6 +137,7 @@ export class Orders {
       this.onError(new GlError(`The sorting worker failed: ${answer.failure}; load the stream again.`));
       return;
     }
+    this.returned = [...answer.returned, ...this.returned].slice(0, PLACING_FIELDS.length);
     if (this.arrived) this.release(this.arrived);
     this.arrived = undefined;
     if (answer.id !== this.stale) this.arrived = { ...asked, order: answer };

@@ -10,7 +10,7 @@ const FAR = 1e30;
 
 export class Sorter {
   private readonly placement = new Placement();
-  private readonly arrays = new Map<PlacingField, Float32Array>();
+  private readonly arrays = new Map<PlacingField, Float32Array<ArrayBuffer>>();
   private readonly sorter = new DepthSorter();
   private depths = new Float32Array(0);
   private candidates = new Uint32Array(0);
@@ -19,8 +19,13 @@ export class Sorter {
     const began = performance.now();
     const { placement, arrays } = this;
     const { offsetsPerAnchor, freeColumns, camera } = request;
+    const returned: ArrayBuffer[] = [];
     if (request.changed.size) {
-      for (const [name, array] of request.changed) arrays.set(name, array);
+      for (const [name, array] of request.changed) {
+        const before = arrays.get(name);
+        if (before) returned.push(before.buffer);
+        arrays.set(name, array);
+      }
       placement.set({ arrays, offsetsPerAnchor, freeColumns });
     }
     const [first, second] = request.buffers;
@@ -39,7 +44,8 @@ export class Sorter {
     const splats = this.depthsOf(camera, anchors, anchorCount, free);
     this.sorter.sort(this.depths, splats, order);
     for (let i = 0; i < splats; i++) order[i] = this.candidates[order[i]!]!;
-    return { id: request.id, anchors, anchorCount, slots: order, splats, milliseconds: performance.now() - began };
+    const milliseconds = performance.now() - began;
+    return { id: request.id, anchors, anchorCount, slots: order, splats, milliseconds, returned };
   }
 
   /** Fills `depths` and `candidates`, the slots they belong to; how many. */

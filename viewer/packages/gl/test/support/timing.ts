@@ -44,7 +44,7 @@ export async function timed(url: string, cameraName: string, path: MlpPath, repe
     show: [],
   };
   const floats = (name: "anchor_positions" | "offset_scales" | "base_scales" | "anchor_offsets" | "free") =>
-    [name, fields.get(name)!.data as Float32Array] as const;
+    [name, fields.get(name)!.data as Float32Array<ArrayBuffer>] as const;
   const changed = new Map(
     (["anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "free"] as const).map(floats),
   );
