@@ -40,7 +40,7 @@ $(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
 	touch $@ $(VENV)/.demo-ready
 
 clean:
-	rm -rf $(VENV) build dist demo viewer/node_modules viewer/packages/*/dist viewer/packages/*/*.tsbuildinfo
+	rm -rf $(VENV) build dist demo viewer/node_modules viewer/packages/*/dist viewer/packages/player/types viewer/packages/*/*.tsbuildinfo
 
 # Tables of the documents, from the results beside them.
 .PHONY: tables
