@@ -47,12 +47,11 @@ async function script(entry) {
 }
 
 const worker = await script("src/worker.ts");
-const sorter = await script("@structgstream/gl/sorter");
 const module = await build({
   ...common,
   entryPoints: ["src/main.ts"],
   format: "esm",
-  define: { STRUCTGSTREAM_WORKER: JSON.stringify(worker), STRUCTGSTREAM_SORTER: JSON.stringify(sorter) },
+  define: { STRUCTGSTREAM_WORKER: JSON.stringify(worker) },
 });
 const bundle = `// SPDX-License-Identifier: Apache-2.0\n${await shorter(module, true)}\n`;
 // In an HTML page a script ends where this stands, whatever it is part of.
@@ -61,4 +60,4 @@ const file = process.argv[2] ?? fileURLToPath(new URL("dist/player.js", import.m
 mkdirSync(dirname(file), { recursive: true });
 writeFileSync(file, bundle);
 const size = (text) => `${Buffer.byteLength(text)} bytes, ${gzipSync(text, { level: 9 }).length} with gzip`;
-console.error(`${basename(file)}: ${size(bundle)} (decoder ${size(worker)}; sorter ${size(sorter)})`);
+console.error(`${basename(file)}: ${size(bundle)} (workers ${size(worker)})`);

@@ -18,7 +18,7 @@ import type { Engine } from "./engine/engine.js";
 import type { TimeRange } from "./engine/events.js";
 import { startedPipeline } from "./pipeline.js";
 import { Player, type PlayerEvents } from "./player.js";
-import { startedSorter, workerScript } from "./scripts.js";
+import { startedWorker } from "./scripts.js";
 import type { SourceDescription } from "./source/description.js";
 import { STYLES } from "./ui/styles.js";
 import { Surface } from "./ui/surface.js";
@@ -94,6 +94,15 @@ export class StructgstreamPlayer extends HTMLElement {
 
   set playbackRate(rate: number) {
     if (this.running) this.running.player.playbackRate = rate;
+  }
+
+  get loop(): boolean {
+    return this.running?.player.loop ?? this.hasAttribute("loop");
+  }
+
+  set loop(loop: boolean) {
+    this.toggleAttribute("loop", loop);
+    this.running?.player.setLoop(loop);
   }
 
   get currentTime(): number {
@@ -185,9 +194,9 @@ export class StructgstreamPlayer extends HTMLElement {
     let player: Player;
     try {
       player = new Player({
-        renderer: new SplatRenderer(canvas, { sorter: startedSorter() }),
+        renderer: new SplatRenderer(canvas, { sorter: startedWorker("sort") }),
         quality,
-        startPipeline: () => startedPipeline(workerScript()),
+        startPipeline: startedPipeline,
         now: () => performance.now() / 1000,
       });
     } catch (error) {

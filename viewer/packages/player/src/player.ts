@@ -36,6 +36,8 @@ export class Player extends Emitter<PlayerEvents> {
   view: View | undefined;
   /** The rig's camera that the view is that of, until it moves. */
   atCamera: RigCamera | undefined;
+  /** Whether hands have moved the camera since the stream was opened. */
+  touched = false;
   /** Whether flights take no time. */
   still = false;
   /** Pictures get the exposure of the camera they are seen from: to compare with its own. */
@@ -55,6 +57,8 @@ export class Player extends Emitter<PlayerEvents> {
   private drawnCamera: Camera | undefined;
   private drawnAt: number | undefined;
   private drawnView: View | undefined;
+  /** The first frame that the renderer was given and has not drawn yet. */
+  private given: { readonly index: number; readonly at: number } | undefined;
   private hasScene = false;
 
   constructor(private readonly options: PlayerOptions) {
@@ -70,6 +74,8 @@ export class Player extends Emitter<PlayerEvents> {
     this.rig = undefined;
     this.flight = undefined;
     this.hasScene = false;
+    this.given = undefined;
+    this.touched = false;
     engine.loop = this.loop;
     engine.playbackRate = this.rate;
     for (const name of ["opening", "frame", "stall", "error", "notice", "progress", "state", "ended"] as const) {
@@ -116,6 +122,7 @@ export class Player extends Emitter<PlayerEvents> {
   /** Moves the camera by hand; flights end. */
   navigate(move: (view: View, rig: Rig) => View): void {
     if (!this.view || !this.rig) return;
+    this.touched = true;
     this.flight = undefined;
     this.landing = undefined;
     this.atCamera = undefined;
@@ -158,6 +165,7 @@ export class Player extends Emitter<PlayerEvents> {
       if (update) {
         renderer.update(update);
         this.hasScene = true;
+        this.given ??= { index: update.index, at: time };
       }
       const { camera } = this;
       if (!camera || !this.hasScene) return;
@@ -220,11 +228,15 @@ export class Player extends Emitter<PlayerEvents> {
   private measure(time: number, stats: RenderStats): void {
     const since = this.drawnAt === undefined ? undefined : time - this.drawnAt;
     this.drawnAt = time;
-    if (since !== undefined && since < PAUSE_SECONDS) {
-      this.pictureSeconds = this.pictureSeconds === undefined ? since : 0.9 * this.pictureSeconds + 0.1 * since;
-      // A stream of few frames a second is not a slow device: only what moves at the screen's pace tells.
-      if (this.view !== this.drawnView) this.options.quality.picture(since);
-    } else this.pictureSeconds = undefined;
+    const following = since !== undefined && since < PAUSE_SECONDS;
+    this.pictureSeconds = following ? 0.9 * (this.pictureSeconds ?? since) + 0.1 * since : undefined;
+    // A stream of few frames a second is not a slow device: pictures of a camera that moves should follow each other at
+    // the screen's pace, and a frame should be drawn soon after it was given; sorting takes its time elsewhere.
+    if (following && this.view !== this.drawnView) this.options.quality.picture(since);
+    else if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
+      this.options.quality.picture(Math.max(time - this.given.at - stats.sortMilliseconds / 1000, 0));
+    }
+    if (this.given && (stats.frameIndex ?? -1) >= this.given.index) this.given = undefined;
     this.drawnView = this.view;
     this.drawnStats = stats;
     this.emit("drawn", { stats });

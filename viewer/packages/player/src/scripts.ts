@@ -1,18 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The workers' scripts, which the build puts in as text (`build.mjs`). */
+/** The workers, from the script that the build puts in as text (`build.mjs`). */
+
+import type { Role } from "./worker.js";
 
 declare const STRUCTGSTREAM_WORKER: string;
-declare const STRUCTGSTREAM_SORTER: string;
 
-export function workerScript(): string {
-  return STRUCTGSTREAM_WORKER;
-}
-
-/** A worker that sorts for the renderer. */
-export function startedSorter(): Worker {
-  const url = URL.createObjectURL(new Blob([STRUCTGSTREAM_SORTER], { type: "text/javascript" }));
-  const worker = new Worker(url, { name: "structgstream sort" });
-  // The worker has been told where its script is; it is fetched whatever becomes of the address now.
+/** Starts a worker with its role; `port` goes over to it. */
+export function startedWorker(name: Role["role"], port?: MessagePort): Worker {
+  const url = URL.createObjectURL(new Blob([STRUCTGSTREAM_WORKER], { type: "text/javascript" }));
+  const worker = new Worker(url, { name: `structgstream ${name}` });
+  worker.postMessage({ role: name, port }, port ? [port] : []);
+  // The browser has been told where the script is; nobody else needs the address, but it must last until it was read.
   setTimeout(() => URL.revokeObjectURL(url), 10_000);
   return worker;
 }

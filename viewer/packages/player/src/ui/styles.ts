@@ -35,7 +35,7 @@ canvas { display: block; }
 button, select { font: inherit; color: inherit; }
 button { background: none; border: 0; border-radius: 7px; min-width: 32px; height: 32px; padding: 0 6px; display: inline-flex;
   align-items: center; justify-content: center; gap: 6px; cursor: pointer; flex: none; }
-button:hover { background: var(--hover); }
+@media (hover: hover) { button:hover, select:hover { background: var(--hover); } }
 button:disabled { opacity: .4; cursor: default; background: none; }
 button[aria-pressed="true"], button[aria-expanded="true"] { color: var(--accent); }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
@@ -49,13 +49,12 @@ button[aria-pressed="true"], button[aria-expanded="true"] { color: var(--accent)
   font-variant-numeric: tabular-nums; white-space: nowrap; pointer-events: none; }
 select { background: none; border: 1px solid transparent; border-radius: 7px; height: 32px; padding: 0 4px; cursor: pointer; }
 .bar select { width: 62px; }
-select:hover { background: var(--hover); }
 option { background: Canvas; color: CanvasText; }
 .panel { position: absolute; right: 10px; top: 10px; bottom: 80px; width: min(290px, calc(100% - 20px)); overflow: auto; padding: 10px 12px;
   overscroll-behavior: contain; height: fit-content; max-height: calc(100% - 90px); }
 .panel h2 { font-size: 12px; font-weight: 600; margin: 0 0 6px; display: flex; align-items: center; justify-content: space-between; }
 .panel h3 { font-size: 11px; font-weight: 600; margin: 12px 0 4px; color: var(--soft); }
-.panel label { display: flex; justify-content: space-between; align-items: center; gap: 8px; min-height: 32px; }
+.panel label { display: flex; justify-content: space-between; align-items: center; gap: 8px; min-height: 36px; }
 .panel label select { border-color: var(--line); }
 .list { display: grid; grid-template-columns: repeat(auto-fill, minmax(76px, 1fr)); gap: 4px; }
 .list button { border: 1px solid var(--line); height: 30px; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; display: block; }

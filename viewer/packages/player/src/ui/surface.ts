@@ -147,6 +147,7 @@ export class Surface {
     if (this.touring && !player.flying) this.nextCamera(1, TOUR_SECONDS);
     const active = now - this.movedAt < IDLE_SECONDS || this.opened !== undefined;
     this.root.classList.toggle("idle", !active && player.engine?.paused === false);
+    if (player.touched && this.playButton?.isConnected) this.notes.show();
     this.tellEdge();
   }
 
