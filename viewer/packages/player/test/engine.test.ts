@@ -338,6 +338,14 @@ describe("damage", () => {
     expect(play.errors.join()).toContain("Frames 4 to 5 are lost");
   });
 
+  test("that leaves no frame is told", async () => {
+    const file = new ServedFile(CLIP.subarray(0, PACKETS[0]!.offset + 20));
+    file.lastModified = new Date(0).toUTCString();
+    const play = opened(file);
+    await play.until(() => play.errors.length > 0);
+    expect(play.errors).toEqual(["clip.sgs has a header and no whole frame to show."]);
+  });
+
   test("of the header, another format, another version", async () => {
     const broken = CLIP.slice();
     broken[5000]! ^= 1;

@@ -28,7 +28,7 @@ async function played(bytes: Uint8Array, ranges: boolean): Promise<boolean> {
     });
     await play.until(() => {
       play.seconds += 0.02;
-      return fatal.found || play.engine.ended || (play.engine.frames.complete && play.engine.frames.count === 0);
+      return fatal.found || play.engine.ended;
     }, "end");
     return play.shown.length > 0;
   } finally {

@@ -49,6 +49,7 @@ export class Engine extends Emitter<EngineEvents> {
   private stored: readonly FrameRange[] = [];
   private fetched = 0;
   private startSeconds: number | undefined;
+  private name = "The stream";
   private serial = 0;
   private target = 0;
   /** The last frame that can be drawn or need not be waited for. */
@@ -76,6 +77,7 @@ export class Engine extends Emitter<EngineEvents> {
   /** Opens a stream and shows its frame at `startSeconds`. An engine opens one in its life. */
   load(source: SourceDescription, startSeconds = 0): void {
     this.startSeconds = startSeconds;
+    this.name = source.name;
     const budgetBytes = this.options.budgetBytes ?? BUDGET_BYTES;
     this.pipeline.send({ type: "open", source, fromStart: startSeconds <= 0, budgetBytes });
   }
@@ -323,6 +325,8 @@ export class Engine extends Emitter<EngineEvents> {
     this.edge.frames(facts.ptsSeconds.length, this.now());
     this.startIfThere();
     this.tellProgress();
+    if (facts.complete && !this.timeline.count)
+      this.fail(`${this.name} has a header and no whole frame to show.`, true);
   }
 
   private hearWaiting(seconds: number, problem: string | undefined): void {

@@ -179,8 +179,8 @@ export class Surface {
       if (file) this.options.open({ kind: "blob", blob: file, name: file.name });
     });
     player.on("opening", ({ loadedBytes, totalBytes }) => {
-      const of = totalBytes === undefined ? "" : ` of ${bytesText(totalBytes)}`;
-      this.notes.loading(loadedBytes, totalBytes, `${bytesText(loadedBytes)}${of}`);
+      const rest = totalBytes === undefined ? "; more is awaited" : ` of ${bytesText(totalBytes)}`;
+      this.notes.loading(loadedBytes, totalBytes, `${bytesText(loadedBytes)}${rest}`);
     });
     player.on("header", () => {
       if (!player.rig) return;
