@@ -153,7 +153,7 @@ describe.skipIf(!executable)("the player in a browser", () => {
     await shows(page, 0);
     // Throttling a page leaves its workers alone: each is a target of its own.
     const client = await page.context().newCDPSession(page);
-    const slow = { offline: false, latency: 200, downloadThroughput: 6000, uploadThroughput: 6000 };
+    const slow = { offline: false, latency: 200, downloadThroughput: 3000, uploadThroughput: 6000 };
     const throttled: Promise<unknown>[] = [];
     client.on("Target.attachedToTarget", ({ sessionId }) => {
       for (const [id, method, params] of [
