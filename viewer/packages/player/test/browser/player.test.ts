@@ -137,6 +137,7 @@ describe.skipIf(!executable)("the player in a browser", () => {
     expectQuiet();
   });
 
+  // The server is what is slow: Chromium refuses to throttle what workers fetch ("Not supported").
   test("waits on a slow network, and goes on", async () => {
     stage.server.put("/clip.sgs", CLIP, { bytesPerSecond: 20_000 });
     const page = await open('src="clip.sgs" autoplay');
@@ -144,34 +145,6 @@ describe.skipIf(!executable)("the player in a browser", () => {
     await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 40_000 });
     await shows(page, LAST);
     expect(await ask(page, (_, events) => events.filter(([name]) => name === "stall").length)).toBeGreaterThan(0);
-    expect(await told(page)).toEqual([]);
-    expectQuiet();
-  });
-
-  test("waits on a throttled connection, as developer tools make one", async () => {
-    const page = await open();
-    await shows(page, 0);
-    // Throttling a page leaves its workers alone: each is a target of its own.
-    const client = await page.context().newCDPSession(page);
-    const slow = { offline: false, latency: 200, downloadThroughput: 3000, uploadThroughput: 6000 };
-    const throttled: Promise<unknown>[] = [];
-    client.on("Target.attachedToTarget", ({ sessionId }) => {
-      for (const [id, method, params] of [
-        [1, "Network.enable", {}],
-        [2, "Network.emulateNetworkConditions", slow],
-      ] as const) {
-        const message = JSON.stringify({ id, method, params });
-        throttled.push(client.send("Target.sendMessageToTarget", { sessionId, message }));
-      }
-    });
-    await client.send("Target.setAutoAttach", { autoAttach: true, waitForDebuggerOnStart: false, flatten: false });
-    await expect.poll(() => throttled.length).toBeGreaterThan(3);
-    await Promise.all(throttled);
-    const start = Date.now();
-    await ask(page, (player) => player.play());
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
-    await shows(page, LAST);
-    expect(Date.now() - start).toBeGreaterThan(1800);
     expect(await told(page)).toEqual([]);
     expectQuiet();
   });
