@@ -5,6 +5,7 @@ import { expect, test } from "vitest";
 import { mlpLayout, packedWeights, paddedRows } from "../src/gpu/weights.ts";
 import { shapeOf } from "../src/scene.ts";
 import { splatRanges } from "../src/shaders/mlp.ts";
+import { cornerIndices, INDICES_PER_SPLAT, SPLATS_PER_CALL } from "../src/shaders/splat.ts";
 import { halfFloat } from "./support/halfFloat.ts";
 
 const [D, R, K, H] = [5, 2, 2, 6];
@@ -85,6 +86,15 @@ test("Gaussians of an anchor are shared out over as many passes as it takes", ()
     { first: 4, count: 3 },
   ]);
   expect(splatRanges(3, 5)).toEqual([{ first: 0, count: 3 }]);
+});
+
+test("no corner of a splat has the index that begins a new primitive", () => {
+  const indices = cornerIndices();
+  expect(indices.length).toBe(INDICES_PER_SPLAT * SPLATS_PER_CALL);
+  expect(indices.includes(0xffff)).toBe(false);
+  expect([...indices.slice(-INDICES_PER_SPLAT)].map((index) => index - 4 * (SPLATS_PER_CALL - 1))).toEqual([
+    0, 1, 2, 2, 1, 3,
+  ]);
 });
 
 test.each([

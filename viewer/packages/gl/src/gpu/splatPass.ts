@@ -1,15 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Splats blended from far to near into a texture of their own. */
 
-import { SPLATS_PER_CALL, splatProgram } from "../shaders/splat.js";
+import { cornerIndices, INDICES_PER_SPLAT, SPLATS_PER_CALL, splatProgram } from "../shaders/splat.js";
 import { bindTextures } from "./binding.js";
 import type { Device } from "./device.js";
 import type { ProjectionPass } from "./projectionPass.js";
 import type { Program, Resources } from "./resources.js";
 import type { SceneTextures } from "./sceneTextures.js";
 import { plainTexture } from "./table.js";
-
-const CORNERS = [0, 1, 2, 2, 1, 3];
 
 export class SplatPass {
   /** What was blended: colours times coverage, and coverage. */
@@ -28,14 +26,10 @@ export class SplatPass {
     this.program = resources.program(splatProgram());
     this.framebuffer = resources.framebuffer();
     // Instances would say the same in less memory, and are several times slower where the GPU is software.
-    const indices = new Uint16Array(CORNERS.length * SPLATS_PER_CALL);
-    for (let i = 0; i < indices.length; i++) {
-      indices[i] = 4 * Math.floor(i / CORNERS.length) + CORNERS[i % CORNERS.length]!;
-    }
     this.corners = resources.vertexArray();
     gl.bindVertexArray(this.corners);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, resources.buffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornerIndices(), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
   }
 
@@ -61,7 +55,7 @@ export class SplatPass {
       for (let start = 0; start < scene.splats; start += SPLATS_PER_CALL) {
         gl.uniform1i(program.at("start"), start);
         const count = Math.min(SPLATS_PER_CALL, scene.splats - start);
-        gl.drawElements(gl.TRIANGLES, CORNERS.length * count, gl.UNSIGNED_SHORT, 0);
+        gl.drawElements(gl.TRIANGLES, INDICES_PER_SPLAT * count, gl.UNSIGNED_SHORT, 0);
       }
       gl.bindVertexArray(null);
       gl.disable(gl.BLEND);

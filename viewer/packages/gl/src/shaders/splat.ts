@@ -5,8 +5,19 @@ import type { ProgramSource } from "../gpu/resources.js";
 import { TABLE_GLSL } from "../gpu/table.js";
 import { RULES_GLSL } from "./projection.js";
 
-/** Vertices of one draw call: what 16-bit indices reach. */
-export const SPLATS_PER_CALL = 16384;
+/** What 16-bit indices reach: the largest of them, 65535, is no vertex but begins a new primitive. */
+export const SPLATS_PER_CALL = 16383;
+const CORNERS = [0, 1, 2, 2, 1, 3];
+export const INDICES_PER_SPLAT = CORNERS.length;
+
+/** Two triangles for each splat of one draw call. */
+export function cornerIndices(): Uint16Array {
+  const splat = (i: number) => Math.floor(i / INDICES_PER_SPLAT);
+  return Uint16Array.from(
+    { length: INDICES_PER_SPLAT * SPLATS_PER_CALL },
+    (_, i) => 4 * splat(i) + CORNERS[i % INDICES_PER_SPLAT]!,
+  );
+}
 
 /** The picture's top row is the target's first. */
 export function splatProgram(): ProgramSource {
@@ -36,7 +47,8 @@ void main() {
   // The rectangle along the ellipse's axes, where alpha falls to MIN_ALPHA, and a little more for roundings.
   float middle = 0.5 * (xx + yy), apart = length(vec2(0.5 * (xx - yy), xy));
   float large = middle + apart, small = max(middle - apart, 0.0);
-  vec2 along = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
+  vec2 along = xx >= yy ? vec2(large - yy, xy) : vec2(xy, large - xx);
+  along = apart > 1e-6 * large ? normalize(along) : vec2(1.0, 0.0);
   float reach = 2.0 * max(log(opacity / MIN_ALPHA), 0.0);
   vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   vec2 from = corner.x * (sqrt(reach * large) + 0.02) * along + corner.y * (sqrt(reach * small) + 0.02) * vec2(-along.y, along.x);

@@ -134,7 +134,7 @@ export async function played(play: Play, camera: Camera, repeats: number): Promi
       began = performance.now();
       const stats = play.renderer.render({ ...camera, viewmat });
       spent += performance.now() - began;
-      if (stats.drawn) seen.add(stats.frameIndex);
+      if (stats.drawn && stats.frameIndex !== undefined) seen.add(stats.frameIndex);
       if (stats.settled) break;
       await new Promise<void>((resolve) => {
         play.renderer.onOrder = resolve;
