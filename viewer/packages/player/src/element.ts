@@ -153,6 +153,11 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.running?.player.stats;
   }
 
+  /** What decoding a packet took in its worker, on the way to the last frame. */
+  get decodeMilliseconds(): number {
+    return this.engine?.decodeMilliseconds ?? 0;
+  }
+
   /** What the renderer holds. */
   get resources(): ResourceCounts | undefined {
     return this.running?.player.resources;
