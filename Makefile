@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check viewer-test clean
+.PHONY: demo test check viewer-test player clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
@@ -21,6 +21,10 @@ check: $(VENV)/.test-ready
 viewer-test:
 	scripts/viewer-test
 
+# The player that comes with the package, from viewer/packages; commit what changes.
+player:
+	scripts/build-player
+
 # A plain (not editable) install: what is tested is what a user gets. Sources are listed so that a change reinstalls.
 SOURCES := pyproject.toml CMakeLists.txt $(shell find csrc src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
 
@@ -36,7 +40,7 @@ $(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
 	touch $@ $(VENV)/.demo-ready
 
 clean:
-	rm -rf $(VENV) build dist demo viewer/node_modules viewer/packages/*/dist viewer/packages/*/*.tsbuildinfo
+	rm -rf $(VENV) build dist demo viewer/node_modules viewer/packages/*/dist viewer/packages/player/types viewer/packages/*/*.tsbuildinfo
 
 # Tables of the documents, from the results beside them.
 .PHONY: tables

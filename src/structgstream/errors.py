@@ -10,6 +10,7 @@
     |-- StorageError            the stream cannot be written (disk full, no permission)
     |-- BackendError            a compute back-end is not available on this machine
     |-- ConfigError             an option has a value that cannot work
+    |-- PlayerError             the player cannot be served, or does not fit in a page
     |-- ExperimentError         a step of a sweep failed; the others are done
     `-- MissingExtraError       an optional dependency is not installed
 
@@ -44,6 +45,10 @@ class BackendError(StructGStreamError):
 
 class ConfigError(StructGStreamError):
     """A configuration value cannot work."""
+
+
+class PlayerError(StructGStreamError):
+    """The player cannot be served here, or a stream does not fit in a page."""
 
 
 class ExperimentError(StructGStreamError):

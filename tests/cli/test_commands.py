@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every command on a tiny stream of the bundled clip, and what they say when something is wrong."""
 
+import base64
 import json
 import math
 import re
@@ -181,10 +182,13 @@ def test_demo_leaves_everything_to_look_at(
     assert main(["demo", "--output", str(out), "--frames", "2", "--scale", "0.25", *QUICK]) == 0
     made = {str(entry.relative_to(out)) for entry in out.rglob("*") if entry.is_file()}
     report = {"report/report.json", "report/over_time.png", "report/contact_sheet.png"}
-    assert made == {"clip.sgs", "clip.log.jsonl", "held-out.mp4", "orbit.mp4"} | report
+    assert made == {"clip.sgs", "clip.log.jsonl", "held-out.mp4", "orbit.mp4", "player.html"} | report
     text = capsys.readouterr().out
     assert re.search(r"Held-out PSNR [\d.]+ dB \([\d.]+ after frame 0's colour fit\)", text)
     assert all(name.split("/")[-1] in text for name in made - {"clip.log.jsonl"})
+    assert (out / "player.html").as_uri() in text
+    assert f"structgstream play {out / 'clip.sgs'} --capture {CLIP}" in text
+    assert base64.b64encode((out / "clip.sgs").read_bytes()) in (out / "player.html").read_bytes()
 
 
 def test_a_rig_that_is_not_the_papers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

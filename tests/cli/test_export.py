@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command ``export``: which files it writes, in which units, and what it says to wrong requests."""
 
+import base64
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +105,11 @@ def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
         (["-o", "x.ply", "--frame", "0", "--frames", "0", "1"], "give one of them"),
         (["-o", "x.ply", "--frame", "0", "--format", "spz"], "asks for .ply, and --format for spz"),
         (["-o", "x.splat", "--frame", "0", "--sh-degree", "1"], "one colour"),
+        (["-o", "x.html", "--frame", "0"], "a page holds the whole stream"),
+        (["-o", "x", "--format", "site", "--sh-degree", "0"], "a page holds the whole stream"),
+        (["-o", "x", "--format", "html"], "a file whose name ends in .html, unlike x"),
+        (["-o", "x.ply", "--format", "html"], "a file whose name ends in .html, unlike x.ply"),
+        (["-o", "x.html", "--format", "ply"], "asks for .html, and --format for ply"),
         (["-o", "x.ply", "--frame", "0", "--sh-degree", "3"], "not one of 0 to 2"),
     ],
 )
@@ -118,6 +124,31 @@ def test_wrong_requests(
     monkeypatch.chdir(tmp_path)
     assert words in error_of([str(stream), *arguments], capsys, status=2)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_page_with_a_player(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "ball.html"
+    assert main(["export", str(stream), "-o", str(page)]) == 0
+    said = capsys.readouterr().out
+    assert f"Wrote {page}" in said
+    assert page.as_uri() in said
+    text = page.read_text()
+    assert base64.b64encode(stream.read_bytes()).decode() in text
+    assert "<structgstream-player" in text
+    copy = tmp_path / "copy.sgs"
+    copy.write_bytes(stream.read_bytes())
+    assert main(["export", str(copy), "--format", "html"]) == 0
+    assert (tmp_path / "copy.html").read_text() == text.replace("<title>small<", "<title>copy<")
+
+
+def test_a_folder_for_a_web_server(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(stream), "-o", str(tmp_path / "on.line"), "--format", "site"]) == 0
+    assert "put the folder on any web server" in capsys.readouterr().out
+    assert (tmp_path / "on.line" / "stream.sgs").read_bytes() == stream.read_bytes()
+    copy = tmp_path / "copy.sgs"
+    copy.write_bytes(stream.read_bytes())
+    assert main(["export", str(copy), "--format", "site"]) == 0
+    assert (tmp_path / "copy-site" / "index.html").is_file()
 
 
 def test_of_a_damaged_stream_what_can_be_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,8 +17,9 @@ COMMANDS = {
     "demo": "reconstruct the bundled clip and show everything there is to see",
     "reconstruct": "turn a capture into a stream, frame by frame",
     "evaluate": "score a stream against the cameras that training did not see",
+    "play": "show a stream in the browser, from any angle",
     "render": "render a camera or a camera path to mp4 or PNG",
-    "export": "write frames as plain 3D Gaussians: .ply, .splat or .spz",
+    "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .splat, .spz",
     "inspect": "show what a stream file holds",
     "ablate": "run the paper's ablations on a capture, ours beside the paper's figures",
     "compare": "run several methods on a capture and score their files alike",
@@ -99,6 +100,7 @@ options:
 examples:
   structgstream demo
   structgstream reconstruct basketball -o ball.sgs --held-out 0 10 15 30
+  structgstream play ball.sgs --capture basketball
   structgstream evaluate ball.sgs basketball --report ball-report
   structgstream render ball.sgs --path orbit -o ball.mp4"""
 

@@ -18,7 +18,8 @@ SLOWED = 0.2  # twelve frames would be over in 0.4 s
 
 @dataclass(frozen=True)
 class Demo:
-    """Reconstructs the bundled clip, scores it, and writes pictures and a video: minutes on two processor cores.
+    """Reconstructs the bundled clip, scores it, and writes pictures, videos and a page that plays it from any angle:
+    minutes on two processor cores.
 
     Example: structgstream demo --output demo
     """
@@ -49,6 +50,8 @@ def main(arguments: list[str]) -> None:
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
     from structgstream.kernels.backend import select_backend
+    from structgstream.player.stream_file import StreamFile
+    from structgstream.player.write import write_page
     from structgstream.presets import DEMO_PRESET
 
     began = time.perf_counter()
@@ -82,6 +85,8 @@ def main(arguments: list[str]) -> None:
     pairs = compared_frames(reader, source, backend=backend, camera=camera)
     write_pictures(held_out, (side_by_side(*pair) for pair in pairs), fps=source.fps * SLOWED)
     write_pictures(orbit, path_pictures(reader, backend, path="orbit", camera=camera), fps=source.fps)
+    player = options.output / "player.html"
+    write_page(player, StreamFile(stream))
     console.print(report_tables(report, title="bundled clip, held-out camera"))
     console.print()
     places = {
@@ -98,4 +103,11 @@ def main(arguments: list[str]) -> None:
         f"\nHeld-out PSNR {quality(report)} over {len(report.frames)} frames, "
         f"everything in {time.perf_counter() - began:.0f} s.",
         highlight=False,
+    )
+    console.print(
+        f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
+        f"or, beside what the cameras took: structgstream play {stream} --capture {bundled_clip_path()}",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
     )

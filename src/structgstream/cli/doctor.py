@@ -18,6 +18,9 @@ OPTIONAL = (
     ("cv2", "opencv-python-headless", "capture", "read pictures, initial points"),
     ("scipy", "scipy", "capture", "initial points"),
     ("matplotlib", "matplotlib", "report", "plots, contact sheets"),
+    ("starlette", "starlette", "serve", "command play"),
+    ("uvicorn", "uvicorn", "serve", "command play"),
+    ("anywidget", "anywidget", "notebook", "player in notebooks"),
     ("gsplat", "gsplat", "cuda", "back-end cuda"),
 )
 

@@ -12,6 +12,7 @@ from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, pars
 from structgstream.cli.tables import quality, report_tables
 
 if TYPE_CHECKING:
+    from structgstream.codec.packets import StreamHeader
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
     from structgstream.evaluation.instruments import Selection
@@ -58,7 +59,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream)
-    source = capture_of(reader, options.scene)
+    source = capture_of(reader.header, options.scene, frames=len(reader.packets))
     report = scored(
         reader,
         source,
@@ -77,17 +78,22 @@ def main(arguments: list[str]) -> None:
         console.print(f"Report: {options.report}", highlight=False, markup=False, soft_wrap=True)
 
 
-def capture_of(reader: "StreamReader", scene: Path) -> "FrameSource":
-    """The part of the capture in folder ``scene`` that the stream was made from, at the stream's sizes."""
+def capture_of(header: "StreamHeader", scene: Path, *, frames: int | None) -> "FrameSource":
+    """The part of the capture in folder ``scene`` that a stream was made from, at the stream's sizes.
+
+    Args:
+        header: the stream's.
+        scene: the capture's folder.
+        frames: how many the stream has; None for all that the capture has from its first on.
+    """
     from structgstream.data.open import open_capture
 
-    header = reader.header
     start = int(header.metadata.get("start", 0))
-    frames = len(reader.packets)
     whole = open_capture(scene, start=start)
     shared = [name for name in header.rig if name in whole.rig.cameras]
     scale = header.rig[shared[0]].width / whole.rig[shared[0]].width if shared else 1.0
-    return open_capture(scene, start=start, frames=min(frames, len(whole)), scale=min(scale, 1.0))
+    wanted = len(whole) if frames is None else min(frames, len(whole))
+    return open_capture(scene, start=start, frames=wanted, scale=min(scale, 1.0))
 
 
 def scored(

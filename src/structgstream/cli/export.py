@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, StreamFile, parsed
 from structgstream.cli.progress import human_bytes
-from structgstream.export.formats import FORMATS, Format
+from structgstream.export.formats import FORMATS, PAGES, Format, PageFormat
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -20,11 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Export:
-    """Writes frames as plain 3D Gaussians for other programs: .ply, .splat or .spz.
+    """Writes the stream as a page with a player, or frames as plain 3D Gaussians for other programs.
 
-    What depends on the camera is averaged over the training cameras; colours are spherical harmonics fitted to what
-    they see. Units and axes are the capture's own (.spz: y up, z back). OUT.ply, OUT.splat or OUT.spz gives one frame,
-    any other name a folder of frame_000000.ply and so on. What is lost: docs/export.md.
+    OUT.html is one page that opens from a disk and plays the whole stream from any angle. --format site gives a folder
+    for any web server, from which a viewer fetches only what is played.
+
+    OUT.ply, OUT.splat or OUT.spz is one frame for other programs, any other name a folder of frame_000000.ply and so
+    on. What depends on the camera is averaged over the training cameras; colours are spherical harmonics fitted to what
+    they see. Units and axes are the capture's own (.spz: y up, z back). What is lost: docs/export.md.
+
+    Example: structgstream export ball.sgs -o ball.html
 
     Example: structgstream export ball.sgs --frame 5 -o ball.ply
 
@@ -35,7 +40,7 @@ class Export:
     """The stream file."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """Where to write. Default: a file (with --frame) or a folder beside the stream."""
-    format: Annotated[Format | None, tyro.conf.arg(help_behavior_hint="")] = None
+    format: Annotated[Format | PageFormat | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Format of the files. Default: what the name of OUT says, else ply."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """This frame only."""
@@ -53,6 +58,9 @@ def main(arguments: list[str]) -> None:
     if options.frame is not None and options.frames is not None:
         raise UsageError("--frame names one frame, --frames the first and the last; give one of them.")
     output, format = destination(options)
+    if format == "html" or format == "site":
+        _export_page(options, output, format)
+        return
     degree = checked_degree(options.sh_degree, format)
     from structgstream.codec.reader import open_stream
     from structgstream.export.bake import Baking, baked
@@ -95,7 +103,24 @@ def main(arguments: list[str]) -> None:
         console.print(f"The stream is damaged: {reader.cut_reason}.", highlight=False, markup=False, soft_wrap=True)
 
 
-def destination(options: Export) -> tuple[Path, Format]:
+def _export_page(options: Export, output: Path, format: PageFormat) -> None:
+    if options.frame is not None or options.frames is not None or options.sh_degree is not None:
+        raise UsageError("a page holds the whole stream; --frame, --frames and --sh-degree are for other formats.")
+    from structgstream.player.stream_file import StreamFile
+    from structgstream.player.write import write_page, write_site
+
+    stream = StreamFile(options.stream)
+    if format == "html":
+        size_bytes = write_page(output, stream)
+        then = f"open it in a browser: {output.resolve().as_uri()}"
+    else:
+        size_bytes = write_site(output, stream)
+        then = "put the folder on any web server"
+    text = f"Wrote {output}, {human_bytes(size_bytes)}; {then}"
+    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def destination(options: Export) -> tuple[Path, Format | PageFormat]:
     """Where to write and in which format.
 
     Raises:
@@ -105,20 +130,23 @@ def destination(options: Export) -> tuple[Path, Format]:
     if options.output is None:
         format = format or "ply"
         stem = options.stream.stem
+        if format == "html":
+            return options.stream.with_suffix(".html"), format
         name = f"{stem}-{format}" if options.frame is None else f"{stem}-{options.frame}.{format}"
         return options.stream.with_name(name), format
     ending = options.output.suffix.lower().lstrip(".")
-    if options.output.is_dir() or not ending:
+    if format == "html" and (options.output.is_dir() or ending != "html"):
+        raise UsageError(f"a page is a file whose name ends in .html, unlike {options.output.name}.")
+    if format == "site" or options.output.is_dir() or not ending:
         return options.output, format or "ply"
-    for known in FORMATS:
+    for known in (*FORMATS, "html"):
         if ending == known:
             if format not in (None, known):
                 raise UsageError(f"the name {options.output.name} asks for .{ending}, and --format for {format}.")
             return options.output, known
     if format is None:
-        raise UsageError(
-            f"there is no format .{ending}; there are {', '.join(FORMATS)}. For a folder of this name add --format."
-        )
+        known = ", ".join((*FORMATS, *PAGES))
+        raise UsageError(f"there is no format .{ending}; there are {known}. For a folder of this name add --format.")
     return options.output, format
 
 

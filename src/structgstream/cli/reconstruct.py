@@ -36,9 +36,9 @@ MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 class Reconstruct:
     """Turns a capture into a stream, one frame after the other.
 
-    The file can be read while it grows. Ctrl-C keeps the frames that are done; --resume goes on after them. Seconds by
-    stage and memory of each frame go to OUT.log.jsonl. Any field of the configuration is an option by its path:
-    --online.iterations 50 (see --help-config).
+    The file can be read while it grows: structgstream play OUT.sgs --wait shows each frame as it comes. Ctrl-C keeps
+    the frames that are done; --resume goes on after them. Seconds by stage and memory of each frame go to
+    OUT.log.jsonl. Any field of the configuration is an option by its path: --online.iterations 50 (see --help-config).
 
     Example: structgstream reconstruct basketball -o ball.sgs --frames 20 --held-out 0 10 15 30
 

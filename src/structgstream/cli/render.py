@@ -162,7 +162,9 @@ def compared_pictures(
 
     camera = chosen_camera(reader, options.camera)
     _check_frame(reader, options.frame)
-    pairs = compared_frames(reader, capture_of(reader, scene), backend=backend, camera=camera)
+    pairs = compared_frames(
+        reader, capture_of(reader.header, scene, frames=len(reader.packets)), backend=backend, camera=camera
+    )
     for number, (truth, picture) in enumerate(pairs):
         if options.frame is None or number == options.frame:
             yield side_by_side(truth, picture)

@@ -6,12 +6,20 @@ from array import array
 from collections.abc import Iterable
 
 from structgstream.codec.decoder import FRAME
-from structgstream.codec.records import CHECKSUM, RECORD, RecordType, head_at, packed, record_at
+from structgstream.codec.records import (
+    CHECKSUM,
+    FOOTER,
+    FOOTER_MAGIC,
+    RECORD,
+    RecordType,
+    footer_offset,
+    head_at,
+    packed,
+    record_at,
+)
 from structgstream.codec.stored import Stored
 
 INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
-FOOTER = struct.Struct("<Q8s")
-FOOTER_MAGIC = b"SGSINDEX"
 
 
 def packed_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
@@ -25,14 +33,11 @@ def indexed_offsets(data: Stored, start: int) -> "array[int] | None":
 
     That is when footer or index is not intact, or they are not what the heads of the records say, one after another.
     """
-    at = len(data) - FOOTER.size
-    if at < start:
-        return None
-    end, magic = FOOTER.unpack(data[at:])
-    if magic != FOOTER_MAGIC or not start <= end < at:
+    end = footer_offset(data)
+    if end is None or end < start:
         return None
     index = record_at(data, end)
-    if index is None or index.type != RecordType.INDEX or index.end != at or len(index.payload) % INDEX_ENTRY.size:
+    if index is None or len(index.payload) % INDEX_ENTRY.size:
         return None
     found = _by_heads(data, start, end)
     if found is None or found != index.payload:

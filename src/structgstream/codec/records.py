@@ -19,6 +19,8 @@ MAJOR, MINOR = 2, 0
 PREFIX = struct.Struct("<8sHH")
 RECORD = struct.Struct("<BBHI")
 CHECKSUM = struct.Struct("<I")
+FOOTER = struct.Struct("<Q8s")
+FOOTER_MAGIC = b"SGSINDEX"
 MAX_RECORD_BYTES = 2**32 - 1
 
 
@@ -101,6 +103,23 @@ def record_at(data: Stored, offset: int) -> Record | None:
     if bytes(data[end : end + CHECKSUM.size]) != checksum:
         return None
     return Record(head[0], payload, offset)
+
+
+def footer_offset(data: Stored) -> int | None:
+    """Where the index record begins that a stream ends with; None while the stream is still being written, or is cut.
+
+    Only the footer and the head of the index are looked at, which is what a server that follows a file can afford.
+    """
+    at = len(data) - FOOTER.size
+    if at < PREFIX.size:
+        return None
+    offset, magic = FOOTER.unpack(data[at:])
+    if magic != FOOTER_MAGIC or not PREFIX.size <= offset < at:
+        return None
+    head = head_at(data, offset)
+    if head is None or head[0] != RecordType.INDEX or offset + RECORD.size + head[1] + CHECKSUM.size != at:
+        return None
+    return offset
 
 
 def why_stopped(data: Stored, offset: int) -> str:

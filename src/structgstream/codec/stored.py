@@ -65,6 +65,12 @@ class StoredFile:
             count -= len(piece)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
+    def __enter__(self) -> "StoredFile":
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Closes the file. A second call does nothing."""
         self._finalizer()

@@ -5,3 +5,8 @@ from typing import Literal, get_args
 
 Format = Literal["ply", "splat", "spz"]
 FORMATS: tuple[Format, ...] = get_args(Format)
+"""Frames as plain 3D Gaussians."""
+
+PageFormat = Literal["html", "site"]
+PAGES: tuple[PageFormat, ...] = get_args(PageFormat)
+"""The whole stream with a player: in one page, or in a folder for a web server."""

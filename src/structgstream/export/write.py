@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Baked Gaussians of a stream's frames as files that others open."""
 
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from structgstream.errors import StorageError
 from structgstream.export.baked import BakedGaussians
 from structgstream.export.formats import Format
 from structgstream.export.ply import ply_bytes
 from structgstream.export.splat import splat_bytes
 from structgstream.export.spz import spz_bytes
+from structgstream.export.whole_file import write_whole
 
 FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
     "ply": ply_bytes,
@@ -37,19 +36,5 @@ def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) ->
         StorageError: the file cannot be written.
     """
     data = FORMAT_BYTES[format](gaussians)
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with partial.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(path)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        reason = f"{path.parent} is a file" if path.parent.is_file() else error.strerror
-        raise StorageError(f"{path} cannot be written ({reason}).") from None
+    write_whole(path, [data])
     return len(data)

@@ -62,12 +62,12 @@ export class CompactDecoder {
   }
 
   /**
-   * The dynamic fields of a frame.
+   * Takes a packet in, after which {@link values} are those of its frame.
    *
    * @throws StreamError the packet is damaged, or does not follow the one before it
    */
-  decode(fields: ReadonlyMap<FieldName, Uint8Array>, isKey: boolean, index: number): Map<FieldName, Tensor> {
-    const { dynamic, steps } = this.header;
+  advance(fields: ReadonlyMap<FieldName, Uint8Array>, isKey: boolean, index: number): void {
+    const { dynamic } = this.header;
     const where = `Packet ${index}`;
     const start = isKey ? { bins: this.reference, models: undefined } : this.state;
     if (start === undefined || (!isKey && this.state?.index !== index - 1)) {
@@ -79,6 +79,10 @@ export class CompactDecoder {
     decoder.end();
     // What a key packet changes is everything since the reference, and tells nothing of what comes next.
     this.state = { index, bins: isKey ? unmoved(bins) : bins, models };
-    return valued(bins, dynamic, steps);
+  }
+
+  /** The dynamic fields of the frame that the last packet made; {@link advance} must have been called. */
+  values(): Map<FieldName, Tensor> {
+    return valued(this.state!.bins, this.header.dynamic, this.header.steps);
   }
 }

@@ -82,15 +82,26 @@ export class SceneDecoder {
    */
   decode(packet: Packet): Frame {
     const { header, compact } = this;
-    const { payload, isKey, index, ptsSeconds } = packet;
+    const { index, ptsSeconds } = packet;
     const where = `Packet ${index}`;
-    const decoded = compact ? codedFields(payload, FRAME_BYTES, where) : unpackedBlocks(payload, FRAME_BYTES, where);
-    checkNames([...decoded.keys()], header, where);
-    const dynamic = compact ? compact.decode(decoded as Map<FieldName, Uint8Array>, isKey, index) : (decoded as Fields);
+    this.advance(packet);
+    const dynamic = compact ? compact.values() : unpackedBlocks(packet.payload, FRAME_BYTES, where);
     const fields = mergedFields(header.static, dynamic);
     const facts = { distanceInput: header.distanceInput, trainingCameras: trainingCameras(header) };
     checkShapes(fields, facts, where);
     return { index, ptsSeconds, fields };
+  }
+
+  /**
+   * Takes a packet in on the way to a later frame, without making numbers of it.
+   *
+   * @throws StreamError as {@link decode}
+   */
+  advance({ payload, isKey, index }: Packet): void {
+    const where = `Packet ${index}`;
+    const names = blocksIn(payload, FRAME_BYTES, where).map((block) => block.name);
+    checkNames(names, this.header, where);
+    this.compact?.advance(codedFields(payload, FRAME_BYTES, where), isKey, index);
   }
 }
 
@@ -101,4 +112,14 @@ function checkNames(names: FieldName[], header: StreamHeader, where: string): vo
         `the header announces ${[...header.dynamic].sort().join(", ") || "none"}.`,
     );
   }
+}
+
+/**
+ * What each field of a packet takes, heads of blocks included.
+ *
+ * @throws StreamError the payload contradicts the format
+ */
+export function fieldBytes({ payload, index }: Packet): Map<FieldName, number> {
+  const blocks = blocksIn(payload, FRAME_BYTES, `Packet ${index}`);
+  return new Map(blocks.map(({ name, start, end }) => [name, end - start]));
 }

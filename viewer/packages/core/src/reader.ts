@@ -130,7 +130,8 @@ export class StreamReader {
    * @throws StreamError there is no such frame, it was forgotten, or it is lost or damaged
    */
   frame(index: number): Frame {
-    if (!this.decoder || !this.shown[index]) throw this.missing(index);
+    if (!this.found || !this.shown[index]) throw this.missing(index);
+    this.decoder ??= new SceneDecoder(this.found);
     const first = this.decoded === index - 1 ? index : this.groupStart(index);
     this.decoded = undefined; // until a packet has been decoded
     for (let i = first; i < index; i++) this.decoder.decode(this.packet(i));
@@ -150,6 +151,18 @@ export class StreamReader {
   forget(index: number): void {
     const end = this.groupStart(Math.min(index, this.infos.length - 1));
     for (; this.kept < end; this.kept++) this.payloads[this.kept] = undefined;
+  }
+
+  /**
+   * The packet of one frame, which the reader then lets go of: for who keeps packets himself, in as many bytes as he
+   * wants.
+   *
+   * @throws StreamError there is no such packet, or it was let go of before
+   */
+  take(index: number): Packet {
+    const packet = this.packet(index);
+    this.payloads[index] = undefined;
+    return packet;
   }
 
   private missing(index: number): StreamError {
@@ -244,9 +257,7 @@ export class StreamReader {
       if (record.type !== RecordType.init) {
         throw new StreamError(`${this.name} begins with a record of type ${record.type}; expected an init record.`);
       }
-      const header = unpackedHeader(record.payload);
-      this.decoder = new SceneDecoder(header);
-      this.found = header;
+      this.found = unpackedHeader(record.payload);
     } else if (record.type === RecordType.init) {
       throw new StreamError(`${this.name} has a second init record, at byte ${record.offset}.`);
     } else if (record.type === RecordType.index) {

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The player in a notebook: ``structgstream.notebook.Player("ball.sgs")`` as the last line of a cell.
+
+Needs the extra ``notebook``. The stream travels with the widget, so a notebook that is saved with its widgets' state
+plays on without Python.
+"""
+
+from pathlib import Path
+
+from structgstream.errors import MissingExtraError
+from structgstream.player.bundle import bundle
+from structgstream.player.stream_file import StreamFile, check_begun
+
+try:
+    import anywidget
+    import traitlets
+except ModuleNotFoundError as error:
+    raise MissingExtraError(error.name or "anywidget", "notebook") from None
+
+# What stands behind the bundle, which defines the element: how a notebook shows one, and takes it away. A player opens
+# streams while it is in a page, and a notebook may put what is rendered there later.
+_WIDGET = """
+export default {
+  render({ model, el }) {
+    const player = document.createElement("structgstream-player");
+    player.toggleAttribute("isolated", true);
+    player.toggleAttribute("loop", true);
+    let waiting;
+    const load = () => {
+      cancelAnimationFrame(waiting);
+      if (player.isConnected) player.load(new Blob([model.get("stream")]));
+      else waiting = requestAnimationFrame(load);
+    };
+    const resize = () => {
+      player.style.cssText = `width: 100%; height: ${model.get("height_pixels")}px`;
+    };
+    resize();
+    load();
+    model.on("change:stream", load);
+    model.on("change:height_pixels", resize);
+    el.append(player);
+    return () => {
+      cancelAnimationFrame(waiting);
+      model.off("change:stream", load);
+      model.off("change:height_pixels", resize);
+      player.remove();
+    };
+  },
+};
+"""
+
+
+class Player(anywidget.AnyWidget):
+    """A player as the output of a notebook's cell.
+
+    Args:
+        stream: a stream file, as long as it is now, or a stream's bytes.
+        height_pixels: of the player; it is as wide as the cell.
+
+    Attributes:
+        stream: the bytes that are shown; assigning others shows those.
+
+    Raises:
+        StreamError: nothing of the stream can be shown.
+        PlayerError: the installation lacks the player.
+    """
+
+    _esm = traitlets.Unicode().tag(sync=True)
+    stream = traitlets.Bytes().tag(sync=True)
+    height_pixels = traitlets.Int(480).tag(sync=True)
+
+    def __init__(self, stream: Path | str | bytes, *, height_pixels: int = 480) -> None:
+        super().__init__(_esm=bundle() + _WIDGET, stream=_stream_bytes(stream), height_pixels=height_pixels)
+
+
+def _stream_bytes(stream: Path | str | bytes) -> bytes:
+    if isinstance(stream, bytes):
+        check_begun(stream, "The stream")
+        return stream
+    with StreamFile(Path(stream)).opened() as data:
+        check_begun(data, str(stream))
+        return data[:]

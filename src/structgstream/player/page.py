@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""HTML pages with a player.
+
+Note [Nothing from elsewhere]
+~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
+Every page states a Content-Security-Policy that lets it load from its own origin only, and the single page from
+nowhere at all. So no stream, whatever it holds, and no link to the page, whatever its parameters say, makes a browser
+ask a third party for anything. Workers are blobs that the module makes of itself; styles are inline, as the element's
+shadow root holds them.
+"""
+
+import base64
+import hashlib
+import html
+import re
+from collections.abc import Mapping
+from typing import Final
+
+from structgstream.codec.stored import Stored
+from structgstream.errors import PlayerError
+
+MOST_PAGE_STREAM_BYTES: Final = 256 * 10**6
+"""Of a stream in a page: browsers hold no string of twice this length."""
+
+_POLICY: Final = {
+    "default-src": "'none'",
+    "worker-src": "blob:",
+    "img-src": "'self' blob: data:",
+    "style-src": "'unsafe-inline'",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+}
+_STYLE: Final = "html,body{margin:0;height:100%;color-scheme:light dark}structgstream-player{width:100%;height:100%}"
+
+
+def policy(**sources: str) -> str:
+    """A Content-Security-Policy (Note [Nothing from elsewhere]).
+
+    Args:
+        sources: further directives, with ``_`` for ``-``, as ``connect_src="'self'"``.
+    """
+    directives = _POLICY | {name.replace("_", "-"): value for name, value in sources.items()}
+    return "; ".join(f"{name} {value}" for name, value in directives.items())
+
+
+SERVED_POLICY: Final = {"script_src": "'self' blob:", "connect_src": "'self' blob:"}
+"""What pages with the module beside them add: it, and the stream."""
+
+
+def linked_page(title: str, *, stream: str, attributes: Mapping[str, str] | None = None) -> str:
+    """A page with ``player.js`` beside it, for a server.
+
+    Args:
+        title: of the window.
+        stream: address of the stream, relative to the page.
+        attributes: further ones of the element.
+    """
+    element = _element({"src": stream, **(attributes or {})})
+    return _page(title, '<script type="module" src="player.js"></script>', element, policy(**SERVED_POLICY))
+
+
+def single_page(title: str, *, module: str, stream: Stored) -> bytes:
+    """A page that holds player and stream, and opens from a disk without a server.
+
+    Args:
+        title: of the window.
+        module: the player's source.
+        stream: the whole stream file.
+
+    Raises:
+        PlayerError: the stream is too long for a page.
+    """
+    if len(stream) > MOST_PAGE_STREAM_BYTES:
+        raise PlayerError(
+            f"The stream has {len(stream) / 1e6:.0f} MB, and a page holds up to {MOST_PAGE_STREAM_BYTES / 1e6:.0f}; "
+            "watch it with structgstream play, or put the folder that --format site writes on a web server."
+        )
+    inlined = inline_module(module)
+    digest = base64.b64encode(hashlib.sha256(inlined.encode()).digest()).decode()
+    rules = policy(script_src=f"'sha256-{digest}' blob:", connect_src="blob: data:")
+    data = '<script type="application/octet-stream;base64" id="stream">'
+    page = _page(
+        title, f"{data}</script>", f'{_element({"src": "#stream"})}<script type="module">{inlined}</script>', rules
+    )
+    before, after = page.split(data)
+    return b"".join((before.encode(), data.encode(), base64.b64encode(stream[:]), after.encode()))
+
+
+def inline_module(source: str) -> str:
+    """A module as the content of a ``script`` element, which ends at the first ``</script`` whatever surrounds it.
+
+    In JavaScript these letters occur in texts and patterns only, where a backslash before the stroke changes nothing.
+    """
+    # After <!-- a parser takes <script> and </script> for a nested pair. Our bundle never writes it.
+    assert "<!--" not in source, "an HTML comment cannot be inlined"
+    return re.sub(r"</(?=script)", r"<\\/", source, flags=re.IGNORECASE)
+
+
+def _element(attributes: Mapping[str, str]) -> str:
+    written = "".join(f' {name}="{html.escape(value)}"' for name, value in attributes.items())
+    return f"<structgstream-player{written} autoplay loop></structgstream-player>"
+
+
+def _page(title: str, head: str, body: str, rules: str) -> str:
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{html.escape(rules, quote=False)}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{html.escape(title)}</title>
+<style>{_STYLE}</style>
+{head}
+</head>
+<body>
+{body}
+<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>
+</body>
+</html>
+"""

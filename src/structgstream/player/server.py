@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The application behind ``structgstream play``: page, player, stream, and the cameras' own pictures.
+
+Note [Only this machine]
+~~~~~~~~~~~~~~~~~~~~~~~~
+The server listens on the loopback address, and so any page that a browser has open can reach it. Three things keep
+others out: a request whose Host is not a name of this machine is refused, so that no name that resolves to 127.0.0.1
+makes a foreign page same-origin (DNS rebinding); no answer allows another origin to read it; and addresses name cameras
+and frames, never files.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from structgstream.codec.stored import StoredFile
+from structgstream.errors import CaptureError, StreamError
+from structgstream.player.bundle import bundle
+from structgstream.player.byte_range import UnsatisfiableRange, asked_bytes
+from structgstream.player.page import SERVED_POLICY, linked_page, policy
+from structgstream.player.stream_file import StreamFile, pieces
+from structgstream.player.truth import Truth
+
+LOOPBACK_NAMES = ("127.0.0.1", "localhost")
+# A file that grows has another state with each request, so nothing is kept and nothing has a validator.
+_HEADERS: Mapping[str, str] = {
+    "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
+    """The application; every answer is made when it is asked for, so the file may grow meanwhile.
+
+    Args:
+        stream: the file to play.
+        truth: pictures to compare with, where the capture is at hand.
+
+    Raises:
+        PlayerError: the installation lacks the player.
+    """
+    module = bundle()
+    attributes = {"truth": "truth.json"} if truth else {}
+    page = linked_page(stream.path.name, stream="stream", attributes=attributes)
+    page_headers = {**_HEADERS, "Content-Security-Policy": policy(**SERVED_POLICY, frame_ancestors="'self'")}
+
+    def index(request: Request) -> Response:
+        return HTMLResponse(page, headers=page_headers)
+
+    def player(request: Request) -> Response:
+        return Response(module, media_type="text/javascript", headers=_HEADERS)
+
+    def state(request: Request) -> Response:
+        try:
+            size_bytes, complete = stream.state()
+        except StreamError as error:
+            return _gone(error)
+        return JSONResponse({"bytes": size_bytes, "complete": complete}, headers=_HEADERS)
+
+    def stream_bytes(request: Request) -> Response:
+        return _part_of(stream, request)
+
+    def cameras(request: Request) -> Response:
+        return JSONResponse(list(truth.cameras) if truth else [], headers=_HEADERS)
+
+    def picture(request: Request) -> Response:
+        if truth is None:
+            return PlainTextResponse("No capture is served.", 404, _HEADERS)
+        camera, frame = request.path_params["camera"], request.path_params["frame"]
+        try:
+            data = truth.jpeg(camera, frame)
+        except CaptureError as error:
+            return PlainTextResponse(str(error), 500, _HEADERS)
+        if data is None:
+            return PlainTextResponse("There is no such camera or frame.", 404, _HEADERS)
+        return Response(data, media_type="image/jpeg", headers=_HEADERS)
+
+    routes = [
+        Route("/", index),
+        Route("/player.js", player),
+        Route("/state", state),
+        Route("/stream", stream_bytes),
+        Route("/truth.json", cameras),
+        Route("/truth/{camera:path}/{frame:int}.jpg", picture),
+    ]
+    only_here = Middleware(TrustedHostMiddleware, allowed_hosts=list(LOOPBACK_NAMES), www_redirect=False)
+    return Starlette(routes=routes, middleware=[only_here])
+
+
+def _part_of(stream: StreamFile, request: Request) -> Response:
+    """The bytes of a stream that a request asks for, of those that are there now."""
+    try:
+        data = stream.opened()
+    except StreamError as error:
+        return _gone(error)
+    size = len(data)
+    headers = {**_HEADERS, "Accept-Ranges": "bytes"}
+    # If-Range asks for a range of a version that is known by a validator, and none was ever given.
+    header = None if "if-range" in request.headers else request.headers.get("range")
+    try:
+        asked = asked_bytes(header, size)
+    except UnsatisfiableRange:
+        data.close()
+        return Response(status_code=416, headers={**headers, "Content-Range": f"bytes */{size}"})
+    wanted = range(size) if asked is None else asked
+    headers["Content-Length"] = str(len(wanted))
+    if asked is not None:
+        headers["Content-Range"] = f"bytes {wanted.start}-{wanted.stop - 1}/{size}"
+    status = 200 if asked is None else 206
+    if request.method == "HEAD":
+        data.close()
+        return Response(status_code=status, headers=headers, media_type="application/octet-stream")
+    return StreamingResponse(_closing(data, wanted), status, headers, "application/octet-stream")
+
+
+def _closing(data: StoredFile, wanted: range) -> Iterator[bytes | memoryview]:
+    with data, suppress(StreamError):  # A file that has become shorter meanwhile ends the answer early.
+        yield from pieces(data, wanted)
+
+
+def _gone(error: StreamError) -> Response:
+    return PlainTextResponse(str(error), 404, _HEADERS)

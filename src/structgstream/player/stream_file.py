@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stream file that may still be growing, as a server sees it. It knows nothing of what is in the packets."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from structgstream.codec.records import PREFIX, RecordType, check_prefix, footer_offset, head_at, why_stopped
+from structgstream.codec.stored import Stored, StoredFile
+from structgstream.errors import StreamError
+
+PIECE_BYTES = 256 * 1024
+
+
+@dataclass(frozen=True)
+class StreamFile:
+    """The file at ``path``; it is opened for each question, as it may be replaced at any time."""
+
+    path: Path
+
+    def opened(self) -> StoredFile:
+        """The file as long as it is now.
+
+        Raises:
+            StreamError: it cannot be read.
+        """
+        return StoredFile(self.path)
+
+    def state(self) -> tuple[int, bool]:
+        """Bytes of the file, and whether its end has been written.
+
+        Raises:
+            StreamError: it cannot be read.
+        """
+        with self.opened() as data:
+            return len(data), footer_offset(data) is not None
+
+    def check(self) -> None:
+        """Refuse what a player cannot show anything of, as :func:`check_begun`."""
+        with self.opened() as data:
+            check_begun(data, str(self.path))
+
+    def has_begun(self) -> bool:
+        """Whether the file is there and holds a whole header.
+
+        Raises:
+            StreamError: what it holds is no stream, or one of another version.
+        """
+        if not self.path.exists():
+            return False
+        with self.opened() as data:
+            if len(data) < PREFIX.size:
+                return False
+            check_prefix(data, str(self.path))
+            return head_at(data, PREFIX.size) is not None
+
+
+def check_begun(data: Stored, name: str) -> None:
+    """Refuse what a player cannot show anything of.
+
+    Raises:
+        StreamError: it is empty, no stream, of another version, or cut within its header.
+    """
+    if not len(data):
+        raise StreamError(f"{name} is empty; expected a stream made by structgstream reconstruct.")
+    check_prefix(data, name)
+    head = head_at(data, PREFIX.size)
+    if head is None or head[0] != RecordType.INIT:
+        raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
+
+
+def pieces(data: Stored, wanted: range) -> Iterator[bytes | memoryview]:
+    """The bytes ``wanted`` of ``data``, a piece at a time."""
+    for start in range(wanted.start, wanted.stop, PIECE_BYTES):
+        yield data[start : min(start + PIECE_BYTES, wanted.stop)]

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``play``: it serves, follows, waits, ends on Ctrl-C, and says what is wrong in one line."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from rigs import random_scene
+from streams import header_for, small_stream, write_stream
+from structgstream.cli import main
+from structgstream.codec.sinks import FileSink
+from structgstream.data.clip import bundled_clip_path
+from structgstream.player import running
+
+STREAM = small_stream()
+PATIENCE_SECONDS = 60.0
+
+
+@dataclass
+class Playing:
+    """The command in a process of its own, and the file that it prints into."""
+
+    process: "subprocess.Popen[bytes]"
+    printed: Path
+
+    def address(self) -> str:
+        """The address that is announced, once it is."""
+        last = time.monotonic() + PATIENCE_SECONDS
+        while time.monotonic() < last:
+            if found := re.search(r"http://127\.0\.0\.1:\d+/", self.printed.read_text()):
+                return found[0]
+            time.sleep(0.1)
+        raise AssertionError(f"no address in {self.printed.read_text()!r}")
+
+    def interrupted(self) -> int:
+        """Presses Ctrl-C; gives back the exit status."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(PATIENCE_SECONDS)
+
+
+@contextmanager
+def playing(folder: Path, *arguments: str) -> Iterator[Playing]:
+    """The command, on a machine without a screen."""
+    environ = {name: text for name, text in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")}
+    printed = folder / "printed"
+    with printed.open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "structgstream", "play", *arguments], stdout=output, stderr=output, env=environ
+        )
+    try:
+        yield Playing(process, printed)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def fetched(address: str) -> bytes:
+    with urllib.request.urlopen(address, timeout=20) as response:
+        return response.read()
+
+
+def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
+    capsys.readouterr()
+    assert main(["play", *arguments]) == status
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert len(error.strip().splitlines()) == 1
+    return error
+
+
+def test_it_serves_until_ctrl_c(tmp_path: Path) -> None:
+    file = tmp_path / "s.sgs"
+    file.write_bytes(STREAM[:-5])
+    with playing(tmp_path, str(file)) as command:
+        address = command.address()
+        assert b"<structgstream-player" in fetched(address)
+        assert fetched(f"{address}stream") == STREAM[:-5]
+        file.write_bytes(STREAM)
+        assert json.loads(fetched(f"{address}state")) == {"bytes": len(STREAM), "complete": True}
+        assert command.interrupted() == 0
+        lines = command.printed.read_text().splitlines()
+    assert len(lines) == 3
+    assert "frames appear as they are written" in lines[1]
+    assert "no screen to open a browser on" in lines[2]
+
+
+def test_it_waits_for_the_file_and_its_whole_header(tmp_path: Path) -> None:
+    file = tmp_path / "later.sgs"
+    with playing(tmp_path, str(file), "--wait", "--no-browser") as command:
+        time.sleep(0.3)
+        file.write_bytes(STREAM[:100])
+        time.sleep(0.3)
+        assert command.process.poll() is None
+        file.write_bytes(STREAM)
+        assert fetched(f"{command.address()}stream") == STREAM
+
+
+def test_ctrl_c_ends_waiting(tmp_path: Path) -> None:
+    with playing(tmp_path, str(tmp_path / "never.sgs"), "--wait") as command:
+        time.sleep(3.0)  # Python itself must be past its start to take a signal as an exception.
+        assert command.interrupted() == 130
+        assert "Traceback" not in command.printed.read_text()
+
+
+def test_a_port_that_is_taken_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "s.sgs"
+    file.write_bytes(STREAM)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        error = error_of([str(file), "--no-browser", "--port", str(port)], capsys, status=1)
+    assert f"Port {port} cannot be used" in error
+    assert "--port" in error
+
+
+@pytest.mark.parametrize(
+    ("content", "extra", "status", "words"),
+    [
+        (None, [], 1, "No such file"),
+        (b"", [], 1, "is empty"),
+        (b"hello, this is no stream", [], 1, "is not a structgstream file"),
+        (STREAM[:200], [], 1, "cut at byte 200"),
+        (STREAM, ["--port", "70000"], 2, "--port 70000 is not one of 0 to 65535"),
+        (STREAM, ["--capture", "/no/such/folder"], 1, "does not exist"),
+    ],
+)
+def test_what_cannot_be_played(
+    tmp_path: Path,
+    content: bytes | None,
+    extra: list[str],
+    status: int,
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = tmp_path / "s.sgs"
+    if content is not None:
+        file.write_bytes(content)
+    assert words in error_of([str(file), "--no-browser", *extra], capsys, status=status)
+
+
+def test_the_capture_of_another_stream_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "s.sgs"
+    scene = random_scene(5)
+    write_stream(FileSink(file), [scene], header=header_for(scene))
+    error = error_of([str(file), "--no-browser", "--capture", str(bundled_clip_path())], capsys, status=1)
+    assert "of the capture clip" in error or "in the capture clip" in error
+
+
+@pytest.mark.parametrize("missing", ["starlette", "uvicorn"])
+def test_a_missing_extra_is_told(
+    tmp_path: Path, missing: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in [name for name in sys.modules if name.startswith(("structgstream.player", missing))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, missing, None)  # type: ignore[arg-type]
+    error = error_of([str(tmp_path / "s.sgs")], capsys, status=1)
+    assert "pip install 'structgstream[serve]'" in error
+
+
+def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(running.webbrowser, "open", lambda address: not opened.append(address))
+    monkeypatch.setattr(running.sys, "platform", "linux")
+    assert not running.open_browser("http://127.0.0.1:1/", environ={"DISPLAY": ""})
+    assert opened == []
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        assert running.open_browser("http://127.0.0.1:1/", environ={name: "x"})
+    monkeypatch.setattr(running.sys, "platform", "darwin")
+    assert running.open_browser("http://127.0.0.1:1/", environ={})
+    assert len(opened) == 4

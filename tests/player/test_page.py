@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages with a player: what they hold, what their policy lets them do, and that no content breaks out of its place."""
+
+import base64
+import hashlib
+import html
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from streams import small_stream
+from structgstream.errors import PlayerError
+from structgstream.player import page
+from structgstream.player.bundle import bundle
+from structgstream.player.page import inline_module, linked_page, single_page
+
+STREAM = small_stream()
+PLAYING = {"autoplay": None, "loop": None}
+
+
+class Elements(HTMLParser):
+    """Tags with their attributes, and the content of scripts as a browser takes it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[str, str]] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.tags:
+            self.texts.append((self.tags[-1][0], data))
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    def text(self, tag: str) -> str:
+        return "".join(text for name, text in self.texts if name == tag)
+
+    def policy(self) -> dict[str, str]:
+        (rules,) = (m["content"] for m in self.of("meta") if m.get("http-equiv") == "Content-Security-Policy")
+        assert rules is not None
+        return dict(rule.split(" ", 1) for rule in rules.split("; "))
+
+
+def scripts(text: str) -> list[tuple[str, str]]:
+    """Attributes and content of every script element, by the rule that its first end tag ends it."""
+    return re.findall(r"<script([^>]*)>(.*?)</script", text, re.DOTALL | re.IGNORECASE)
+
+
+def test_a_page_holds_player_and_stream() -> None:
+    module = 'export const end = "</script>"; /* </SCRIPT */'
+    text = single_page("a clip", module=module, stream=STREAM).decode()
+    (data, stored), (kind, inlined) = scripts(text)
+    assert 'id="stream"' in data
+    assert "application/octet-stream;base64" in data
+    assert base64.b64decode(stored, validate=True) == STREAM
+    assert kind == ' type="module"'
+    assert inlined == 'export const end = "<\\/script>"; /* <\\/SCRIPT */'
+    assert Elements(text).of("structgstream-player") == [{"src": "#stream", **PLAYING}]
+
+
+def test_nothing_in_a_page_runs_but_the_player_and_nothing_is_fetched() -> None:
+    text = single_page("a clip", module=bundle(), stream=STREAM).decode()
+    rules = Elements(text).policy()
+    inlined = scripts(text)[1][1]
+    digest = base64.b64encode(hashlib.sha256(inlined.encode()).digest()).decode()
+    assert rules["script-src"].split() == [f"'sha256-{digest}'", "blob:"]
+    assert rules["default-src"] == "'none'"
+    assert rules["worker-src"] == "blob:"
+    assert set(rules["connect-src"].split()) == {"blob:", "data:"}
+    assert rules["base-uri"] == rules["form-action"] == "'none'"
+    allowed = {"'none'", "'self'", "'unsafe-inline'", "blob:", "data:", f"'sha256-{digest}'"}
+    assert {source for sources in rules.values() for source in sources.split()} <= allowed
+
+
+def test_a_page_for_a_server_loads_from_its_own_origin_only() -> None:
+    found = Elements(linked_page("a clip", stream="stream.sgs"))
+    assert [script["src"] for script in found.of("script")] == ["player.js"]
+    assert found.of("structgstream-player") == [{"src": "stream.sgs", **PLAYING}]
+    rules = found.policy()
+    assert rules["connect-src"] == "'self' blob:"
+    assert rules["script-src"] == "'self' blob:"
+    addresses = [value for _, attributes in found.tags for name, value in attributes.items() if name in ("src", "href")]
+    assert set(addresses) == {"player.js", "stream.sgs", "data:,"}
+
+
+HOSTILE = ["</title><script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "<!--", "{{7*7}}", "a & b"]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_names_stay_text(text: str) -> None:
+    plain = linked_page("a", stream="b", attributes={"truth": "c"})
+    found = Elements(linked_page(text, stream=text, attributes={"truth": text}))
+    assert [tag for tag, _ in found.tags] == [tag for tag, _ in Elements(plain).tags]
+    assert found.text("title").strip() == text
+    assert found.of("structgstream-player") == [{"src": text, "truth": text, **PLAYING}]
+    assert html.escape(text) in single_page(text, module="", stream=STREAM).decode()
+
+
+def test_a_module_that_ends_its_element_is_escaped_and_a_comment_refused() -> None:
+    assert inline_module("a</script b</Script>c</ script") == "a<\\/script b<\\/Script>c</ script"
+    with pytest.raises(AssertionError, match="comment"):
+        inline_module("x = '<!-- <script>'")
+
+
+def test_the_bundle_can_be_inlined() -> None:
+    assert "</script" not in inline_module(bundle()).lower()
+
+
+def test_a_stream_that_is_too_long_for_a_page_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page, "MOST_PAGE_STREAM_BYTES", len(STREAM) - 1)
+    with pytest.raises(PlayerError, match="structgstream play"):
+        single_page("a clip", module="", stream=STREAM)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A file that grows, as the player's server sees it."""
+
+from pathlib import Path
+
+import pytest
+
+from streams import small_stream
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.records import FOOTER, FOOTER_MAGIC
+from structgstream.errors import StreamError
+from structgstream.player.stream_file import PIECE_BYTES, StreamFile, check_begun, pieces
+
+STREAM = small_stream()
+HEADER_BYTES = StreamReader(STREAM).header_bytes
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> StreamFile:
+    return StreamFile(tmp_path / "s.sgs")
+
+
+def test_it_begins_with_its_header_and_is_complete_with_its_footer(file: StreamFile) -> None:
+    assert not file.has_begun()
+    for length in (0, 5, 12, 13, HEADER_BYTES - 1, HEADER_BYTES, HEADER_BYTES + 3, len(STREAM) - 1, len(STREAM)):
+        file.path.write_bytes(STREAM[:length])
+        assert file.has_begun() == (length >= HEADER_BYTES)
+        assert file.state() == (length, length == len(STREAM))
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        FOOTER.pack(0, FOOTER_MAGIC),
+        FOOTER.pack(2**63, FOOTER_MAGIC),
+        FOOTER.pack(len(STREAM) - 1, FOOTER_MAGIC),
+        FOOTER.pack(HEADER_BYTES, FOOTER_MAGIC),
+        FOOTER.pack(len(STREAM) - 40, b"SGSINDEY"),
+    ],
+)
+def test_a_footer_that_points_to_no_index_is_none(file: StreamFile, end: bytes) -> None:
+    file.path.write_bytes(STREAM[: -FOOTER.size] + end)
+    assert not file.state()[1]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is empty; expected a stream made by structgstream reconstruct"),
+        (b"hello, this is no stream", "is not a structgstream file"),
+        (STREAM[:10], "cut at byte 10"),
+        (STREAM[: HEADER_BYTES - 1], f"cut at byte {HEADER_BYTES - 1}, within the record that begins at byte 12"),
+        (STREAM[:8] + b"\x09\x00" + STREAM[10:], "version 9.0"),
+    ],
+)
+def test_what_cannot_be_shown_is_told(file: StreamFile, data: bytes, words: str) -> None:
+    file.path.write_bytes(data)
+    with pytest.raises(StreamError, match=words):
+        file.check()
+    with pytest.raises(StreamError, match=words):
+        check_begun(data, "memory")
+
+
+def test_a_missing_file_is_told(file: StreamFile) -> None:
+    with pytest.raises(StreamError, match=r"No such file or directory"):
+        file.check()
+
+
+def test_pieces_are_bounded_and_exact() -> None:
+    data = bytes(range(256)) * (3 * PIECE_BYTES // 256 + 1)
+    found = list(pieces(data, range(100, len(data) - 5)))
+    assert b"".join(found) == data[100:-5]
+    assert max(map(len, found)) == PIECE_BYTES
+    assert not list(pieces(data, range(0)))

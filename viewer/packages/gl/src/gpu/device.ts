@@ -1,0 +1,89 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The context, what this device can do, and sentences about what it cannot. */
+
+import { GlError } from "../errors.js";
+import type { MlpPath } from "../types.js";
+
+/** vec4s that a splat takes of the MLPs' outputs. */
+export const SPLAT_VECTORS = 3;
+/** Two splats' outputs as half floats fill so many targets of four 32-bit numbers. */
+export const PAIR_TARGETS = 3;
+
+export interface Device {
+  readonly gl: WebGL2RenderingContext;
+  /** What splats are blended into. */
+  readonly accumulation: { readonly format: "RGBA16F" | "RGBA8" };
+  readonly maxTextureSize: number;
+  readonly maxLayers: number;
+  /** Splats of an anchor that one pass can give, by path; 0 when the device cannot take that path. */
+  readonly splatsPerPass: Readonly<Record<MlpPath, number>>;
+  /** Sentences about what is drawn worse than elsewhere. */
+  readonly limitations: readonly string[];
+}
+
+/** @throws GlError this browser or device has no WebGL2 */
+export function openDevice(canvas: HTMLCanvasElement | OffscreenCanvas): Device {
+  const gl = canvas.getContext("webgl2", {
+    alpha: false,
+    antialias: false,
+    depth: false,
+    stencil: false,
+    powerPreference: "high-performance",
+  }) as WebGL2RenderingContext | null;
+  if (!gl) {
+    throw new GlError(
+      "This browser gives no WebGL2, which the player draws with; turn on hardware acceleration, or use a current browser.",
+    );
+  }
+  return deviceOf(gl);
+}
+
+/** What a context can do; again after one has been restored, for extensions have to be asked for anew. */
+export function deviceOf(gl: WebGL2RenderingContext): Device {
+  const float = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  const limitations: string[] = [];
+  if (!float) {
+    limitations.push(
+      "This device cannot draw into floating-point textures (EXT_color_buffer_float): splats are blended in 8 bits, and soft " +
+        "gradients may show steps.",
+    );
+  }
+  return {
+    gl,
+    accumulation: { format: float ? "RGBA16F" : "RGBA8" },
+    maxTextureSize: limit(gl, gl.MAX_TEXTURE_SIZE),
+    maxLayers: limit(gl, gl.MAX_ARRAY_TEXTURE_LAYERS),
+    splatsPerPass: {
+      "transform-feedback": Math.floor(
+        Math.min(
+          limit(gl, gl.MAX_TRANSFORM_FEEDBACK_INTERLEAVED_COMPONENTS) / 4,
+          limit(gl, gl.MAX_VERTEX_OUTPUT_COMPONENTS) / 4 - 1,
+          limit(gl, gl.MAX_VARYING_VECTORS),
+        ) / SPLAT_VECTORS,
+      ),
+      mrt: 2 * Math.floor(Math.min(limit(gl, gl.MAX_DRAW_BUFFERS), limit(gl, gl.MAX_COLOR_ATTACHMENTS)) / PAIR_TARGETS),
+    },
+    limitations,
+  };
+}
+
+/**
+ * The path that is asked for, or the best that the device can take.
+ *
+ * @throws GlError it cannot take that one
+ */
+export function chosenPath(device: Device, asked: MlpPath | undefined): MlpPath {
+  const { splatsPerPass } = device;
+  const path = asked ?? (splatsPerPass["transform-feedback"] > 0 ? "transform-feedback" : "mrt");
+  if (splatsPerPass[path] > 0) return path;
+  const other = path === "mrt" ? "transform-feedback" : "mrt";
+  throw new GlError(
+    `This device's limits are too small for the MLP path ${JSON.stringify(path)}; expected at least ` +
+      `${PAIR_TARGETS} draw buffers or ${4 * SPLAT_VECTORS} transform feedback components; try ${JSON.stringify(other)}.`,
+  );
+}
+
+function limit(gl: WebGL2RenderingContext, name: number): number {
+  // A context that is lost at this very moment gives null; it will be asked again.
+  return (gl.getParameter(name) as number | null) ?? 0;
+}

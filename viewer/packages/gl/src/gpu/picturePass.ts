@@ -1,0 +1,65 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The canvas: what was blended, before the environment, as a camera of the rig would take it. */
+
+import { axes } from "../cameraMath.js";
+import { pictureProgram } from "../shaders/picture.js";
+import type { Camera } from "../types.js";
+import { bindTextures } from "./binding.js";
+import type { Program, Resources } from "./resources.js";
+
+/** `picture = gain * rendering + bias` for each channel. */
+export interface Look {
+  readonly gain: readonly [number, number, number];
+  readonly bias: readonly [number, number, number];
+}
+
+export class PicturePass {
+  private program: Program | undefined;
+  private rows = -1;
+
+  constructor(private readonly resources: Resources) {}
+
+  /**
+   * @param environment [E, 3], empty without one
+   * @param background behind everything where there is no environment
+   */
+  draw(
+    blended: WebGLTexture,
+    camera: Camera,
+    environment: Float32Array,
+    background: readonly [number, number, number],
+    look: Look,
+  ): void {
+    const { gl } = this.resources;
+    const program = this.programFor(environment.length / 3);
+    bindTextures(gl, program, { blended });
+    gl.uniform2f(program.at("size"), camera.width, camera.height);
+    gl.uniform3f(program.at("gain"), ...look.gain);
+    gl.uniform3f(program.at("bias"), ...look.bias);
+    gl.uniform3f(program.at("background"), ...background);
+    if (environment.length) gl.uniform3fv(program.at("environment"), environment);
+    gl.uniformMatrix3fv(program.at("rays"), true, rays(camera));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.disable(gl.BLEND);
+    gl.viewport(0, 0, camera.width, camera.height);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  private programFor(rows: number): Program {
+    if (this.program && rows === this.rows) return this.program;
+    if (this.program) this.resources.deleteProgram(this.program.handle);
+    this.program = this.resources.program(pictureProgram(rows));
+    this.rows = rows;
+    return this.program;
+  }
+}
+
+/** Row by row, from (pixel, 1) to a direction of the scene: R^T K^-1. */
+function rays(camera: Camera): number[] {
+  const { fx, fy, cx, cy } = camera.K;
+  const [right, down, forward] = axes(camera);
+  return [0, 1, 2].flatMap((i) => {
+    const [x, y] = [right[i]! / fx, down[i]! / fy];
+    return [x, y, forward[i]! - x * cx - y * cy];
+  });
+}

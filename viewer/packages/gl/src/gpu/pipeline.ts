@@ -1,0 +1,110 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Everything on the GPU, from fields to the canvas; made anew when a context has been restored. */
+
+import type { Fields } from "@structgstream/core";
+import { center, resized } from "../cameraMath.js";
+import { type Shape, sameShape, shapeOf } from "../scene.js";
+import type { Sorted } from "../sorting/orders.js";
+import type { Camera, MlpPath } from "../types.js";
+import { chosenPath, type Device } from "./device.js";
+import { FeedbackPass } from "./feedbackPass.js";
+import type { MlpPass } from "./mlpPass.js";
+import { type Look, PicturePass } from "./picturePass.js";
+import { ProjectionPass } from "./projectionPass.js";
+import { Resources } from "./resources.js";
+import { SceneTextures } from "./sceneTextures.js";
+import { SplatPass } from "./splatPass.js";
+import { TargetsPass } from "./targetsPass.js";
+
+/** What depends on the scene's shape: widths of the MLPs, Gaussians of an anchor. */
+interface Stage {
+  readonly shape: Shape;
+  readonly scene: SceneTextures;
+  readonly mlp: MlpPass;
+  readonly projection: ProjectionPass;
+}
+
+const NOTHING = new Float32Array(0);
+
+export class Pipeline {
+  readonly resources: Resources;
+  readonly path: MlpPath;
+  private readonly splats: SplatPass;
+  private readonly picture: PicturePass;
+  private stage: Stage | undefined;
+  private fields: Fields | undefined;
+
+  /** @throws GlError the device cannot take the path that is asked for, or refuses a shader */
+  constructor(
+    readonly device: Device,
+    askedPath: MlpPath | undefined,
+    private readonly background: readonly [number, number, number],
+  ) {
+    this.path = chosenPath(device, askedPath);
+    this.resources = new Resources(device.gl);
+    this.splats = new SplatPass(this.resources, device);
+    this.picture = new PicturePass(this.resources);
+  }
+
+  /**
+   * A scene and its order; without one when it throws.
+   *
+   * @throws GlError the scene is too large for this device
+   */
+  adopt({ snapshot, order }: Sorted, distanceInput: boolean): void {
+    const shape = shapeOf(snapshot.fields, distanceInput);
+    if (!this.stage || !sameShape(this.stage.shape, shape)) {
+      this.forget();
+      this.stage = this.stageFor(shape);
+    }
+    try {
+      this.stage.scene.adopt(snapshot, order);
+    } catch (error) {
+      this.forget();
+      throw error;
+    }
+    this.fields = snapshot.fields;
+  }
+
+  /** The scene of a stream played before. */
+  forget(): void {
+    this.stage?.scene.delete();
+    this.stage?.mlp.delete();
+    this.stage?.projection.delete();
+    this.stage = undefined;
+    this.fields = undefined;
+  }
+
+  evaluate(camera: Camera): void {
+    this.stage?.mlp.evaluate(this.stage.scene, center(camera));
+  }
+
+  /** Draws splats at `scale` times the camera's size. */
+  draw(camera: Camera, scale: number): void {
+    const factor = Math.min(scale, this.device.maxTextureSize / Math.max(camera.width, camera.height));
+    const width = Math.max(Math.round(camera.width * factor), 1);
+    const height = Math.max(Math.round(camera.height * factor), 1);
+    this.stage?.projection.project(this.stage.scene, resized(camera, width, height));
+    this.splats.draw(this.stage?.scene, this.stage?.projection, width, height);
+  }
+
+  /** What was drawn last, onto the canvas. */
+  show(camera: Camera, look: Look): void {
+    const environment = this.fields?.get("environment")?.data as Float32Array | undefined;
+    if (!this.splats.target) return;
+    this.picture.draw(this.splats.target, camera, environment ?? NOTHING, this.background, look);
+  }
+
+  private stageFor(shape: Shape): Stage {
+    const { resources, device } = this;
+    const most = device.splatsPerPass[this.path];
+    const Pass = this.path === "mrt" ? TargetsPass : FeedbackPass;
+    const mlp = new Pass(resources, device, shape, most);
+    return {
+      shape,
+      scene: new SceneTextures(resources, device, shape),
+      mlp,
+      projection: new ProjectionPass(resources, device, shape.offsetsPerAnchor, mlp),
+    };
+  }
+}

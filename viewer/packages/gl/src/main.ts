@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+
+export {
+  axes,
+  between,
+  center,
+  fitted,
+  frustum,
+  lookAt,
+  projected,
+  resized,
+  rigCamera,
+  rigCameras,
+  sameCamera,
+  unprojected,
+  viewmatOf,
+} from "./cameraMath.js";
+export { GlError } from "./errors.js";
+export { SplatRenderer } from "./renderer.js";
+export { focusPoint, upAxis } from "./rig.js";
+export type {
+  Camera,
+  Intrinsics,
+  MlpPath,
+  Renderer,
+  RendererOptions,
+  RenderOptions,
+  RenderStats,
+  ResourceCounts,
+  SceneUpdate,
+} from "./types.js";
+export {
+  across,
+  along,
+  cross,
+  directionBetween,
+  dot,
+  length,
+  type Rotation,
+  rotationBetween,
+  scaled,
+  unit,
+  type Vector,
+} from "./vectors.js";

@@ -1,0 +1,258 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A canvas on which a stream's scenes are drawn. */
+
+import type { StreamHeader, Tensor } from "@structgstream/core";
+import { sameCamera } from "./cameraMath.js";
+import { GlError } from "./errors.js";
+import { type Device, deviceOf, openDevice } from "./gpu/device.js";
+import { Pace } from "./gpu/pace.js";
+import type { Look } from "./gpu/picturePass.js";
+import { Pipeline } from "./gpu/pipeline.js";
+import { LiveScene } from "./scene.js";
+import { Orders, type Sorted, sameWanted } from "./sorting/orders.js";
+import type {
+  Camera,
+  Renderer,
+  RendererOptions,
+  RenderOptions,
+  RenderStats,
+  ResourceCounts,
+  SceneUpdate,
+} from "./types.js";
+
+const MEAN_LOOK: Look = { gain: [1, 1, 1], bias: [0, 0, 0] };
+const BLACK = [0, 0, 0] as const;
+
+/** What is on the canvas. */
+interface Shown {
+  readonly sorted: Sorted | undefined;
+  readonly camera: Camera;
+  readonly pixelScale: number;
+  readonly look: Look;
+}
+
+export class SplatRenderer implements Renderer {
+  onOrder: (() => void) | undefined;
+  onContextLost: (() => void) | undefined;
+  onContextRestored: (() => void) | undefined;
+  onError: ((error: Error) => void) | undefined;
+  maxSplats: number;
+  pixelScale: number;
+  private device: Device;
+  private pipeline: Pipeline | undefined;
+  private readonly worker: Worker;
+  private readonly orders: Orders;
+  private readonly pace: Pace;
+  private scene: LiveScene | undefined;
+  /** The order that pictures are drawn in, and the scene it belongs to. */
+  private sorted: Sorted | undefined;
+  private shown: Shown | undefined;
+  private settling: { resolve: () => void; reject: (error: Error) => void }[] = [];
+  private destroyed = false;
+
+  /** @throws GlError no WebGL2, or a device that cannot take the path that is asked for */
+  constructor(
+    private readonly canvas: HTMLCanvasElement | OffscreenCanvas,
+    private readonly options: RendererOptions = {},
+  ) {
+    this.maxSplats = options.maxSplats ?? Number.POSITIVE_INFINITY;
+    this.pixelScale = options.pixelScale ?? 1;
+    this.device = openDevice(canvas);
+    this.pipeline = this.newPipeline();
+    this.worker = workerOf(options.sorter);
+    this.orders = this.newOrders();
+    this.pace = new Pace(this.device.gl, this.ready);
+    canvas.addEventListener("webglcontextlost", this.lost);
+    canvas.addEventListener("webglcontextrestored", this.restored);
+  }
+
+  get limitations(): readonly string[] {
+    return this.device.limitations;
+  }
+
+  get resources(): ResourceCounts {
+    const none = { textures: 0, buffers: 0, programs: 0, framebuffers: 0 };
+    return { ...(this.pipeline?.resources.counts ?? none), workers: this.destroyed ? 0 : 1 };
+  }
+
+  load(header: StreamHeader): void {
+    this.alive();
+    this.scene = new LiveScene(header);
+    this.sorted = undefined;
+    this.shown = undefined;
+    this.pipeline?.forget();
+    this.orders.forget();
+  }
+
+  update(update: SceneUpdate): void {
+    this.alive();
+    if (!this.scene) throw new GlError("An update came before a header; call load(header) first.");
+    this.scene.apply(update);
+  }
+
+  render(camera: Camera, options: RenderOptions = {}): RenderStats {
+    this.alive();
+    const began = performance.now();
+    const snapshot = this.scene?.latest;
+    if (snapshot) this.orders.want({ snapshot, camera, maxSplats: this.maxSplats });
+    const look = this.lookNamed(options.cameraName);
+    const drawn = this.pipeline ? this.drawn(this.pipeline, camera, look) : false;
+    const { sorted } = this;
+    const settled =
+      sorted !== undefined &&
+      snapshot !== undefined &&
+      this.pipeline !== undefined &&
+      sameWanted(sorted, { snapshot, camera, maxSplats: this.maxSplats }) &&
+      this.shows(sorted, camera, look);
+    return {
+      frameIndex: sorted?.snapshot.index,
+      ptsSeconds: sorted?.snapshot.ptsSeconds,
+      drawn,
+      settled,
+      anchors: sorted?.order.anchorCount ?? 0,
+      splats: sorted?.order.splats ?? 0,
+      sortMilliseconds: sorted?.order.milliseconds ?? 0,
+      callMilliseconds: performance.now() - began,
+    };
+  }
+
+  async renderSettled(camera: Camera, options: RenderOptions = {}): Promise<RenderStats> {
+    if (!this.scene?.latest) throw new GlError("There is no scene to draw yet; call update(frame) first.");
+    for (;;) {
+      const stats = this.render(camera, options);
+      if (stats.settled) return stats;
+      await new Promise<void>((resolve, reject) => this.settling.push({ resolve, reject }));
+    }
+  }
+
+  async screenshot(): Promise<Blob> {
+    this.alive();
+    if (!this.shown || !this.pipeline) throw new GlError("There is no picture to save yet; call render first.");
+    // The canvas keeps nothing after the browser has shown it: the picture is made again, and taken at once.
+    this.pipeline.show(this.shown.camera, this.shown.look);
+    const { canvas } = this;
+    if ("convertToBlob" in canvas) return canvas.convertToBlob({ type: "image/png" });
+    const blob = await new Promise<Blob | null>((resolve) => canvas.toBlob(resolve, "image/png"));
+    if (!blob) throw new GlError("The browser could not encode the picture; make it smaller.");
+    return blob;
+  }
+
+  destroy(): void {
+    if (this.destroyed) return;
+    this.destroyed = true;
+    this.canvas.removeEventListener("webglcontextlost", this.lost);
+    this.canvas.removeEventListener("webglcontextrestored", this.restored);
+    this.orders.close();
+    this.pace.stop();
+    this.pipeline?.resources.deleteAll();
+    this.pipeline = undefined;
+    this.scene = undefined;
+    this.sorted = undefined;
+    this.shown = undefined;
+    this.settle();
+  }
+
+  private alive(): void {
+    if (this.destroyed) throw new GlError("This renderer was destroyed; make another one.");
+  }
+
+  private newPipeline(): Pipeline {
+    return new Pipeline(this.device, this.options.mlpPath, this.options.background ?? BLACK);
+  }
+
+  private newOrders(): Orders {
+    const failed = (error: Error) => {
+      for (const waiting of this.settling.splice(0)) waiting.reject(error);
+      this.onError?.(error);
+    };
+    return new Orders(this.worker, this.ready, failed);
+  }
+
+  private settle(): void {
+    for (const waiting of this.settling.splice(0)) waiting.resolve();
+  }
+
+  private readonly ready = (): void => {
+    this.onOrder?.();
+    this.settle();
+  };
+
+  /** Whether anything had to be drawn, and could be. */
+  private drawn(pipeline: Pipeline, camera: Camera, look: Look): boolean {
+    if (this.shows(this.sorted, camera, look) && !this.orders.waiting) return false;
+    if (this.pace.busy()) return false;
+    const arrived = this.orders.take();
+    if (arrived && this.scene) {
+      if (this.sorted) this.orders.release(this.sorted);
+      this.sorted = undefined;
+      pipeline.adopt(arrived, this.scene.header.distanceInput);
+      this.sorted = arrived;
+    }
+    const { shown, sorted, pixelScale } = this;
+    const same = shown && shown.sorted === sorted && sameCamera(shown.camera, camera);
+    if (this.canvas.width !== camera.width) this.canvas.width = camera.width;
+    if (this.canvas.height !== camera.height) this.canvas.height = camera.height;
+    if (sorted && !same) pipeline.evaluate(camera);
+    if (!same || shown.pixelScale !== pixelScale) pipeline.draw(camera, pixelScale);
+    pipeline.show(camera, look);
+    this.pace.mark();
+    this.shown = { sorted, camera, pixelScale, look };
+    return true;
+  }
+
+  private shows(sorted: Sorted | undefined, camera: Camera, look: Look): boolean {
+    const { shown, pixelScale } = this;
+    if (!shown || shown.sorted !== sorted || shown.pixelScale !== pixelScale) return false;
+    return sameCamera(shown.camera, camera) && sameLook(shown.look, look);
+  }
+
+  /** Held-out cameras have no correction of their own: theirs is the mean. */
+  private lookNamed(name: string | undefined): Look {
+    if (name === undefined || !this.scene) return MEAN_LOOK;
+    const { cameras } = this.scene.header;
+    const found = cameras.find((camera) => camera.name === name);
+    if (!found) {
+      const names = cameras.map((camera) => camera.name).join(", ");
+      throw new GlError(`The stream has no camera ${JSON.stringify(name)}; it has ${names}.`);
+    }
+    const color = this.scene.latest?.fields.get("camera_color");
+    if (found.heldOut || !color) return MEAN_LOOK;
+    return lookOf(color, cameras.filter((camera) => !camera.heldOut).indexOf(found));
+  }
+
+  private readonly lost = (event: Event): void => {
+    event.preventDefault(); // else it would not be restored
+    this.pace.stop();
+    this.pipeline = undefined;
+    this.shown = undefined;
+    this.onContextLost?.();
+  };
+
+  private readonly restored = (): void => {
+    try {
+      this.device = deviceOf(this.device.gl);
+      this.pipeline = this.newPipeline();
+      if (this.sorted && this.scene) this.pipeline.adopt(this.sorted, this.scene.header.distanceInput);
+    } catch (error) {
+      this.pipeline = undefined;
+      this.onError?.(error instanceof Error ? error : new Error(String(error)));
+      return;
+    }
+    this.onContextRestored?.();
+    this.settle();
+  };
+}
+
+function workerOf(sorter: Worker | URL | undefined): Worker {
+  if (sorter && !(sorter instanceof URL)) return sorter;
+  return new Worker(sorter ?? new URL("./sorter.worker.js", import.meta.url), { type: "module" });
+}
+
+function sameLook(a: Look, b: Look): boolean {
+  return [0, 1, 2].every((i) => a.gain[i] === b.gain[i] && a.bias[i] === b.bias[i]);
+}
+
+function lookOf(color: Tensor, row: number): Look {
+  const [r, g, b, dr, dg, db] = (color.data as Float32Array).subarray(6 * row, 6 * row + 6);
+  return { gain: [r!, g!, b!], bias: [dr!, dg!, db!] };
+}

@@ -1,0 +1,83 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The scene on this side of the decoder: what it is now, and what it was when an order was asked for. */
+
+import { FIELD_NAMES, type FieldName, type Fields, type StreamHeader, type Tensor } from "@structgstream/core";
+import { GlError } from "./errors.js";
+import type { SceneUpdate } from "./types.js";
+
+/** A scene at one instant; never changes. */
+export interface Snapshot {
+  readonly index: number;
+  readonly ptsSeconds: number;
+  readonly fields: Fields;
+}
+
+/** Numbers that say how much there is. */
+export interface Sizes {
+  readonly anchors: number;
+  readonly offsetsPerAnchor: number;
+  readonly free: number;
+}
+
+/** Numbers that programs are compiled for. */
+export interface Shape {
+  readonly offsetsPerAnchor: number;
+  readonly features: number;
+  /** Columns of the anchors' appearance; 0 without. */
+  readonly appearance: number;
+  readonly hidden: number;
+  readonly distanceInput: boolean;
+}
+
+const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
+
+export function sizesOf(fields: Fields): Sizes {
+  const [anchors, offsetsPerAnchor] = fields.get("anchor_offsets")!.shape as [number, number];
+  return { anchors, offsetsPerAnchor, free: fields.get("free")!.shape[0]! };
+}
+
+export function shapeOf(fields: Fields, distanceInput: boolean): Shape {
+  const { offsetsPerAnchor } = sizesOf(fields);
+  const features = fields.get("anchor_features")!.shape[1]!;
+  const inputs = features + 3 + Number(distanceInput);
+  const weights = fields.get("opacity_mlp")!.data.length;
+  return {
+    offsetsPerAnchor,
+    features,
+    appearance: fields.get("appearance")?.shape[1] ?? 0,
+    hidden: (weights - offsetsPerAnchor) / (inputs + 1 + offsetsPerAnchor),
+    distanceInput,
+  };
+}
+
+export function sameShape(a: Shape, b: Shape): boolean {
+  return (Object.keys(a) as (keyof Shape)[]).every((key) => a[key] === b[key]);
+}
+
+/** Gathers updates; hands out what the scene is. */
+export class LiveScene {
+  private fields: Map<FieldName, Tensor>;
+  private found: Snapshot | undefined;
+
+  constructor(readonly header: StreamHeader) {
+    this.fields = new Map(header.static);
+  }
+
+  /** Undefined until an update has completed the scene. */
+  get latest(): Snapshot | undefined {
+    return this.found;
+  }
+
+  /** @throws GlError the update leaves fields out that no update before has brought */
+  apply(update: SceneUpdate): void {
+    const fields = new Map([...this.fields, ...update.fields]);
+    const missing = FIELD_NAMES.filter((name) => !fields.has(name) && !OPTIONAL.includes(name));
+    if (missing.length) {
+      throw new GlError(
+        `The update of frame ${update.index} lacks ${missing.join(", ")}; expected every dynamic field in the first update.`,
+      );
+    }
+    this.fields = fields;
+    this.found = { index: update.index, ptsSeconds: update.ptsSeconds, fields };
+  }
+}

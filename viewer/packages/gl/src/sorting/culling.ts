@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Which anchors a camera may see. */
+
+import type { Camera } from "../types.js";
+import type { Placement } from "./placement.js";
+
+/**
+ * Share of the picture's size by which the frustum is widened on each side: an order may be shown for the next cameras too,
+ * until theirs has come, and what they see at their edges must be in it.
+ */
+const MARGIN = 0.2;
+const SIZE_BINS = 1024;
+/** Bins of an octave of apparent size. */
+const OCTAVE_BINS = 32;
+
+/** Indices, ascending, of the anchors whose ball may reach the picture or its margin, written to `into`; how many. */
+export function seenAnchors(placement: Placement, camera: Camera, into: Uint32Array): number {
+  const { positions, radii } = placement;
+  const planes = sidePlanes(camera);
+  const v = camera.viewmat;
+  let count = 0;
+  for (let m = 0, at = 0; m < placement.anchors; m++, at += 3) {
+    const [px, py, pz] = [positions[at]!, positions[at + 1]!, positions[at + 2]!];
+    const radius = radii[m]!;
+    if (!(v[8]! * px + v[9]! * py + v[10]! * pz + v[11]! + radius > camera.near)) continue;
+    let seen = true;
+    for (let i = 0; i < 16; i += 4) {
+      const distance = planes[i]! * px + planes[i + 1]! * py + planes[i + 2]! * pz + planes[i + 3]!;
+      if (distance < -radius) seen = false;
+    }
+    if (seen) into[count++] = m;
+  }
+  return count;
+}
+
+/** Four planes in the scene, each a unit normal inwards and a shift: left, right, top, bottom. */
+function sidePlanes(camera: Camera): Float64Array {
+  const { K, width, height, viewmat: v } = camera;
+  const slopes = [
+    [0, 1, (K.cx + MARGIN * width) / K.fx],
+    [0, -1, ((1 + MARGIN) * width - K.cx) / K.fx],
+    [4, 1, (K.cy + MARGIN * height) / K.fy],
+    [4, -1, ((1 + MARGIN) * height - K.cy) / K.fy],
+  ] as const;
+  const planes = new Float64Array(16);
+  slopes.forEach(([row, sign, slope], i) => {
+    const size = Math.hypot(1, slope);
+    for (let j = 0; j < 4; j++) planes[4 * i + j] = (sign * v[row + j]! + slope * v[8 + j]!) / size;
+  });
+  return planes;
+}
+
+/**
+ * Keeps of the first `count` anchors in `seen` about those `keep` that look largest, in their order; how many are left, at
+ * most `keep`.
+ */
+export function largestAnchors(
+  placement: Placement,
+  camera: Camera,
+  seen: Uint32Array,
+  count: number,
+  keep: number,
+): number {
+  if (count <= keep) return count;
+  const { positions, extents } = placement;
+  const v = camera.viewmat;
+  const histogram = new Uint32Array(SIZE_BINS);
+  const bins = new Uint16Array(count);
+  for (let i = 0; i < count; i++) {
+    const at = 3 * seen[i]!;
+    const z = v[8]! * positions[at]! + v[9]! * positions[at + 1]! + v[10]! * positions[at + 2]! + v[11]!;
+    const octaves = Math.log2(extents[seen[i]!]! / Math.max(z, camera.near));
+    const bin = Math.min(Math.max(Math.floor(SIZE_BINS / 2 + OCTAVE_BINS * octaves) || 0, 0), SIZE_BINS - 1);
+    bins[i] = bin;
+    histogram[bin]!++;
+  }
+  let least = SIZE_BINS - 1;
+  let larger = 0;
+  while (larger + histogram[least]! <= keep && least > 0) larger += histogram[least--]!;
+  // Of the bin that does not fit whole, every so-manieth stays, so that no corner of the picture loses all of them.
+  const share = (keep - larger) / Math.max(histogram[least]!, 1);
+  let [kept, owed] = [0, 0];
+  for (let i = 0; i < count; i++) {
+    if (bins[i]! < least) continue;
+    if (bins[i] === least) {
+      owed += share;
+      if (owed < 1) continue;
+      owed -= 1;
+    }
+    seen[kept++] = seen[i]!;
+  }
+  return kept;
+}

@@ -1,0 +1,83 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Where everything is: what does not depend on the camera, computed once for each state of the scene. */
+
+import type { FieldName } from "@structgstream/core";
+
+/** The fields that say where splats are. */
+export const PLACING_FIELDS = ["anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "free"] as const;
+export type PlacingField = (typeof PLACING_FIELDS)[number] & FieldName;
+
+/** Their numbers, and what their shapes say. */
+export interface PlacingState {
+  readonly arrays: ReadonlyMap<PlacingField, Float32Array>;
+  readonly offsetsPerAnchor: number;
+  readonly freeColumns: number;
+}
+
+/** A Gaussian ends within so many standard deviations: alpha = 1/255 is reached before 3.33 at any opacity. */
+const BALL_DEVIATIONS = 3.4;
+
+/** Splat `m * K + k` is that of anchor `m`, `M * K + i` is free Gaussian `i`. */
+export class Placement {
+  anchors = 0;
+  free = 0;
+  offsetsPerAnchor = 1;
+  /** [M, 3], the state's own. */
+  positions = new Float32Array(0);
+  /** [M * K + F, 3] */
+  centers = new Float32Array(0);
+  /** [M] of a ball around the anchor that holds all its Gaussians. */
+  radii = new Float32Array(0);
+  /** [M] the largest standard deviation that a Gaussian of the anchor can have. */
+  extents = new Float32Array(0);
+
+  set(state: PlacingState): void {
+    const positions = array(state, "anchor_positions");
+    const offsetScales = array(state, "offset_scales");
+    const baseScales = array(state, "base_scales");
+    const offsets = array(state, "anchor_offsets");
+    const free = array(state, "free");
+    const k = state.offsetsPerAnchor;
+    this.positions = positions;
+    this.offsetsPerAnchor = k;
+    this.anchors = positions.length / 3;
+    this.free = free.length / state.freeColumns;
+    const splats = this.anchors * k + this.free;
+    if (this.centers.length !== 3 * splats) this.centers = new Float32Array(3 * splats);
+    if (this.radii.length !== this.anchors) {
+      this.radii = new Float32Array(this.anchors);
+      this.extents = new Float32Array(this.anchors);
+    }
+    this.placeAnchors(offsets, offsetScales, baseScales);
+    for (let i = 0, to = 3 * this.anchors * k, from = 0; i < this.free; i++, to += 3, from += state.freeColumns) {
+      this.centers[to] = free[from]!;
+      this.centers[to + 1] = free[from + 1]!;
+      this.centers[to + 2] = free[from + 2]!;
+    }
+  }
+
+  private placeAnchors(offsets: Float32Array, offsetScales: Float32Array, baseScales: Float32Array): void {
+    const { positions, centers, radii, extents, offsetsPerAnchor: k } = this;
+    for (let m = 0, a = 0, to = 0; m < this.anchors; m++, a += 3) {
+      const [x, y, z] = [positions[a]!, positions[a + 1]!, positions[a + 2]!];
+      const [sx, sy, sz] = [Math.exp(offsetScales[a]!), Math.exp(offsetScales[a + 1]!), Math.exp(offsetScales[a + 2]!)];
+      let reach = 0;
+      for (let j = 0; j < k; j++, to += 3) {
+        const [dx, dy, dz] = [offsets[to]! * sx, offsets[to + 1]! * sy, offsets[to + 2]! * sz];
+        centers[to] = x + dx;
+        centers[to + 1] = y + dy;
+        centers[to + 2] = z + dz;
+        reach = Math.max(reach, dx * dx + dy * dy + dz * dz);
+      }
+      extents[m] = Math.exp(Math.max(baseScales[a]!, baseScales[a + 1]!, baseScales[a + 2]!));
+      radii[m] = Math.sqrt(reach) + BALL_DEVIATIONS * extents[m]!;
+    }
+  }
+}
+
+function array(state: PlacingState, name: PlacingField): Float32Array<ArrayBuffer> {
+  const found = state.arrays.get(name);
+  // A message of this package's own making: that it is whole is not the user's concern.
+  if (!found) throw new TypeError(`the sorter was given a state without ${name}`);
+  return found as Float32Array<ArrayBuffer>;
+}

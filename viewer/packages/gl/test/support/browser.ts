@@ -1,0 +1,108 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A headless browser with WebGL2 in software, and a server on this machine for what it shows. */
+
+import { existsSync } from "node:fs";
+import { readFile } from "node:fs/promises";
+import { createServer, type Server } from "node:http";
+import type { AddressInfo } from "node:net";
+import { fileURLToPath } from "node:url";
+import { build } from "esbuild";
+import { type Browser, chromium, type Page } from "playwright-core";
+
+const USUAL_PLACES = [
+  "/usr/bin/chromium",
+  "/usr/bin/chromium-browser",
+  "/usr/bin/google-chrome",
+  "/usr/bin/chromium-headless-shell",
+  "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+];
+/** Software GL, and no warning that it is. */
+const FLAGS = [
+  "--no-sandbox",
+  "--use-angle=swiftshader",
+  "--enable-unsafe-swiftshader",
+  "--ignore-gpu-blocklist",
+  "--enable-gpu",
+];
+
+/** Where a browser is: the variable CHROMIUM, or one of the usual places; undefined says that tests must skip. */
+export function chromiumPath(): string | undefined {
+  const named = process.env.CHROMIUM;
+  const found = named || USUAL_PLACES.find(existsSync);
+  if (!found) console.warn("Browser tests are skipped: no Chromium; set CHROMIUM to its path.");
+  return found;
+}
+
+/** One page with the renderer in it, and what went wrong on it. */
+export interface Stage {
+  readonly page: Page;
+  /** Errors of the page and of its console. */
+  readonly complaints: string[];
+  close(): Promise<void>;
+}
+
+/**
+ * @param files what the server gives besides the page, by name: paths on this machine
+ * @param script what runs in the page; it sets `globalThis.stage`
+ */
+export async function openStage(
+  executablePath: string,
+  files: Readonly<Record<string, string>>,
+  script = new URL("page.ts", import.meta.url),
+): Promise<Stage> {
+  const sorterScript = new URL("../../src/sorter.worker.ts", import.meta.url);
+  const [page, sorter] = await Promise.all([script, sorterScript].map((url) => bundled(fileURLToPath(url))));
+  const content: Record<string, Uint8Array | string> = {
+    "/": '<!doctype html><meta charset="utf-8"><title>stage</title><link rel="icon" href="data:,"><script type="module" src="/page.js"></script>',
+    "/page.js": page,
+    "/sorter.js": sorter,
+    "/sorter.worker.js": sorter,
+  };
+  const server = createServer(async (request, response) => {
+    const name = new URL(request.url ?? "/", "http://localhost").pathname;
+    const path = files[name.slice(1)];
+    const body = content[name] ?? (path === undefined ? undefined : await readFile(path));
+    const type = name === "/" ? "text/html" : name.endsWith(".js") ? "text/javascript" : "application/octet-stream";
+    response.writeHead(body === undefined ? 404 : 200, { "content-type": type });
+    response.end(body);
+  });
+  await new Promise<void>((resolve) => server.listen(0, "127.0.0.1", resolve));
+  let browser: Browser | undefined;
+  try {
+    browser = await chromium.launch({ executablePath, args: FLAGS });
+    const opened = await browser.newPage();
+    const complaints: string[] = [];
+    opened.on("pageerror", (error) => complaints.push(error.message));
+    opened.on("console", (message) => {
+      const text = message.text();
+      // The page has no icon, and software GL says so of itself when pixels are read.
+      const usual = text.includes("favicon") || text.includes("GPU stall due to ReadPixels");
+      if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
+    });
+    await opened.goto(`http://127.0.0.1:${(server.address() as AddressInfo).port}/`);
+    await opened.waitForFunction("globalThis.stage !== undefined");
+    const running = browser;
+    return { page: opened, complaints, close: () => closed(running, server) };
+  } catch (error) {
+    await closed(browser, server);
+    throw error;
+  }
+}
+
+async function closed(browser: Browser | undefined, server: Server): Promise<void> {
+  await browser?.close();
+  server.closeAllConnections();
+  await new Promise<void>((resolve) => server.close(() => resolve()));
+}
+
+async function bundled(entry: string): Promise<string> {
+  const result = await build({
+    entryPoints: [entry],
+    bundle: true,
+    format: "esm",
+    target: "es2022",
+    write: false,
+    logLevel: "warning",
+  });
+  return result.outputFiles[0]!.text;
+}

@@ -1,0 +1,174 @@
+// SPDX-License-Identifier: Apache-2.0
+/** What runs in the browser: a stream, a renderer, and what tests ask of both. */
+
+import { readStream, type StreamReader } from "@structgstream/core";
+import {
+  type Camera,
+  type RendererOptions,
+  type RenderOptions,
+  type RenderStats,
+  rigCamera,
+  SplatRenderer,
+} from "../../src/main.js";
+import { HeldWorker } from "./heldWorker.js";
+import { mlpOutputs } from "./mlpOutputs.js";
+import { base64, pixelsOf } from "./pixels.js";
+import { timed } from "./timing.js";
+
+/** A camera as JSON has it. */
+export type PlainCamera = Omit<Camera, "viewmat"> & { readonly viewmat: readonly number[] };
+type PlainOptions = Omit<RendererOptions, "sorter"> & {
+  readonly device?: Lesser;
+  readonly sorterPath?: string;
+  readonly ownSorter?: boolean;
+};
+
+/** A device that can do less than this one. */
+export interface Lesser {
+  /** By the names of `getParameter`'s constants. */
+  readonly limits?: Readonly<Record<string, number>>;
+  readonly withoutExtensions?: readonly string[];
+  readonly withoutWebGL2?: boolean;
+}
+
+export function cameraOf(plain: PlainCamera): Camera {
+  return { ...plain, viewmat: Float64Array.from(plain.viewmat) };
+}
+
+/** A renderer on a canvas of its own, with one stream. */
+export class Play {
+  readonly canvas = document.createElement("canvas");
+  readonly renderer: SplatRenderer;
+  readonly sorter: HeldWorker;
+  readonly events: string[] = [];
+  private given = new Map<string, unknown>();
+
+  constructor(
+    readonly reader: StreamReader,
+    options: PlainOptions,
+  ) {
+    document.body.append(this.canvas);
+    if (options.device) lessen(this.canvas, options.device);
+    this.sorter = new HeldWorker(new Worker(options.sorterPath ?? "/sorter.js", { type: "module" }));
+    // Without one, the renderer starts the file that lies beside its own.
+    const sorter = options.ownSorter ? {} : { sorter: this.sorter as unknown as Worker };
+    this.renderer = new SplatRenderer(this.canvas, { ...options, ...sorter });
+    this.renderer.onContextLost = () => this.events.push("lost");
+    this.renderer.onContextRestored = () => this.events.push("restored");
+    this.renderer.onError = (error) => this.events.push(`error: ${error.message}`);
+    this.renderer.load(reader.header!);
+  }
+
+  /** Gives the renderer what has changed, as a decode worker would: in arrays of their own. */
+  frame(index: number): void {
+    const { ptsSeconds, fields } = this.reader.frame(index);
+    const changed = new Map(
+      [...fields]
+        .filter(([name, tensor]) => this.reader.header!.dynamic.has(name) && this.given.get(name) !== tensor)
+        .map(([name, tensor]) => {
+          this.given.set(name, tensor);
+          return [name, { shape: tensor.shape, data: tensor.data.slice() }] as const;
+        }),
+    );
+    this.renderer.update({ index, ptsSeconds, fields: changed });
+  }
+
+  rig(name: string): Camera {
+    return rigCamera(this.reader.header!, name);
+  }
+
+  async picture(plain: PlainCamera, options?: RenderOptions): Promise<{ stats: RenderStats; rgba: string }> {
+    const stats = await this.renderer.renderSettled(cameraOf(plain), options);
+    return { stats, rgba: await this.pixels() };
+  }
+
+  /** A picture in the order there is, whatever it is the order for. */
+  async unsorted(plain: PlainCamera): Promise<{ stats: RenderStats; rgba: string }> {
+    for (;;) {
+      const stats = this.renderer.render(cameraOf(plain));
+      if (stats.drawn) return { stats, rgba: await this.pixels() };
+      await new Promise((resolve) => setTimeout(resolve, 5)); // the GPU is still at the one before
+    }
+  }
+
+  /** The picture shown last, RGBA, as base64. */
+  async pixels(): Promise<string> {
+    return base64(await pixelsOf(await this.renderer.screenshot()));
+  }
+
+  /** What the MLPs say, and of which anchors, as base64 of numbers. */
+  outputs(): { anchors: string; outputs: string } {
+    const { anchors, outputs } = mlpOutputs(this.renderer);
+    return { anchors: base64(anchors), outputs: base64(outputs) };
+  }
+
+  close(): void {
+    this.renderer.destroy();
+    this.canvas.remove();
+  }
+}
+
+export async function open(url: string, options: PlainOptions = {}): Promise<Play> {
+  const answer = await fetch(url);
+  return new Play(readStream(new Uint8Array(await answer.arrayBuffer())), options);
+}
+
+/** Milliseconds on this thread of each of `repeats` frames in a row, from update to settled picture. */
+export async function played(play: Play, camera: Camera, repeats: number): Promise<{ calls: number[]; shown: number }> {
+  const frames = play.reader.packets.length;
+  const updates = Array.from({ length: Math.min(frames, 8) }, (_, index) => play.reader.frame(index));
+  const calls: number[] = [];
+  const seen = new Set<number | undefined>();
+  for (let i = 0; i < repeats; i++) {
+    const frame = updates[i % updates.length]!;
+    const fields = new Map(
+      [...frame.fields]
+        .filter(([name]) => play.reader.header!.dynamic.has(name))
+        .map(([name, { shape, data }]) => [name, { shape, data: data.slice() }] as const),
+    );
+    const viewmat = camera.viewmat.map((value, at) => (at === 3 ? value + 0.001 * i : value));
+    let began = performance.now();
+    play.renderer.update({ index: i, ptsSeconds: i, fields });
+    let spent = performance.now() - began;
+    for (;;) {
+      began = performance.now();
+      const stats = play.renderer.render({ ...camera, viewmat });
+      spent += performance.now() - began;
+      if (stats.drawn && stats.frameIndex !== undefined) seen.add(stats.frameIndex);
+      if (stats.settled) break;
+      await new Promise<void>((resolve) => {
+        play.renderer.onOrder = resolve;
+      });
+    }
+    calls.push(spent);
+  }
+  return { calls, shown: seen.size };
+}
+
+function lessen(canvas: HTMLCanvasElement, device: Lesser): void {
+  const open = canvas.getContext.bind(canvas) as (kind: string, attributes?: unknown) => WebGL2RenderingContext | null;
+  const lesser = (kind: string, attributes?: unknown) => {
+    if (device.withoutWebGL2) return null;
+    const gl = open(kind, attributes)!;
+    const getParameter = gl.getParameter.bind(gl);
+    const getExtension = gl.getExtension.bind(gl) as (name: string) => unknown;
+    const limits = new Map(
+      Object.entries(device.limits ?? {}).map(([name, limit]) => [gl[name as keyof WebGL2RenderingContext], limit]),
+    );
+    gl.getParameter = (name: number) => limits.get(name) ?? getParameter(name);
+    gl.getExtension = ((name: string) =>
+      device.withoutExtensions?.includes(name) ? null : getExtension(name)) as typeof gl.getExtension;
+    return gl;
+  };
+  canvas.getContext = lesser as unknown as typeof canvas.getContext;
+}
+
+export async function pngPixels(url: string): Promise<string> {
+  return base64(await pixelsOf(await (await fetch(url)).blob()));
+}
+
+const api = { open, pngPixels, timed, played, plays: [] as Play[] };
+declare global {
+  var stage: typeof api;
+}
+globalThis.stage = api;

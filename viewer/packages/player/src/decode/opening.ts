@@ -1,0 +1,186 @@
+// SPDX-License-Identifier: Apache-2.0
+/**
+ * The beginning of a stream: its header, and where its packets are.
+ *
+ * A stored file is opened by its first bytes, which tell its size, and its last ones, where the index is; then the rest of
+ * the init record is read, and nothing else. Without an index, or without ranges, all of it is read from its start on,
+ * and packets are found as they come.
+ */
+
+import {
+  FOOTER_BYTES,
+  type IndexEntry,
+  indexEntries,
+  indexOffset,
+  type StreamHeader,
+  StreamReader,
+} from "@structgstream/core";
+import type { ByteClient } from "./byteClient.js";
+
+const HEAD_BYTES = 4096;
+const TAIL_BYTES = 4096;
+/** More entries than this are not taken from an index: 3 hours at 100 frames a second. */
+const MOST_INDEX_BYTES = 2 ** 24;
+
+/** What comes out of opening, in this order: progress, the header, the index if there is one, then packets. */
+export interface OpeningEvents {
+  opening(loadedBytes: number, totalBytes: number | undefined): void;
+  /** `index` is given when it says where all packets are, with the byte where they end. */
+  header(header: StreamHeader, ranged: boolean, index: { entries: IndexEntry[]; end: number } | undefined): void;
+  /** The reader has packets that were not there before, or knows of damage; after `ended` nothing more comes. */
+  read(reader: StreamReader, ended: boolean): void;
+  waiting(seconds: number, problem: string | undefined): void;
+  failed(message: string): void;
+}
+
+export class Opening {
+  private readonly reader: StreamReader;
+  private ranged = true;
+  private fileBytes: number | undefined;
+  private loaded = 0;
+  private index: { entries: IndexEntry[]; end: number } | undefined;
+  /** What decides how everything else is read has been looked for. */
+  private lookedForIndex = false;
+  private announced = false;
+  private reading: number | undefined;
+
+  constructor(
+    private readonly client: ByteClient,
+    private readonly events: OpeningEvents,
+    name: string,
+    private readonly fromStart: boolean,
+  ) {
+    this.reader = new StreamReader(name);
+  }
+
+  begin(): void {
+    this.read(0, HEAD_BYTES, true, () => {
+      if (!this.ranged || this.fileBytes === undefined || this.loaded >= this.fileBytes) this.scan();
+      else this.readTail(Math.max(this.loaded, this.fileBytes - TAIL_BYTES), this.fileBytes);
+    });
+  }
+
+  /** Reads from `start` on into the reader; `then` when all has come. */
+  private read(start: number, end: number, wholeIfNeeded: boolean, then: () => void): void {
+    this.reading = this.client.read(start, end, wholeIfNeeded, {
+      begin: ({ fileBytes, ranged }) => {
+        this.fileBytes ??= fileBytes;
+        this.ranged &&= ranged || !wholeIfNeeded;
+        this.lookedForIndex ||= !this.ranged;
+      },
+      bytes: (bytes) => this.take(bytes),
+      end: then,
+      failed: (message) => this.events.failed(message),
+      waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+    });
+  }
+
+  private readTail(start: number, fileBytes: number): void {
+    const parts: Uint8Array[] = [];
+    this.client.read(start, fileBytes, false, {
+      bytes: (bytes) => parts.push(bytes),
+      end: () => this.lookAtTail(joined(parts), start, fileBytes),
+      failed: (message) => this.events.failed(message),
+      waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+    });
+  }
+
+  private lookAtTail(tail: Uint8Array, start: number, fileBytes: number): void {
+    const footer = tail.subarray(-FOOTER_BYTES);
+    const offset = start + tail.length === fileBytes ? indexOffset(footer, fileBytes) : undefined;
+    if (offset === undefined || fileBytes - offset > MOST_INDEX_BYTES) this.scan();
+    else if (offset < start) this.readTail(offset, fileBytes);
+    else this.useIndex(indexEntries(tail.subarray(offset - start, -FOOTER_BYTES), offset), offset);
+  }
+
+  private useIndex(entries: IndexEntry[] | undefined, offset: number): void {
+    const first = entries?.[0];
+    if (!entries || !first) {
+      this.scan();
+      return;
+    }
+    this.index = { entries, end: offset };
+    this.lookedForIndex = true;
+    const end = this.fromStart ? (entries[1]?.offset ?? offset) : first.offset;
+    if (this.loaded >= end) this.headerByIndex(end);
+    else this.read(this.loaded, end, false, () => this.headerByIndex(end));
+  }
+
+  /** All up to `end` has been read; a damaged index would leave the header out of it. */
+  private headerByIndex(end: number): void {
+    if (this.announced) return;
+    this.index = undefined;
+    if (this.loaded >= end) this.scan();
+  }
+
+  /** Reads all that is left, and what is appended. */
+  private scan(): void {
+    this.lookedForIndex = true;
+    this.announceIfThere();
+    this.reading = this.client.follow(this.loaded, {
+      begin: ({ fileBytes }) => {
+        this.fileBytes = fileBytes ?? this.fileBytes;
+      },
+      bytes: (bytes) => this.take(bytes),
+      end: () => this.finish(),
+      failed: (message) => this.events.failed(message),
+      waiting: (seconds, problem) => {
+        if (!this.announced && problem === undefined && this.loaded >= (this.fileBytes ?? 0)) {
+          this.events.opening(this.loaded, undefined);
+        }
+        this.events.waiting(seconds, problem);
+      },
+    });
+  }
+
+  private finish(): void {
+    this.guarded(() => {
+      this.reader.finish();
+      this.events.read(this.reader, true);
+    });
+  }
+
+  private take(bytes: Uint8Array): void {
+    this.loaded += bytes.length;
+    this.guarded(() => {
+      this.reader.push(bytes);
+      const complete = this.reader.state === "complete";
+      this.lookedForIndex ||= complete;
+      if (!this.announced) this.events.opening(this.loaded, this.index?.entries[0]?.offset ?? this.fileBytes);
+      this.announceIfThere();
+      if (this.announced) this.events.read(this.reader, complete);
+      if (complete) this.stop();
+    });
+  }
+
+  private announceIfThere(): void {
+    const { header } = this.reader;
+    if (this.announced || !header || !this.lookedForIndex) return;
+    this.announced = true;
+    this.events.header(header, this.ranged, this.index);
+    this.events.read(this.reader, false);
+  }
+
+  private guarded(action: () => void): void {
+    try {
+      action();
+    } catch (error) {
+      this.stop();
+      this.events.failed(error instanceof Error ? error.message : String(error));
+    }
+  }
+
+  private stop(): void {
+    if (this.reading !== undefined) this.client.cancel(this.reading);
+  }
+}
+
+function joined(parts: readonly Uint8Array[]): Uint8Array {
+  const whole = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0));
+  let at = 0;
+  for (const part of parts) {
+    whole.set(part, at);
+    at += part.length;
+  }
+  return whole;
+}

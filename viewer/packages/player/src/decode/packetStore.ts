@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Packets that were fetched, in a bounded number of bytes. */
+
+import type { Packet } from "@structgstream/core";
+import type { FrameRange } from "./messages.js";
+
+/** So much is let go of at once, so that not every packet has to look for another's place. */
+const LEFT = 0.9;
+
+export class PacketStore {
+  private readonly packets = new Map<number, Packet>();
+  private bytes = 0;
+
+  /** @param budgetBytes the most that payloads may take, but for the one packet that is needed now */
+  constructor(readonly budgetBytes: number) {}
+
+  has(index: number): boolean {
+    return this.packets.has(index);
+  }
+
+  get(index: number): Packet | undefined {
+    return this.packets.get(index);
+  }
+
+  /**
+   * Keeps a packet. When there is no room, others go: those before frame `first` first, then those farthest after it.
+   *
+   * @returns whether it was kept: one that is farther than all others is not
+   */
+  put(packet: Packet, first: number): boolean {
+    if (this.packets.has(packet.index)) return true;
+    this.packets.set(packet.index, packet);
+    this.bytes += packet.payload.length;
+    if (this.bytes > this.budgetBytes) this.makeRoom(first);
+    return this.packets.has(packet.index);
+  }
+
+  /** Frames whose packets are there. */
+  ranges(): FrameRange[] {
+    const ranges: FrameRange[] = [];
+    for (const index of [...this.packets.keys()].sort((a, b) => a - b)) {
+      const last = ranges.at(-1);
+      if (last?.[1] === index) ranges[ranges.length - 1] = [last[0], index + 1];
+      else ranges.push([index, index + 1]);
+    }
+    return ranges;
+  }
+
+  private makeRoom(first: number): void {
+    const distance = (index: number) => (index < first ? Number.MAX_SAFE_INTEGER - index : index - first);
+    const farthest = [...this.packets.keys()].sort((a, b) => distance(b) - distance(a));
+    for (const index of farthest) {
+      if (this.bytes <= LEFT * this.budgetBytes || index === first) return;
+      this.bytes -= this.packets.get(index)!.payload.length;
+      this.packets.delete(index);
+    }
+  }
+}

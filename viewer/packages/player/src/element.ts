@@ -1,0 +1,343 @@
+// SPDX-License-Identifier: Apache-2.0
+/**
+ * `<structgstream-player src="stream.sgs">`
+ *
+ * | attribute | meaning |
+ * |---|---|
+ * | `src` | address of a stream, or `#id` of an element of the page that holds one as base64 |
+ * | `autoplay`, `loop` | as of a video |
+ * | `controls="off"` | no controls; the picture can still be turned |
+ * | `embed` | few controls |
+ * | `theme` | `dark` or `light`; otherwise as the system's |
+ * | `truth` | address of a list of cameras that have pictures, `truth.json`; they are at `truth/CAMERA/FRAME.jpg` beside it |
+ * | `isolated` | the page's address (`?src=&t=&view=&embed=1`) means nothing to this player |
+ */
+
+import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
+import type { Engine } from "./engine/engine.js";
+import type { TimeRange } from "./engine/events.js";
+import { startedPipeline } from "./pipeline.js";
+import { Player, type PlayerEvents } from "./player.js";
+import { startedWorker } from "./scripts.js";
+import type { SourceDescription } from "./source/description.js";
+import { STYLES } from "./ui/styles.js";
+import { Surface } from "./ui/surface.js";
+import { type Link, linkOf, viewFrom } from "./view/link.js";
+import { viewOf } from "./view/navigator.js";
+import { QualityControl } from "./view/quality.js";
+
+interface Running {
+  readonly player: Player;
+  readonly surface: Surface;
+  readonly observer: ResizeObserver;
+}
+
+type Name = keyof PlayerEvents;
+
+export class StructgstreamPlayer extends HTMLElement {
+  static readonly observedAttributes = ["src", "loop", "controls", "embed"];
+  private running: Running | undefined;
+  private readonly listeners: { readonly name: Name; readonly listener: (event: never) => void; off?: () => void }[] =
+    [];
+  private ticking: number | undefined;
+  private link: Link | undefined;
+  /** The stream's address where a link can lead to it. */
+  private linked: string | undefined;
+
+  connectedCallback(): void {
+    this.link ??= this.hasAttribute("isolated") ? undefined : linkOf(new URL(location.href));
+    if (!this.running) this.start();
+    if (!this.running) return;
+    this.ticking ??= requestAnimationFrame(this.tick);
+  }
+
+  disconnectedCallback(): void {
+    // An element that is only being moved is connected again before this runs.
+    queueMicrotask(() => {
+      if (!this.isConnected) this.stop();
+    });
+  }
+
+  attributeChangedCallback(name: string, before: string | null, after: string | null): void {
+    if (!this.running || before === after) return;
+    if (name === "src") this.openAttribute();
+    else if (name === "loop") this.running.player.setLoop(after !== null);
+    else this.applyAttributes(this.running.surface);
+  }
+
+  /** Opens a stream: an address, a file, or bytes. */
+  load(source: string | Blob, seconds = 0): void {
+    if (typeof source === "string") this.open(this.described(source), seconds);
+    else this.open({ kind: "blob", blob: source, name: source instanceof File ? source.name : "The stream" }, seconds);
+  }
+
+  play(): void {
+    this.engine?.play();
+  }
+
+  pause(): void {
+    this.engine?.pause();
+  }
+
+  seek(seconds: number): void {
+    this.engine?.seek(seconds);
+  }
+
+  /** Pauses, and goes so many frames on or back. */
+  step(frames: number): void {
+    this.engine?.step(frames);
+  }
+
+  get playbackRate(): number {
+    return this.running?.player.playbackRate ?? 1;
+  }
+
+  set playbackRate(rate: number) {
+    if (this.running) this.running.player.playbackRate = rate;
+  }
+
+  get loop(): boolean {
+    return this.running?.player.loop ?? this.hasAttribute("loop");
+  }
+
+  set loop(loop: boolean) {
+    this.toggleAttribute("loop", loop);
+    this.running?.player.setLoop(loop);
+  }
+
+  get currentTime(): number {
+    return this.engine?.currentTime ?? 0;
+  }
+
+  set currentTime(seconds: number) {
+    this.seek(seconds);
+  }
+
+  get duration(): number {
+    return this.engine?.durationSeconds ?? Number.NaN;
+  }
+
+  get paused(): boolean {
+    return this.engine?.paused ?? true;
+  }
+
+  get buffered(): readonly TimeRange[] {
+    return this.engine?.buffered ?? [];
+  }
+
+  /** The camera of the picture, in scene units; one that is set is flown to no more than it is looked through. */
+  get camera(): Camera | undefined {
+    return this.running?.player.camera;
+  }
+
+  set camera(camera: Camera | undefined) {
+    const player = this.running?.player;
+    if (camera && player?.rig) player.flyToView(viewOf(camera, player.rig.focus), 0);
+  }
+
+  /** Names of the rig's cameras. */
+  get cameras(): readonly string[] {
+    return this.running?.player.rig?.cameras.map(({ name }) => name) ?? [];
+  }
+
+  /** Flies to a camera of the rig, in so many seconds. */
+  show(camera: string, seconds = 0): void {
+    const found = this.running?.player.rig?.cameras.find(({ name }) => name === camera);
+    if (!found)
+      throw new RangeError(`The stream has no camera ${camera}; it has ${this.cameras.join(", ") || "none"}.`);
+    this.running!.player.flyTo(found, seconds);
+  }
+
+  /** What the last picture took. */
+  get stats(): RenderStats | undefined {
+    return this.running?.player.stats;
+  }
+
+  /** What decoding a packet took in its worker, on the way to the last frame. */
+  get decodeMilliseconds(): number {
+    return this.engine?.decodeMilliseconds ?? 0;
+  }
+
+  /** What the renderer holds. */
+  get resources(): ResourceCounts | undefined {
+    return this.running?.player.resources;
+  }
+
+  /** Listens to the player; what comes back ends the listening. Kept when another stream is loaded. */
+  on<EventName extends Name>(name: EventName, listener: (event: PlayerEvents[EventName]) => void): () => void {
+    const entry: (typeof this.listeners)[number] = { name, listener: listener as (event: never) => void };
+    this.listeners.push(entry);
+    if (this.running) entry.off = this.running.player.on(name, listener);
+    return () => {
+      entry.off?.();
+      this.listeners.splice(this.listeners.indexOf(entry), 1);
+    };
+  }
+
+  /** The picture as it is, as PNG. */
+  async screenshot(): Promise<Blob> {
+    if (!this.running) throw new Error("There is no picture: the player is not in a page, or was destroyed.");
+    return this.running.player.screenshot();
+  }
+
+  /** Ends workers and gives back all memory. The element can be put into a page again. */
+  destroy(): void {
+    this.stop();
+    this.remove();
+  }
+
+  private get engine(): Engine | undefined {
+    return this.running?.player.engine;
+  }
+
+  private start(): void {
+    const root = this.shadowRoot ?? this.attachShadow({ mode: "open" });
+    const style = document.createElement("style");
+    style.textContent = STYLES;
+    const canvas = document.createElement("canvas");
+    const quality = new QualityControl(deviceOf(navigator));
+    let player: Player;
+    try {
+      player = new Player({
+        renderer: new SplatRenderer(canvas, { sorter: startedWorker("sort") }),
+        quality,
+        startPipeline: startedPipeline,
+        now: () => performance.now() / 1000,
+      });
+    } catch (error) {
+      this.startWithout(root, style, error);
+      return;
+    }
+    const surface = new Surface({
+      host: this,
+      canvas,
+      player,
+      quality,
+      open: (source) => this.open(source),
+      saveScreenshot: () => void this.save(),
+      linkedSource: () => this.linked,
+    });
+    root.replaceChildren(style, surface.root);
+    const observer = new ResizeObserver(() => this.resized());
+    observer.observe(this);
+    this.running = { player, surface, observer };
+    for (const entry of this.listeners) entry.off = player.on(entry.name, entry.listener as (event: unknown) => void);
+    player.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    player.setLoop(this.hasAttribute("loop"));
+    this.applyAttributes(surface);
+    this.resized();
+    const refused = this.link?.refused ?? [];
+    this.openAttribute();
+    for (const sentence of refused) surface.say(sentence);
+    const truth = this.getAttribute("truth");
+    if (truth !== null) surface.compare.attach(new URL(truth, document.baseURI)).catch(() => undefined);
+  }
+
+  /** There is no WebGL2, and a sentence says so. */
+  private startWithout(root: ShadowRoot, style: Node, error: unknown): void {
+    const text = document.createElement("p");
+    text.textContent = error instanceof Error ? error.message : String(error);
+    text.setAttribute("role", "alert");
+    const middle = document.createElement("div");
+    middle.className = "middle bad";
+    middle.append(text);
+    root.replaceChildren(style, middle);
+    for (const { name, listener } of this.listeners) {
+      if (name === "error") (listener as (event: unknown) => void)({ message: text.textContent, fatal: true });
+    }
+  }
+
+  private stop(): void {
+    if (this.ticking !== undefined) cancelAnimationFrame(this.ticking);
+    this.ticking = undefined;
+    const { running } = this;
+    this.running = undefined;
+    running?.observer.disconnect();
+    running?.player.destroy();
+    for (const entry of this.listeners) delete entry.off;
+    this.shadowRoot?.replaceChildren();
+  }
+
+  private readonly tick = (): void => {
+    this.ticking = requestAnimationFrame(this.tick);
+    this.running?.player.tick();
+    this.running?.surface.tick();
+  };
+
+  private applyAttributes(surface: Surface): void {
+    surface.controls = this.getAttribute("controls") !== "off";
+    surface.embed = this.hasAttribute("embed") || this.link?.embed === true;
+  }
+
+  private openAttribute(): void {
+    const linked = this.link?.src;
+    const own = this.getAttribute("src");
+    // A link names a stream of its own origin, and no redirection leads out of it.
+    if (linked !== undefined) this.open({ kind: "url", url: linked, name: nameOf(linked), sameOrigin: true });
+    else if (own !== null) this.open(this.described(own));
+    else this.running?.surface.invite();
+  }
+
+  private described(source: string): SourceDescription {
+    if (source.startsWith("#")) {
+      const text = document.getElementById(source.slice(1))?.textContent;
+      return { kind: "base64", text: text ?? "", name: `The page's ${source}` };
+    }
+    const { href } = new URL(source, document.baseURI);
+    return { kind: "url", url: href, name: nameOf(href) };
+  }
+
+  private open(source: SourceDescription, seconds?: number): void {
+    const { running, link } = this;
+    if (!running) return;
+    const { player, surface } = running;
+    const at = seconds ?? link?.seconds ?? 0;
+    const view = link?.view;
+    this.link = undefined; // a link is of the first stream only
+    this.linked = source.kind === "url" && new URL(source.url).origin === location.origin ? source.url : undefined;
+    if (source.kind === "base64") this.linked = undefined;
+    const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
+    surface.begin(source.name);
+    if (this.hasAttribute("autoplay")) engine.play();
+  }
+
+  private resized(): void {
+    if (!this.running) return;
+    const { width, height } = this.getBoundingClientRect();
+    this.running.player.resize(width * devicePixelRatio, height * devicePixelRatio);
+    this.running.surface.resize(width);
+  }
+
+  private async save(): Promise<void> {
+    try {
+      const url = URL.createObjectURL(await this.screenshot());
+      const anchor = document.createElement("a");
+      anchor.href = url;
+      anchor.download = `frame-${this.running?.player.stats?.frameIndex ?? 0}.png`;
+      anchor.click();
+      setTimeout(() => URL.revokeObjectURL(url), 10_000);
+    } catch (error) {
+      this.running?.surface.say(error instanceof Error ? error.message : String(error), true);
+    }
+  }
+}
+
+function nameOf(url: string): string {
+  return decodedName(new URL(url).pathname.split("/").at(-1) ?? "") || "The stream";
+}
+
+function decodedName(name: string): string {
+  try {
+    return decodeURIComponent(name);
+  } catch {
+    return name;
+  }
+}
+
+function deviceOf(browser: Navigator & { readonly deviceMemory?: number }) {
+  return {
+    coarsePointer: matchMedia("(pointer: coarse)").matches,
+    memoryGigabytes: browser.deviceMemory,
+    processors: browser.hardwareConcurrency,
+  };
+}

@@ -1,0 +1,399 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Playback without a page: a clock, frames that come from a decoder, and what to do when they do not. */
+
+import type { StreamHeader } from "@structgstream/core";
+import type { SceneUpdate } from "@structgstream/gl";
+import type { Demand, FrameRange, FromDecoder, PacketFacts, ToDecoder } from "../decode/messages.js";
+import type { SourceDescription } from "../source/description.js";
+import { MediaClock } from "./clock.js";
+import { GrowingEdge } from "./edge.js";
+import { Emitter } from "./emitter.js";
+import type { EngineEvents, TimeRange } from "./events.js";
+import { FrameQueue } from "./frameQueue.js";
+import { Timeline } from "./timeline.js";
+
+/** The decoder's end of the line. */
+export interface Pipeline {
+  send(message: ToDecoder): void;
+  onmessage: ((message: FromDecoder) => void) | undefined;
+  close(): void;
+}
+
+export interface EngineOptions {
+  /** Packets are kept in no more bytes than these. */
+  readonly budgetBytes?: number;
+  /** While playing, packets are fetched for so many seconds ahead. */
+  readonly aheadSeconds?: number;
+}
+
+const BUDGET_BYTES = 64 * 2 ** 20;
+const AHEAD_SECONDS = 10;
+/** Decoded frames wait in a queue, which takes memory: few are enough to even out decoding. */
+const LEAD_SECONDS = 0.15;
+const LEAST_LEAD = 3;
+const MOST_LEAD = 8;
+/** After a stall so much is waited for, or the next one would follow at once. */
+const REBUFFER_SECONDS = 0.5;
+const MOST_REBUFFER_SECONDS = 3;
+const RATES: readonly [number, number] = [0.05, 16];
+const REMEMBERED_PACKETS = 4096;
+
+export class Engine extends Emitter<EngineEvents> {
+  loop = false;
+  header: StreamHeader | undefined;
+  private readonly clock = new MediaClock();
+  private readonly queue = new FrameQueue();
+  private readonly edge = new GrowingEdge();
+  private readonly facts = new Map<number, PacketFacts>();
+  private timeline = new Timeline(1);
+  private stored: readonly FrameRange[] = [];
+  private fetched = 0;
+  private startSeconds: number | undefined;
+  private name = "The stream";
+  private serial = 0;
+  private target = 0;
+  /** The last frame that can be drawn or need not be waited for. */
+  private reached = -1;
+  private demanded: Demand | undefined;
+  private wantsToPlay = false;
+  private isSeeking = false;
+  private isStalled = false;
+  private hasEnded = false;
+  /** Since when a stalled clock could go on. */
+  private readySince: number | undefined;
+  private failed = false;
+  private lastDecodeMilliseconds = 0;
+
+  /** @param now seconds of a clock that only goes forward */
+  constructor(
+    private readonly pipeline: Pipeline,
+    private readonly now: () => number,
+    private readonly options: EngineOptions = {},
+  ) {
+    super();
+    pipeline.onmessage = (message) => this.hear(message);
+  }
+
+  /** Opens a stream and shows its frame at `startSeconds`. An engine opens one in its life. */
+  load(source: SourceDescription, startSeconds = 0): void {
+    this.startSeconds = startSeconds;
+    this.name = source.name;
+    const budgetBytes = this.options.budgetBytes ?? BUDGET_BYTES;
+    this.pipeline.send({ type: "open", source, fromStart: startSeconds <= 0, budgetBytes });
+  }
+
+  play(): void {
+    if (this.failed || this.wantsToPlay) return;
+    this.wantsToPlay = true;
+    if (this.hasEnded) this.seekFrame(0);
+    else if (!this.isSeeking && this.timeline.count) this.clock.start(this.now());
+    this.emit("state", {});
+  }
+
+  pause(): void {
+    if (!this.wantsToPlay) return;
+    this.wantsToPlay = false;
+    this.clock.stop(this.now());
+    this.setStalled(false);
+    this.emit("state", {});
+  }
+
+  /** Goes to a time; the frame there is drawn when it has come, the key frame before it as soon as that has. */
+  seek(seconds: number): void {
+    if (!this.timeline.count) {
+      this.startSeconds = seconds;
+      return;
+    }
+    const time = Math.min(Math.max(seconds, 0), this.timeline.duration);
+    this.begin(this.timeline.frameAt(time), time);
+  }
+
+  seekFrame(index: number): void {
+    const frame = Math.min(Math.max(Math.round(index), 0), Math.max(this.timeline.count - 1, 0));
+    this.begin(frame, this.timeline.ptsOf(frame));
+  }
+
+  /** Pauses, and goes so many frames on or back. */
+  step(frames: number): void {
+    this.pause();
+    this.seekFrame(this.frameIndex + frames);
+  }
+
+  get playbackRate(): number {
+    return this.clock.rate;
+  }
+
+  set playbackRate(rate: number) {
+    if (!Number.isFinite(rate) || rate <= 0) {
+      throw new RangeError(`The playback rate is ${rate}; expected a positive number, such as 0.5.`);
+    }
+    this.clock.setRate(Math.min(Math.max(rate, RATES[0]), RATES[1]), this.now());
+    this.emit("state", {});
+  }
+
+  get currentTime(): number {
+    return Math.min(this.clock.at(this.now()), Math.max(this.timeline.duration, 0));
+  }
+
+  /** The frame that the clock is at, or that is sought. */
+  get frameIndex(): number {
+    return this.isSeeking ? this.target : this.timeline.frameAt(this.clock.at(this.now()));
+  }
+
+  get durationSeconds(): number {
+    return this.timeline.duration;
+  }
+
+  get frames(): Timeline {
+    return this.timeline;
+  }
+
+  get paused(): boolean {
+    return !this.wantsToPlay;
+  }
+
+  get seeking(): boolean {
+    return this.isSeeking;
+  }
+
+  get stalled(): boolean {
+    return this.isStalled;
+  }
+
+  get ended(): boolean {
+    return this.hasEnded;
+  }
+
+  /** Whether frames may still be appended to the stream, and all that there are have been read. */
+  get growing(): boolean {
+    return !this.timeline.complete && this.edge.reached;
+  }
+
+  /** Of a growing stream: seconds until its next frame, where its pace is known. */
+  get nextFrameSeconds(): number | undefined {
+    return this.growing ? this.edge.nextIn(this.now()) : undefined;
+  }
+
+  get buffered(): readonly TimeRange[] {
+    return this.stored.map(([first, end]) => [this.timeline.ptsOf(first), this.timeline.endOf(end - 1)]);
+  }
+
+  get fetchedBytes(): number {
+    return this.fetched;
+  }
+
+  /** What decoding a packet took in the worker, on the way to the last frame given. */
+  get decodeMilliseconds(): number {
+    return this.lastDecodeMilliseconds;
+  }
+
+  /** What a packet took, as far as it was decoded lately. */
+  packetFacts(index: number): PacketFacts | undefined {
+    return this.facts.get(index);
+  }
+
+  /** The next picture comes with everything that can change: for a renderer that has lost what it had. */
+  refresh(): void {
+    this.pipeline.send({ type: "refresh" });
+    if (this.timeline.count) this.begin(this.frameIndex, this.clock.at(this.now()));
+  }
+
+  /** To be called before each picture: moves the clock, and gives what has to be drawn, if anything new has. */
+  tick(): SceneUpdate | undefined {
+    if (!this.timeline.count || this.failed) return undefined;
+    const now = this.now();
+    if (this.wantsToPlay && !this.isSeeking) this.advance(now);
+    this.ask();
+    const update = this.queue.take(this.timeline.frameAt(this.clock.at(now)));
+    if (update) this.emit("frame", { index: update.index, ptsSeconds: update.ptsSeconds });
+    return update;
+  }
+
+  destroy(): void {
+    this.failed = true;
+    this.pipeline.onmessage = undefined;
+    this.pipeline.close();
+    this.clear();
+  }
+
+  private begin(frame: number, seconds: number): void {
+    const now = this.now();
+    this.serial++;
+    this.target = frame;
+    this.reached = frame - 1;
+    this.isSeeking = true;
+    this.hasEnded = false;
+    this.clock.stop(now);
+    this.clock.set(seconds, now);
+    this.queue.carryAll();
+    this.ask();
+    this.emit("state", {});
+  }
+
+  private advance(now: number): void {
+    const { clock, timeline } = this;
+    if (this.isStalled && this.mayGoOn(clock.at(now), now)) {
+      this.setStalled(false);
+      clock.start(now);
+    }
+    if (!clock.running) return;
+    const time = clock.at(now);
+    if (time >= timeline.duration) this.stopAtEnd(now);
+    else if (timeline.frameAt(time) > this.reached && !this.isStored(this.reached + 1)) {
+      clock.stop(now);
+      clock.set(Math.min(time, Math.max(timeline.endOf(Math.max(this.reached, 0)) - 1e-3, 0)), now);
+      this.setStalled(true);
+    }
+  }
+
+  private stopAtEnd(now: number): void {
+    const { clock, timeline } = this;
+    if (timeline.complete && this.loop) {
+      this.seekFrame(0);
+      return;
+    }
+    clock.stop(now);
+    if (!timeline.complete) {
+      // The last frame is held until the next one has been written.
+      clock.set(Math.max(timeline.duration - 1e-3, 0), now);
+      this.setStalled(true);
+      return;
+    }
+    clock.set(timeline.duration, now);
+    this.hasEnded = true;
+    this.wantsToPlay = false;
+    this.emit("ended", {});
+    this.emit("state", {});
+  }
+
+  private mayGoOn(time: number, now: number): boolean {
+    const { timeline, reached, clock } = this;
+    const frame = timeline.frameAt(time);
+    if (reached <= frame) return frame >= timeline.count - 1 && timeline.complete;
+    this.readySince ??= now;
+    const wanted = timeline.frameAt(time + REBUFFER_SECONDS * clock.rate);
+    const enough = Math.min(wanted, (this.demanded?.ahead ?? 1) - 1);
+    // A store may be too small for that much.
+    return this.growing || reached >= enough || this.isStored(enough) || now - this.readySince > MOST_REBUFFER_SECONDS;
+  }
+
+  private isStored(index: number): boolean {
+    return this.stored.some(([first, end]) => index >= first && index < end);
+  }
+
+  /** Tells the decoder what is wanted, if that has changed. */
+  private ask(): void {
+    const { timeline, clock, serial } = this;
+    const at = this.isSeeking ? this.target : timeline.frameAt(clock.at(this.now()));
+    const lead = Math.ceil((LEAD_SECONDS * clock.rate * timeline.count) / Math.max(timeline.duration, 1e-3));
+    const until = at + 1 + (this.wantsToPlay ? Math.min(Math.max(lead, LEAST_LEAD), MOST_LEAD) : 0);
+    const seconds = timeline.ptsOf(at) + (this.options.aheadSeconds ?? AHEAD_SECONDS) * clock.rate;
+    const ahead = this.wantsToPlay ? Math.max(timeline.frameAt(seconds) + 1, until) : until;
+    const last = this.demanded;
+    if (last?.serial === serial && last.at === at && last.until === until && last.ahead === ahead) return;
+    this.demanded = { serial, at, until, ahead };
+    this.pipeline.send({ type: "demand", demand: this.demanded });
+  }
+
+  private hear(message: FromDecoder): void {
+    if (message.type === "frame") this.hearFrame(message);
+    else if (message.type === "gap") this.hearGap(message.serial, message.end);
+    else if (message.type === "opening") this.emit("opening", message);
+    else if (message.type === "header") this.hearHeader(message.header, message.ranged);
+    else if (message.type === "catalog") this.hearCatalog(message);
+    else if (message.type === "stored") {
+      this.stored = message.ranges;
+      this.fetched = message.fetchedBytes;
+      this.tellProgress();
+    } else if (message.type === "damage") this.emit("error", { message: message.message, fatal: false });
+    else if (message.type === "waiting") this.hearWaiting(message.seconds, message.problem);
+    else this.fail(message.message, message.fatal);
+  }
+
+  private hearHeader(header: StreamHeader, ranged: boolean): void {
+    this.header = header;
+    this.timeline = new Timeline(header.fps);
+    this.emit("header", header);
+    if (ranged) return;
+    this.emit("notice", {
+      message: "The server gives no parts of files (Range), so that all of it has to be fetched.",
+    });
+  }
+
+  private hearCatalog({ facts }: FromDecoder & { type: "catalog" }): void {
+    this.timeline.take(facts);
+    this.edge.frames(facts.ptsSeconds.length, this.now());
+    this.startIfThere();
+    this.tellProgress();
+    if (facts.complete && !this.timeline.count)
+      this.fail(`${this.name} has a header and no whole frame to show.`, true);
+  }
+
+  private hearWaiting(seconds: number, problem: string | undefined): void {
+    if (problem !== undefined) {
+      this.emit("notice", { message: `${problem} The next attempt is in ${seconds} s.` });
+      return;
+    }
+    this.edge.reached = true;
+    this.startIfThere();
+    this.tellProgress();
+  }
+
+  private startIfThere(): void {
+    const { startSeconds, timeline } = this;
+    if (startSeconds === undefined || !timeline.count) return;
+    if (startSeconds > timeline.duration && !timeline.complete && !this.edge.reached) return;
+    this.startSeconds = undefined;
+    this.seek(startSeconds);
+  }
+
+  private hearFrame(message: FromDecoder & { type: "frame" }): void {
+    const { serial, update, exact, packets } = message;
+    for (const packet of packets) this.facts.set(packet.index, packet);
+    while (this.facts.size > REMEMBERED_PACKETS) this.facts.delete(this.facts.keys().next().value as number);
+    this.lastDecodeMilliseconds = message.decodeMilliseconds / Math.max(packets.length, 1);
+    if (serial !== this.serial) {
+      this.queue.carry(update);
+      return;
+    }
+    this.queue.add(update, this.isSeeking);
+    this.reached = Math.max(this.reached, update.index);
+    if (exact && this.isSeeking) this.arrive();
+  }
+
+  private hearGap(serial: number, end: number): void {
+    if (serial !== this.serial) return;
+    this.reached = Math.max(this.reached, end - 1);
+    if (this.isSeeking) this.arrive();
+  }
+
+  private arrive(): void {
+    this.isSeeking = false;
+    this.reached = Math.max(this.reached, this.target);
+    if (this.wantsToPlay) this.clock.start(this.now());
+    this.emit("state", {});
+  }
+
+  private setStalled(stalled: boolean): void {
+    if (this.isStalled === stalled) return;
+    this.isStalled = stalled;
+    this.readySince = undefined;
+    this.emit("stall", { stalled });
+  }
+
+  private tellProgress(): void {
+    this.emit("progress", {
+      buffered: this.buffered,
+      fetchedBytes: this.fetched,
+      durationSeconds: this.durationSeconds,
+      complete: this.timeline.complete,
+    });
+  }
+
+  private fail(message: string, fatal: boolean): void {
+    this.failed ||= fatal;
+    this.pause();
+    this.demanded = undefined; // the next one is another attempt
+    this.emit("error", { message, fatal });
+  }
+}

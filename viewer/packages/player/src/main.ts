@@ -1,0 +1,10 @@
+// SPDX-License-Identifier: Apache-2.0
+
+import { StructgstreamPlayer } from "./element.js";
+
+export type { EngineEvents, TimeRange } from "./engine/events.js";
+export type { PlayerEvents } from "./player.js";
+export { StructgstreamPlayer };
+
+// A page may hold the module twice, as notebooks do.
+if (!customElements.get("structgstream-player")) customElements.define("structgstream-player", StructgstreamPlayer);

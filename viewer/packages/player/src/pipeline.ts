@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The two workers of a stream. */
+
+import type { FromDecoder } from "./decode/messages.js";
+import type { Pipeline } from "./engine/engine.js";
+import { startedWorker } from "./scripts.js";
+
+/** Starts both workers; `close` ends them, whatever they do. */
+export function startedPipeline(): Pipeline {
+  const { port1, port2 } = new MessageChannel();
+  const workers = [startedWorker("fetch", port1), startedWorker("decode", port2)];
+  const decoder = workers[1]!;
+  const pipeline: Pipeline = {
+    onmessage: undefined,
+    send: (message) => decoder.postMessage(message),
+    close: () => {
+      for (const worker of workers) worker.terminate();
+    },
+  };
+  decoder.onmessage = ({ data }: MessageEvent<FromDecoder>) => pipeline.onmessage?.(data);
+  for (const worker of workers) {
+    worker.onerror = (event) => {
+      const message = `A worker of the player stopped: ${event.message ?? "it cannot be started from this page"}.`;
+      pipeline.onmessage?.({ type: "failed", message, fatal: true });
+    };
+  }
+  return pipeline;
+}

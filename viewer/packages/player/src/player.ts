@@ -1,0 +1,244 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A stream on a canvas: engine, renderer and a camera that moves. It knows nothing of buttons. */
+
+import type { StreamHeader } from "@structgstream/core";
+import { type Camera, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
+import { Emitter } from "./engine/emitter.js";
+import { Engine, type Pipeline } from "./engine/engine.js";
+import type { EngineEvents } from "./engine/events.js";
+import type { SourceDescription } from "./source/description.js";
+import { Flight } from "./view/flight.js";
+import { type View, viewOf } from "./view/navigator.js";
+import type { QualityControl } from "./view/quality.js";
+import { type Rig, type RigCamera, rigOf } from "./view/rig.js";
+
+export interface PlayerEvents extends EngineEvents {
+  /** The camera or the picture's size is another. */
+  view: { readonly view: View };
+  /** A picture was drawn. */
+  drawn: { readonly stats: RenderStats };
+}
+
+export interface PlayerOptions {
+  readonly renderer: Renderer;
+  readonly quality: QualityControl;
+  readonly startPipeline: () => Pipeline;
+  /** Seconds of a clock that only goes forward. */
+  readonly now: () => number;
+}
+
+/** Pictures further apart than this did not follow each other: the page was hidden, or nothing changed. */
+const PAUSE_SECONDS = 1;
+const FLIGHT_SECONDS = 0.9;
+
+export class Player extends Emitter<PlayerEvents> {
+  rig: Rig | undefined;
+  view: View | undefined;
+  /** The rig's camera that the view is that of, until it moves. */
+  atCamera: RigCamera | undefined;
+  /** Whether hands have moved the camera since the stream was opened. */
+  touched = false;
+  /** Whether flights take no time. */
+  still = false;
+  /** Pictures get the exposure of the camera they are seen from: to compare with its own. */
+  exposed = false;
+  engine: Engine | undefined;
+  stats: RenderStats | undefined;
+  /** Those of the last call that drew something. */
+  drawnStats: RenderStats | undefined;
+  /** Time between the last pictures, smoothed; undefined while none follow each other. */
+  pictureSeconds: number | undefined;
+  loop = false;
+  private rate = 1;
+  private size: readonly [width: number, height: number] = [1, 1];
+  private flight: Flight | undefined;
+  private landing: RigCamera | undefined;
+  private fittedTo: { readonly view: Camera; readonly width: number; readonly height: number } | undefined;
+  private drawnCamera: Camera | undefined;
+  private drawnAt: number | undefined;
+  private drawnView: View | undefined;
+  /** The first frame that the renderer was given and has not drawn yet. */
+  private given: { readonly index: number; readonly at: number } | undefined;
+  private hasScene = false;
+
+  constructor(private readonly options: PlayerOptions) {
+    super();
+    options.renderer.onError = (error) => this.emit("error", { message: error.message, fatal: false });
+  }
+
+  /** Opens a stream; the one before is forgotten. `view` is taken once the rig is known. */
+  load(source: SourceDescription, startSeconds = 0, view?: (rig: Rig) => View): Engine {
+    this.engine?.destroy();
+    const engine = new Engine(this.options.startPipeline(), this.options.now);
+    this.engine = engine;
+    this.rig = undefined;
+    this.flight = undefined;
+    this.hasScene = false;
+    this.given = undefined;
+    this.touched = false;
+    engine.loop = this.loop;
+    engine.playbackRate = this.rate;
+    for (const name of ["opening", "frame", "stall", "error", "notice", "progress", "state", "ended"] as const) {
+      engine.on(name, (event) => this.emit(name, event as never));
+    }
+    engine.on("header", (header) => this.begin(header, view));
+    engine.load(source, startSeconds);
+    return engine;
+  }
+
+  set playbackRate(rate: number) {
+    if (this.engine) this.engine.playbackRate = rate;
+    this.rate = this.engine?.playbackRate ?? rate;
+  }
+
+  get playbackRate(): number {
+    return this.rate;
+  }
+
+  setLoop(loop: boolean): void {
+    this.loop = loop;
+    if (this.engine) this.engine.loop = loop;
+    this.emit("state", {});
+  }
+
+  /** The canvas has so many pixels. */
+  resize(width: number, height: number): void {
+    this.size = [Math.max(Math.round(width), 1), Math.max(Math.round(height), 1)];
+    if (this.view) this.emit("view", { view: this.view });
+  }
+
+  /** The camera of the picture: that of the view, as large as the canvas. */
+  get camera(): Camera | undefined {
+    const { view, size, fittedTo } = this;
+    if (!view) return undefined;
+    const [width, height] = size;
+    if (!fittedTo || fittedTo.view !== view.camera || fittedTo.width !== width || fittedTo.height !== height) {
+      this.fittedTo = { view: view.camera, width, height };
+      this.drawnCamera = fitted(view.camera, width, height);
+    }
+    return this.drawnCamera;
+  }
+
+  /** Moves the camera by hand; flights end. */
+  navigate(move: (view: View, rig: Rig) => View): void {
+    if (!this.view || !this.rig) return;
+    this.touched = true;
+    this.flight = undefined;
+    this.landing = undefined;
+    this.atCamera = undefined;
+    this.setView(move(this.view, this.rig));
+  }
+
+  /** Flies to a camera of the rig. */
+  flyTo(camera: RigCamera, seconds = FLIGHT_SECONDS): void {
+    if (!this.view || !this.rig) return;
+    this.flyToView(viewOf(camera.camera, this.rig.focus), seconds);
+    this.landing = camera;
+    if (!this.flight) this.land();
+  }
+
+  flyToView(view: View, seconds = FLIGHT_SECONDS): void {
+    if (!this.view || !this.rig) return;
+    this.landing = undefined;
+    this.atCamera = undefined;
+    this.flight = undefined;
+    if (this.still || seconds <= 0) this.setView(view);
+    else this.flight = new Flight(this.view, view, this.rig.focus, this.options.now(), seconds);
+  }
+
+  get flying(): boolean {
+    return this.flight !== undefined;
+  }
+
+  /** To be called for every picture that the browser shows. */
+  tick(): void {
+    const { renderer, quality, now } = this.options;
+    const time = now();
+    if (this.flight) {
+      const { view, over } = this.flight.at(time);
+      if (over) this.flight = undefined;
+      this.setView(view);
+      if (over) this.land();
+    }
+    try {
+      const update = this.engine?.tick();
+      if (update) {
+        renderer.update(update);
+        this.hasScene = true;
+        this.given ??= { index: update.index, at: time };
+      }
+      const { camera } = this;
+      if (!camera || !this.hasScene) return;
+      const { maxSplats, pixelScale } = quality.current;
+      renderer.maxSplats = maxSplats;
+      renderer.pixelScale = pixelScale;
+      const cameraName = this.exposed ? this.atCamera?.name : undefined;
+      this.stats = renderer.render(camera, cameraName === undefined ? {} : { cameraName });
+    } catch (error) {
+      this.engine?.destroy();
+      this.engine = undefined;
+      this.emit("error", { message: error instanceof Error ? error.message : String(error), fatal: true });
+      return;
+    }
+    if (this.stats.drawn) this.measure(time, this.stats);
+  }
+
+  get resources(): ResourceCounts {
+    return this.options.renderer.resources;
+  }
+
+  /** The picture as it is, as PNG. */
+  screenshot(): Promise<Blob> {
+    return this.options.renderer.screenshot();
+  }
+
+  destroy(): void {
+    this.engine?.destroy();
+    this.engine = undefined;
+    this.options.renderer.destroy();
+    this.clear();
+  }
+
+  private begin(header: StreamHeader, view: ((rig: Rig) => View) | undefined): void {
+    const rig = rigOf(header);
+    this.rig = rig;
+    try {
+      this.options.renderer.load(header);
+    } catch (error) {
+      this.engine?.destroy();
+      this.emit("error", { message: error instanceof Error ? error.message : String(error), fatal: true });
+      return;
+    }
+    this.setView(view ? view(rig) : viewOf(rig.first.camera, rig.focus));
+    this.atCamera = view ? undefined : rig.first;
+    this.emit("header", header);
+  }
+
+  private land(): void {
+    this.atCamera = this.landing;
+    this.landing = undefined;
+    if (this.view) this.emit("view", { view: this.view });
+  }
+
+  private setView(view: View): void {
+    this.view = view;
+    this.emit("view", { view });
+  }
+
+  private measure(time: number, stats: RenderStats): void {
+    const since = this.drawnAt === undefined ? undefined : time - this.drawnAt;
+    this.drawnAt = time;
+    const following = since !== undefined && since < PAUSE_SECONDS;
+    this.pictureSeconds = following ? 0.9 * (this.pictureSeconds ?? since) + 0.1 * since : undefined;
+    // A stream of few frames a second is not a slow device: pictures of a camera that moves should follow each other at
+    // the screen's pace, and a frame should be drawn soon after it was given; sorting takes its time elsewhere.
+    if (following && this.view !== this.drawnView) this.options.quality.picture(since);
+    else if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
+      this.options.quality.picture(Math.max(time - this.given.at - stats.sortMilliseconds / 1000, 0));
+    }
+    if (this.given && (stats.frameIndex ?? -1) >= this.given.index) this.given = undefined;
+    this.drawnView = this.view;
+    this.drawnStats = stats;
+    this.emit("drawn", { stats });
+  }
+}

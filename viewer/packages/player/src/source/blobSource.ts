@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A file of the user's, or bytes that a page brought with it. */
+
+import { type ByteSink, type ByteSource, type ReadOptions, SourceError } from "./byteSource.js";
+
+export class BlobSource implements ByteSource {
+  /** A file that was chosen is as it was then: a browser gives no more of it. */
+  readonly mayGrow = false;
+
+  constructor(
+    private readonly blob: Blob,
+    private readonly name: string,
+  ) {}
+
+  async read(start: number, options: ReadOptions, sink: ByteSink, signal: AbortSignal): Promise<void> {
+    const end = Math.min(options.end ?? this.blob.size, this.blob.size);
+    let bytes: Uint8Array;
+    try {
+      bytes = new Uint8Array(await this.blob.slice(start, end).arrayBuffer());
+    } catch {
+      throw new SourceError(`${this.name} can no longer be read: it was moved or changed. Choose the file again.`);
+    }
+    if (signal.aborted) return;
+    sink.begin({ start, fileBytes: this.blob.size, ranged: true });
+    if (bytes.length) sink.take(bytes);
+  }
+}
+
+/**
+ * The bytes that base64 text stands for; white space counts for nothing.
+ *
+ * @throws SourceError it is no base64
+ */
+export function blobOfBase64(text: string, name: string): Blob {
+  let binary: string;
+  try {
+    binary = atob(text);
+  } catch {
+    throw new SourceError(`${name} is no base64 text: the page was cut or changed. Export it again.`);
+  }
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
+  return new Blob([bytes]);
+}

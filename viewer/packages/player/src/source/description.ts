@@ -1,0 +1,45 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Where a stream comes from, as values that go between threads. */
+
+/** A stream to play; `name` is what messages call it. */
+export type SourceDescription =
+  | {
+      readonly kind: "url";
+      readonly url: string;
+      readonly name: string;
+      /** Refuse other origins, also those that a server redirects to: for addresses that are not the page's own. */
+      readonly sameOrigin?: boolean;
+    }
+  | { readonly kind: "blob"; readonly blob: Blob; readonly name: string }
+  | { readonly kind: "base64"; readonly text: string; readonly name: string };
+
+/** What the decode worker asks of the fetch worker; `id` is its own number for one reading. */
+export type ReadRequest =
+  | { readonly type: "open"; readonly source: SourceDescription }
+  /** Bytes from `start` to before `end`; `wholeIfNeeded` takes the whole file where a server gives no ranges. */
+  | {
+      readonly type: "read";
+      readonly id: number;
+      readonly start: number;
+      readonly end: number;
+      readonly wholeIfNeeded: boolean;
+    }
+  /** Everything from `start` on, and then what is appended to the file. */
+  | { readonly type: "follow"; readonly id: number; readonly start: number }
+  | { readonly type: "cancel"; readonly id: number };
+
+/** What the fetch worker answers. */
+export type ReadReply =
+  /** The first byte that comes is that at `start`; without ranges the whole file comes. */
+  | {
+      readonly type: "begin";
+      readonly id: number;
+      readonly start: number;
+      readonly fileBytes: number | undefined;
+      readonly ranged: boolean;
+    }
+  | { readonly type: "bytes"; readonly id: number; readonly bytes: Uint8Array }
+  | { readonly type: "end"; readonly id: number }
+  /** Nothing new, or no connection: it looks again in so many seconds. */
+  | { readonly type: "waiting"; readonly id: number; readonly seconds: number; readonly problem: string | undefined }
+  | { readonly type: "failed"; readonly id: number; readonly message: string };

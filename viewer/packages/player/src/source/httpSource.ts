@@ -1,0 +1,153 @@
+// SPDX-License-Identifier: Apache-2.0
+/**
+ * A file on a server, by Range requests; by whole answers where a server knows no ranges.
+ *
+ * Only ranges with a first byte are asked for: browsers let these through to another origin without asking it first, and
+ * a range of the last bytes not.
+ */
+
+import { type ByteSink, type ByteSource, type ReadOptions, SourceError } from "./byteSource.js";
+
+/** A file that nobody has changed for so long is not being written. */
+const STILL_SECONDS = 600;
+const TEMPORARY = new Set([408, 429, 500, 502, 503, 504]);
+
+interface ContentRange {
+  readonly start: number | undefined;
+  readonly fileBytes: number | undefined;
+}
+
+export class HttpSource implements ByteSource {
+  private growing = true;
+  private fileBytes = 0;
+
+  constructor(
+    private readonly url: string,
+    private readonly name: string,
+    private readonly request: typeof fetch,
+    private readonly sameOrigin = false,
+  ) {}
+
+  get mayGrow(): boolean {
+    return this.growing;
+  }
+
+  async read(start: number, options: ReadOptions, sink: ByteSink, signal: AbortSignal): Promise<void> {
+    // Browsers report every answer of 416 in their console, so what may be nothing is asked for with the byte before it.
+    const before = options.end === undefined && start > 0 ? 1 : 0;
+    const response = await this.answer(start - before, options.end, signal);
+    this.noticeAge(response);
+    if (response.status === 416) {
+      this.takeNothing(start, response, sink);
+      return;
+    }
+    if (response.status !== 206 && response.status !== 200) throw this.refused(response.status);
+    const found = response.status === 206 ? rangeOf(response.headers.get("Content-Range")) : undefined;
+    if (found) {
+      // A page of another origin may not be allowed to see where the bytes are from; they are what was asked for then.
+      const from = start - before;
+      if ((found.start ?? from) !== from) throw this.misplaced(from, found.start);
+      this.checkSize(found.fileBytes);
+      sink.begin({ start, fileBytes: found.fileBytes, ranged: found.fileBytes !== undefined });
+      return this.pour(response, before, (options.end ?? Number.POSITIVE_INFINITY) - start, sink);
+    }
+    const fileBytes = lengthOf(response);
+    if (options.wholeIfNeeded) {
+      sink.begin({ start: 0, fileBytes, ranged: false });
+      return this.pour(response, 0, Number.POSITIVE_INFINITY, sink);
+    }
+    sink.begin({ start, fileBytes, ranged: false });
+    if (fileBytes !== undefined && fileBytes <= start) return response.body?.cancel();
+    return this.pour(response, start, (options.end ?? Number.POSITIVE_INFINITY) - start, sink);
+  }
+
+  private async answer(start: number, end: number | undefined, signal: AbortSignal): Promise<Response> {
+    const range = `bytes=${start}-${end === undefined ? "" : end - 1}`;
+    try {
+      const mode = this.sameOrigin ? "same-origin" : "cors";
+      return await this.request(this.url, { headers: { Range: range }, signal, mode, cache: "no-store" });
+    } catch (error) {
+      if (signal.aborted) throw error;
+      throw new SourceError(
+        `${this.name} cannot be fetched: the server does not answer, or, being of another origin, does not allow this ` +
+          "page to read it (Access-Control-Allow-Origin).",
+        true,
+      );
+    }
+  }
+
+  /** Gives `count` bytes of the body after the first `skip`. */
+  private async pour(response: Response, skip: number, count: number, sink: ByteSink): Promise<void> {
+    const reader = response.body!.getReader();
+    let [left, behind] = [count, skip];
+    try {
+      while (left > 0) {
+        const { done, value } = await reader.read();
+        if (done) return;
+        const bytes = value.subarray(Math.min(behind, value.length), Math.min(value.length, behind + left));
+        behind -= Math.min(behind, value.length);
+        left -= bytes.length;
+        // A copy: what is given away is transferred, and the rest of a chunk would go with it.
+        if (bytes.length) sink.take(bytes.length === value.buffer.byteLength ? bytes : bytes.slice());
+      }
+      await reader.cancel();
+    } catch {
+      throw new SourceError(`The connection broke while ${this.name} was read.`, true);
+    }
+  }
+
+  private takeNothing(start: number, response: Response, sink: ByteSink): void {
+    const { fileBytes } = rangeOf(response.headers.get("Content-Range"));
+    this.checkSize(fileBytes);
+    sink.begin({ start, fileBytes, ranged: true });
+  }
+
+  private checkSize(fileBytes: number | undefined): void {
+    if (fileBytes === undefined) return;
+    if (fileBytes < this.fileBytes) {
+      throw new SourceError(
+        `${this.name} has become shorter (${fileBytes} bytes after ${this.fileBytes}): it was replaced. Load it again.`,
+      );
+    }
+    this.fileBytes = fileBytes;
+  }
+
+  private noticeAge(response: Response): void {
+    const changed = Date.parse(response.headers.get("Last-Modified") ?? "");
+    const now = Date.parse(response.headers.get("Date") ?? "");
+    // The server's own clock, as far as it tells it: the user's may be wrong.
+    if (!Number.isNaN(changed)) this.growing = (Number.isNaN(now) ? Date.now() : now) - changed < STILL_SECONDS * 1000;
+  }
+
+  private misplaced(start: number, found: number | undefined): SourceError {
+    return new SourceError(`The server gave ${this.name} from byte ${found} on where byte ${start} was asked for.`);
+  }
+
+  private refused(status: number): SourceError {
+    if (status === 404 || status === 410) {
+      return new SourceError(`${this.name} was not found on the server (${status}). Check the address.`);
+    }
+    if (status === 401 || status === 403) {
+      return new SourceError(`The server does not give ${this.name} to this page (${status}).`);
+    }
+    const temporary = TEMPORARY.has(status);
+    return new SourceError(`The server answered ${status} where ${this.name} was asked for.`, temporary);
+  }
+}
+
+/** `bytes 0-9/100` or `bytes * /100`; nothing where it cannot be seen or understood. */
+function rangeOf(header: string | null): ContentRange {
+  const found = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(header?.trim() ?? "");
+  if (!found) return { start: undefined, fileBytes: undefined };
+  const [, start, size] = found;
+  return {
+    start: start === undefined ? undefined : Number(start),
+    fileBytes: size === "*" ? undefined : Number(size),
+  };
+}
+
+/** What a body has, where it comes as it is: a coded one has a length of its own. */
+function lengthOf(response: Response): number | undefined {
+  const header = response.headers.get("Content-Length");
+  return header === null || response.headers.get("Content-Encoding") ? undefined : Number(header);
+}

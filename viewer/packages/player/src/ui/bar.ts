@@ -1,0 +1,127 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The bar of controls at the bottom. */
+
+import type { Player } from "../player.js";
+import { made, setText } from "./dom.js";
+import { timeText } from "./format.js";
+import { type IconName, icon } from "./icons.js";
+import { TimelineBar } from "./timelineBar.js";
+
+const RATES = [0.1, 0.25, 0.5, 1, 1.5, 2, 4];
+
+/** What a button does that concerns more than the player. */
+export interface BarActions {
+  toggle(panel: "cameras" | "settings" | "statistics" | "help", button: HTMLButtonElement): void;
+  compare(): void;
+  share(): void;
+  screenshot(): void;
+  fullscreen(): void;
+}
+
+export class Bar {
+  readonly root: HTMLElement;
+  readonly timeline: TimelineBar;
+  readonly compare: HTMLButtonElement;
+  private readonly play: HTMLButtonElement;
+  private readonly loop: HTMLButtonElement;
+  private readonly time = made("div", { class: "time" });
+  private readonly rate: HTMLSelectElement;
+  private readonly edge: HTMLButtonElement;
+  private face: IconName = "play";
+
+  constructor(
+    private readonly player: Player,
+    actions: BarActions,
+  ) {
+    const engine = () => player.engine;
+    this.timeline = new TimelineBar((seconds) => engine()?.seek(seconds));
+    this.play = button("play", "Play", () => this.toggle());
+    this.loop = button("loop", "Loop", () => player.setLoop(!player.loop), "medium");
+    this.compare = button("compare", "Compare with the camera's picture", () => actions.compare());
+    this.compare.hidden = true;
+    this.rate = made("select", { "aria-label": "Speed", title: "Speed", class: "medium" });
+    for (const rate of RATES) this.rate.append(made("option", { value: String(rate) }, `${rate}×`));
+    this.rate.addEventListener("change", () => {
+      player.playbackRate = Number(this.rate.value);
+    });
+    this.edge = made("button", { type: "button", hidden: true, title: "Go to the newest frame" }, "Newest");
+    this.edge.addEventListener("click", () => engine()?.seekFrame(Number.MAX_SAFE_INTEGER));
+    const panel = (name: Parameters<BarActions["toggle"]>[0], face: IconName, label: string, extra: string) => {
+      const made_ = button(face, label, () => actions.toggle(name, made_), extra);
+      made_.setAttribute("aria-expanded", "false");
+      return made_;
+    };
+    this.root = made(
+      "div",
+      { class: "bar glass", role: "group", "aria-label": "Player controls" },
+      this.timeline.root,
+      made(
+        "div",
+        { class: "row" },
+        this.play,
+        button("back", "Previous frame", () => engine()?.step(-1), "wide"),
+        button("forward", "Next frame", () => engine()?.step(1), "wide"),
+        this.time,
+        this.edge,
+        made("div", { class: "space" }),
+        this.rate,
+        this.loop,
+        this.compare,
+        panel("cameras", "cameras", "Cameras", "noembed"),
+        panel("statistics", "chart", "Statistics", "noembed wide"),
+        panel("settings", "settings", "Picture", "noembed"),
+        button("photo", "Save a screenshot", () => actions.screenshot(), "noembed wide"),
+        button("link", "Copy a link to this view and time", () => actions.share(), "noembed wide"),
+        panel("help", "help", "Keys", "noembed wide"),
+        button("full", "Full screen", () => actions.fullscreen()),
+      ),
+    );
+    this.update();
+  }
+
+  toggle(): void {
+    const { engine } = this.player;
+    if (engine?.paused) engine.play();
+    else engine?.pause();
+  }
+
+  /** To be called with every picture: sets what is different. */
+  update(): void {
+    const { engine } = this.player;
+    this.timeline.update();
+    this.loop.setAttribute("aria-pressed", String(this.player.loop));
+    if (this.rate.value !== String(this.player.playbackRate)) this.rate.value = String(this.player.playbackRate);
+    this.play.disabled = !engine?.header;
+    const face: IconName = engine && !engine.paused ? "pause" : engine?.ended ? "again" : "play";
+    if (face !== this.face) {
+      this.face = face;
+      const label = { play: "Play", pause: "Pause", again: "Play again" }[face as "play"];
+      this.play.replaceChildren(icon(face));
+      this.play.setAttribute("aria-label", label);
+      this.play.title = label;
+    }
+    this.edge.hidden = !engine?.growing || engine.frameIndex >= engine.frames.count - 1;
+    this.updateTime();
+  }
+
+  private updateTime(): void {
+    const { engine } = this.player;
+    if (!engine?.frames.count) {
+      setText(this.time, "");
+      return;
+    }
+    const fine = engine.durationSeconds < 60;
+    const now = timeText(engine.currentTime, fine);
+    const total = timeText(engine.durationSeconds, fine);
+    const text = `${now} / ${total}`;
+    const frame = ` · frame ${engine.frameIndex}`;
+    if (this.time.textContent === text + frame) return;
+    this.time.replaceChildren(text, made("span", { class: "soft" }, frame));
+  }
+}
+
+export function button(face: IconName, label: string, action: () => void, extra = ""): HTMLButtonElement {
+  const element = made("button", { type: "button", "aria-label": label, title: label, class: extra }, icon(face));
+  element.addEventListener("click", action);
+  return element;
+}

@@ -1,0 +1,30 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Pictures on buttons, 24 by 24, drawn in lines of the text's colour. */
+
+import { madeSvg } from "./dom.js";
+
+const PATHS = {
+  play: "M8 5.5v13l10.5-6.5z",
+  pause: "M8.5 5.5v13M15.5 5.5v13",
+  again: "M5 12a7 7 0 1 0 2.2-5.1M5 4.5v4h4",
+  back: "M17 6v12l-9-6zM6.5 6v12",
+  forward: "M7 6v12l9-6zM17.5 6v12",
+  loop: "M17 4l3 3-3 3M20 7H8a4 4 0 0 0-4 4v1M7 20l-3-3 3-3M4 17h12a4 4 0 0 0 4-4v-1",
+  cameras: "M4 8h10v8H4zM14 11l6-3v8l-6-3z",
+  compare: "M12 3v18M4 6h16v12H4z",
+  chart: "M5 19V11M10 19V5M15 19v-6M20 19V8",
+  settings: "M4 7h9M17 7h3M4 17h3M11 17h9M15 4.8v4.4M9 14.8v4.4",
+  link: "M10 14a4 4 0 0 0 5.7 0l3-3A4 4 0 0 0 13 5.300l-1 1M14 10a4 4 0 0 0-5.700 0l-3 3A4 4 0 0 0 11 18.700l1-1",
+  photo: "M4 8h3.500l1.500-2.500h6L16.500 8H20v11H4zM12 16.500a3.250 3.250 0 1 0 0-6.500 3.250 3.250 0 0 0 0 6.500z",
+  full: "M4 9V4h5M15 4h5v5M20 15v5h-5M9 20H4v-5",
+  close: "M6 6l12 12M18 6L6 18",
+  help: "M9.200 9a2.900 2.900 0 1 1 4.300 2.500c-1 .6-1.500 1.200-1.500 2.500M12 17.500v.5",
+} as const;
+
+export type IconName = keyof typeof PATHS;
+
+export function icon(name: IconName): SVGSVGElement {
+  const filled = name === "play" || name === "back" || name === "forward";
+  const path = madeSvg("path", { d: PATHS[name], ...(filled ? { fill: "currentColor" } : {}) });
+  return madeSvg("svg", { viewBox: "0 0 24 24", "aria-hidden": "true", class: "icon" }, path);
+}

@@ -1,0 +1,74 @@
+// SPDX-License-Identifier: Apache-2.0
+/** What the player says: one short note at a time, and what stands in the middle while there is no picture. */
+
+import { made, setText } from "./dom.js";
+import { icon } from "./icons.js";
+
+const NOTE_SECONDS = 6;
+
+export class Notes {
+  readonly root = made("div");
+  private readonly note = made("div", { class: "note glass", role: "status", hidden: true });
+  private readonly text = made("span");
+  private readonly middle = made("div", { class: "middle" });
+  private readonly spoken = made("div", { class: "quiet", role: "status", "aria-live": "polite" });
+  private until = 0;
+
+  constructor() {
+    const close = made("button", { type: "button", "aria-label": "Close" }, icon("close"));
+    close.addEventListener("click", () => this.hide());
+    this.note.append(this.text, close);
+    this.root.append(this.middle, this.note, this.spoken);
+  }
+
+  /** @param bad it is an error, and stays until it is closed or another comes */
+  say(text: string, now: number, bad = false): void {
+    setText(this.text, text);
+    this.note.classList.toggle("bad", bad);
+    this.note.hidden = text === "";
+    this.until = bad ? Number.POSITIVE_INFINITY : now + NOTE_SECONDS;
+  }
+
+  tick(now: number): void {
+    if (!this.note.hidden && now > this.until) this.hide();
+  }
+
+  /** A line for screen readers only. */
+  speak(text: string): void {
+    setText(this.spoken, text);
+  }
+
+  /** Nothing can be shown, and why. */
+  fail(text: string): void {
+    this.hide();
+    this.middle.classList.add("bad");
+    this.middle.replaceChildren(made("p", { role: "alert" }, text));
+  }
+
+  /** The stream is being opened. */
+  loading(loadedBytes: number, totalBytes: number | undefined, text: string): void {
+    const known = totalBytes !== undefined && totalBytes > 0;
+    const bar = this.middle.querySelector("progress");
+    if (bar && this.middle.dataset.is === "loading") {
+      if (known) bar.value = loadedBytes / totalBytes;
+      setText(this.middle.querySelector("p")!, text);
+      return;
+    }
+    const made_ = made("progress", { "aria-label": "Opening the stream", max: "1" });
+    if (known) made_.value = loadedBytes / totalBytes;
+    this.middle.classList.remove("bad");
+    this.middle.dataset.is = "loading";
+    this.middle.replaceChildren(made_, made("p", { class: "soft" }, text));
+  }
+
+  /** Something else in the middle, or nothing. */
+  show(...children: Node[]): void {
+    this.middle.classList.remove("bad");
+    this.middle.dataset.is = "";
+    this.middle.replaceChildren(...children);
+  }
+
+  private hide(): void {
+    this.note.hidden = true;
+  }
+}

@@ -1,0 +1,106 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A camera that hands move: around a point, with it, towards it, or freely. Values in, values out. */
+
+import {
+  across,
+  along,
+  axes,
+  type Camera,
+  center,
+  cross,
+  dot,
+  length,
+  type Rotation,
+  scaled,
+  unit,
+  type Vector,
+  viewmatOf,
+} from "@structgstream/gl";
+
+/** A camera and the point that it turns around. */
+export interface View {
+  readonly camera: Camera;
+  readonly pivot: Vector;
+}
+
+/** Closer to straight up or down than this, left and right would change places. */
+const POLE_RADIANS = 0.03;
+const LEAST_DISTANCE = 1e-3;
+
+/** A camera that turns around the point of its optical axis at the depth of `focus`. */
+export function viewOf(camera: Camera, focus: Vector): View {
+  const eye = center(camera);
+  const forward = axes(camera)[2];
+  const depth = dot(along(focus, eye, -1), forward);
+  const distance = depth > LEAST_DISTANCE ? depth : Math.max(length(along(focus, eye, -1)), LEAST_DISTANCE);
+  return { camera, pivot: along(eye, forward, distance) };
+}
+
+/** Goes round the pivot: to the right for positive `yaw`, up for positive `pitch`, both in radians. */
+export function orbited({ camera, pivot }: View, yaw: number, pitch: number, up: Vector): View {
+  const arm = along(center(camera), pivot, -1);
+  const turn = (vector: Vector) => rotated(vector, up, yaw);
+  const side = cross(turn(arm), up);
+  const right = length(side) > 1e-9 ? unit(scaled(side, -1)) : turn(axes(camera)[0]);
+  const polar = Math.acos(Math.min(Math.max(dot(unit(arm), up), -1), 1));
+  const wanted = Math.min(Math.max(polar - pitch, POLE_RADIANS), Math.PI - POLE_RADIANS);
+  // A camera that is beyond already is not moved by it.
+  const tilt = polar < POLE_RADIANS || polar > Math.PI - POLE_RADIANS ? pitch : polar - wanted;
+  const whole = (vector: Vector) => rotated(turn(vector), right, -tilt);
+  const turned = axes(camera).map(whole) as unknown as Rotation;
+  return { camera: placed(camera, along(pivot, whole(arm)), turned), pivot };
+}
+
+/** Turns the camera where it stands; the pivot stays in front of it. */
+export function looked({ camera, pivot }: View, yaw: number, pitch: number, up: Vector): View {
+  const eye = center(camera);
+  const right = axes(camera)[0];
+  const turn = (vector: Vector) => rotated(rotated(vector, right, pitch), up, yaw);
+  const turned = axes(camera).map(turn) as unknown as Rotation;
+  const distance = length(along(pivot, eye, -1));
+  return { camera: placed(camera, eye, turned), pivot: along(eye, turned[2], distance) };
+}
+
+/** Moves with its pivot so that the scene at its depth goes by so many pixels. */
+export function panned(view: View, x: number, y: number): View {
+  const { camera, pivot } = view;
+  const [right, down] = axes(camera);
+  const depth = Math.max(dot(along(pivot, center(camera), -1), axes(camera)[2]), LEAST_DISTANCE);
+  const shift = along(scaled(right, (-x * depth) / camera.K.fx), down, (-y * depth) / camera.K.fy);
+  return moved(view, shift);
+}
+
+/** Goes towards the pivot: `factor` times as far from it as before. */
+export function dollied({ camera, pivot }: View, factor: number): View {
+  const arm = along(center(camera), pivot, -1);
+  const distance = Math.max(length(arm) * factor, LEAST_DISTANCE);
+  return { camera: placed(camera, along(pivot, unit(arm), distance), axes(camera)), pivot };
+}
+
+/** Flies: so far to the right, down and forward, in scene units. */
+export function flown(view: View, right: number, down: number, forward: number): View {
+  const [x, y, z] = axes(view.camera);
+  return moved(view, along(along(scaled(x, right), y, down), z, forward));
+}
+
+function moved({ camera, pivot }: View, shift: Vector): View {
+  return { camera: placed(camera, along(center(camera), shift), axes(camera)), pivot: along(pivot, shift) };
+}
+
+function placed(camera: Camera, eye: Vector, rotation: Rotation): Camera {
+  return { ...camera, viewmat: viewmatOf(eye, orthonormal(rotation)) };
+}
+
+/** Thousands of small turns must not add up to a skewed camera. */
+function orthonormal([right, , forward]: Rotation): Rotation {
+  const z = unit(forward);
+  const x = unit(along(right, z, -dot(right, z)));
+  return length(x) > 0 ? [x, cross(z, x), z] : [across(z), cross(z, across(z)), z];
+}
+
+/** A vector turned around a unit axis, by the right hand. */
+function rotated(vector: Vector, axis: Vector, radians: number): Vector {
+  const [sine, cosine] = [Math.sin(radians), Math.cos(radians)];
+  const part = scaled(axis, dot(axis, vector) * (1 - cosine));
+  return along(along(scaled(vector, cosine), cross(axis, vector), sine), part);
+}

@@ -1,0 +1,45 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The cameras of a stream as a viewer meets them. */
+
+import type { StreamHeader } from "@structgstream/core";
+import {
+  along,
+  type Camera,
+  center,
+  focusPoint,
+  length,
+  rigCameras,
+  scaled,
+  upAxis,
+  type Vector,
+} from "@structgstream/gl";
+
+export interface RigCamera {
+  readonly name: string;
+  readonly heldOut: boolean;
+  /** In scene units. */
+  readonly camera: Camera;
+}
+
+export interface Rig {
+  readonly cameras: readonly RigCamera[];
+  readonly focus: Vector;
+  readonly up: Vector;
+  /** Largest distance of a camera to the mean of all. */
+  readonly radius: number;
+  /** The camera that a stream begins with: the one nearest to their mean. */
+  readonly first: RigCamera;
+}
+
+export function rigOf(header: StreamHeader): Rig {
+  const found = rigCameras(header);
+  const cameras = header.cameras.map(({ name, heldOut }, i) => ({ name, heldOut, camera: found[i]! }));
+  const centers = found.map(center);
+  const middle = scaled(
+    centers.reduce((sum, eye) => along(sum, eye), [0, 0, 0] as Vector),
+    1 / centers.length,
+  );
+  const distances = centers.map((eye) => length(along(eye, middle, -1)));
+  const first = cameras[distances.indexOf(Math.min(...distances))]!;
+  return { cameras, focus: focusPoint(found), up: upAxis(found), radius: Math.max(...distances), first };
+}

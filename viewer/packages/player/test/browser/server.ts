@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A server of pages and streams that remembers what it was asked, and can be made worse. */
+
+import { createServer, type IncomingMessage, type ServerResponse } from "node:http";
+import type { AddressInfo } from "node:net";
+
+/** A file; `bytes` may be replaced while it is served. */
+export interface Served {
+  bytes: Uint8Array;
+  type?: string;
+  ranges?: boolean;
+  /** Bytes of the body in a second. */
+  bytesPerSecond?: number;
+  cors?: boolean;
+  status?: number;
+  location?: string;
+  changed?: Date;
+}
+
+export interface Request {
+  readonly path: string;
+  /** From the first to before the last byte; undefined when all was asked for. */
+  readonly range: readonly [start: number, end: number] | undefined;
+}
+
+export class TestServer {
+  readonly files = new Map<string, Served>();
+  readonly requests: Request[] = [];
+  private readonly server = createServer((request, response) => void this.answer(request, response));
+
+  /** @returns a server that listens on this machine only */
+  static async started(): Promise<TestServer> {
+    const made = new TestServer();
+    await new Promise<void>((resolve) => made.server.listen(0, "127.0.0.1", resolve));
+    return made;
+  }
+
+  get origin(): string {
+    return `http://127.0.0.1:${(this.server.address() as AddressInfo).port}`;
+  }
+
+  put(path: string, bytes: Uint8Array | string, more: Omit<Served, "bytes"> = {}): Served {
+    const data = typeof bytes === "string" ? new TextEncoder().encode(bytes) : bytes;
+    const file = { bytes: data, ...more };
+    this.files.set(path, file);
+    return file;
+  }
+
+  rangesOf(path: string): (readonly [number, number] | undefined)[] {
+    return this.requests.filter((request) => request.path === path).map(({ range }) => range);
+  }
+
+  async stop(): Promise<void> {
+    this.server.closeAllConnections();
+    await new Promise<void>((resolve) => this.server.close(() => resolve()));
+  }
+
+  private async answer(request: IncomingMessage, response: ServerResponse): Promise<void> {
+    const path = new URL(request.url ?? "/", "http://localhost").pathname;
+    const file = this.files.get(path);
+    const asked = /^bytes=(\d+)-(\d*)$/.exec(request.headers.range ?? "");
+    const size = file?.bytes.length ?? 0;
+    const start = asked ? Number(asked[1]) : 0;
+    const end = asked?.[2] ? Math.min(Number(asked[2]) + 1, size) : size;
+    this.requests.push({ path, range: asked ? [start, end] : undefined });
+    if (!file || file.status) {
+      const headers = file?.location ? { Location: file.location } : {};
+      response.writeHead(file?.status ?? 404, headers).end();
+      return;
+    }
+    const headers: Record<string, string> = {
+      "Content-Type": file.type ?? "application/octet-stream",
+      "Last-Modified": (file.changed ?? new Date(0)).toUTCString(),
+      ...(file.cors ? { "Access-Control-Allow-Origin": "*", "Access-Control-Expose-Headers": "Content-Range" } : {}),
+    };
+    if (!asked || file.ranges === false) {
+      response.writeHead(200, { ...headers, "Content-Length": size });
+      return pour(response, file, 0, size);
+    }
+    if (start >= size) {
+      response.writeHead(416, { ...headers, "Content-Range": `bytes */${size}` }).end();
+      return;
+    }
+    response.writeHead(206, {
+      ...headers,
+      "Content-Length": end - start,
+      "Content-Range": `bytes ${start}-${end - 1}/${size}`,
+    });
+    await pour(response, file, start, end);
+  }
+}
+
+async function pour(response: ServerResponse, file: Served, start: number, end: number): Promise<void> {
+  const { bytes, bytesPerSecond } = file;
+  const step = bytesPerSecond ? Math.max(Math.round(bytesPerSecond / 20), 1) : end - start;
+  for (let at = start; at < end && !response.destroyed; at += step) {
+    response.write(bytes.subarray(at, Math.min(at + step, end)));
+    if (bytesPerSecond) await new Promise((resolve) => setTimeout(resolve, 50));
+  }
+  response.end();
+}

@@ -1,0 +1,125 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A headless browser with WebGL2 in software, with pages that hold the built player. */
+
+import { existsSync, readFileSync } from "node:fs";
+import { type Browser, type BrowserContextOptions, chromium, type Page } from "playwright-core";
+import type { StructgstreamPlayer } from "../../src/element.ts";
+import { CLIP } from "../served.ts";
+import { TestServer } from "./server.ts";
+
+const USUAL_PLACES = [
+  "/usr/bin/chromium",
+  "/usr/bin/chromium-browser",
+  "/usr/bin/google-chrome",
+  "/usr/bin/chromium-headless-shell",
+  "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+];
+/** Software GL without a window; garbage can be collected when a test asks for it. */
+const FLAGS = [
+  "--no-sandbox",
+  "--use-angle=swiftshader",
+  "--enable-unsafe-swiftshader",
+  "--ignore-gpu-blocklist",
+  "--enable-gpu",
+  "--js-flags=--expose-gc",
+];
+
+declare global {
+  /** What `pageWith` gathers in the page. */
+  var heard: { told: [name: string, message: string][]; frames: number[] };
+  interface HTMLElementTagNameMap {
+    "structgstream-player": StructgstreamPlayer;
+  }
+}
+
+/** Where a browser is: the variable CHROMIUM, or one of the usual places; undefined says that tests must skip. */
+export function chromiumPath(): string | undefined {
+  const found = process.env.CHROMIUM || USUAL_PLACES.find((path) => existsSync(path));
+  if (!found) console.warn("SKIPPED: the browser tests of the player: no Chromium; set CHROMIUM to its path.");
+  return found;
+}
+
+export function builtPlayer(): string {
+  return readFileSync(new URL("../../dist/player.js", import.meta.url), "utf8");
+}
+
+export interface Opened {
+  readonly page: Page;
+  /** What the console and the page complained of. */
+  readonly complaints: string[];
+}
+
+/** One browser and one server for a file of tests. */
+export class Stage {
+  private constructor(
+    readonly browser: Browser,
+    readonly server: TestServer,
+  ) {}
+
+  static async opened(executablePath: string): Promise<Stage> {
+    const [browser, server] = await Promise.all([
+      chromium.launch({ executablePath, args: FLAGS }),
+      TestServer.started(),
+    ]);
+    server.put("/player.js", builtPlayer(), { type: "text/javascript" });
+    server.put("/clip.sgs", CLIP);
+    return new Stage(browser, server);
+  }
+
+  /** A page with one player: `attributes` are the element's, written as in HTML. */
+  async open(attributes = 'src="clip.sgs"', query = "", options: BrowserContextOptions = {}): Promise<Opened> {
+    this.server.put("/page.html", pageWith(attributes), { type: "text/html" });
+    this.server.requests.length = 0;
+    const context = await this.browser.newContext({ viewport: { width: 320, height: 240 }, ...options });
+    const page = await context.newPage();
+    const complaints: string[] = [];
+    page.on("pageerror", (error) => complaints.push(`page: ${error.message}`));
+    page.on("console", (message) => {
+      const text = message.text();
+      const usual = text.includes("GPU stall due to ReadPixels");
+      if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
+    });
+    await page.goto(`${this.server.origin}/page.html${query}`);
+    return { page, complaints };
+  }
+
+  async close(): Promise<void> {
+    await this.browser.close();
+    await this.server.stop();
+  }
+}
+
+export function pageWith(attributes: string): string {
+  return `<!doctype html><html lang="en"><meta charset="utf-8"><title>player</title><link rel="icon" href="data:,">
+<meta name="viewport" content="width=device-width"><style>html,body{margin:0;height:100%}</style>
+<structgstream-player ${attributes} style="width:100%;height:100%;aspect-ratio:auto"></structgstream-player>
+<script>
+  const player = document.querySelector("structgstream-player"); globalThis.heard = { told: [], frames: [] };
+  customElements.whenDefined("structgstream-player").then(() => {
+    for (const name of ["error", "notice", "stall", "ended"]) player.on(name, (event) => heard.told.push([name, event.message ?? ""]));
+    player.on("drawn", ({ stats }) => { if (heard.frames.at(-1) !== stats.frameIndex) heard.frames.push(stats.frameIndex); });
+  });
+</script>
+<script type="module" src="/player.js"></script></html>`;
+}
+
+/** Runs in the page: gives back what it gives, with the element and what it has told. */
+export function ask<Result>(
+  page: Page,
+  question: (player: StructgstreamPlayer, told: [string, string][], frames: number[]) => Result | Promise<Result>,
+): Promise<Result> {
+  const text = `(${question.toString()})(document.querySelector("structgstream-player"), heard.told, heard.frames)`;
+  return page.evaluate(text) as Promise<Result>;
+}
+
+/** Waits until the picture shows this frame, of this moment's camera. */
+export async function shows(page: Page, frame: number): Promise<void> {
+  await page.waitForFunction(
+    (wanted) => {
+      const player = document.querySelector("structgstream-player") as StructgstreamPlayer | null;
+      return player?.stats?.frameIndex === wanted && player.stats.settled;
+    },
+    frame,
+    { timeout: 20_000 },
+  );
+}

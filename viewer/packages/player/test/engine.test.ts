@@ -1,0 +1,432 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Engine, decoder and fetcher together, without a browser. */
+
+import { readStream, type Tensor } from "@structgstream/core";
+import { afterEach, describe, expect, test, vi } from "vitest";
+import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
+
+vi.setConfig({ testTimeout: 60_000 });
+
+const WHOLE = readStream(CLIP);
+const PACKETS = WHOLE.packets;
+const KEYS = PACKETS.filter(({ isKey }) => isKey).map(({ index }) => index);
+let open: Playing[] = [];
+
+afterEach(() => {
+  for (const { engine, close } of open) {
+    engine.destroy();
+    close();
+  }
+  open = [];
+});
+
+function opened(file: ServedFile, startSeconds = 0, options = {}): Playing {
+  const found = playing(file.fetch as typeof fetch, options);
+  open.push(found);
+  found.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
+  return found;
+}
+
+/** Whether what was given, update after update, adds up to a frame of the file. */
+function expectFrame(fields: Map<string, Tensor>, index: number): void {
+  const expected = readStream(CLIP).frame(index).fields;
+  for (const name of WHOLE.header!.dynamic) {
+    expect(fields.get(name)?.shape).toEqual(expected.get(name)!.shape);
+    expect(fields.get(name)?.data).toEqual(expected.get(name)!.data);
+  }
+}
+
+test("the clip has groups", () => {
+  expect(KEYS).toEqual([0, 3, 6, 9]);
+});
+
+test("the first picture takes head, tail, header and one key packet", async () => {
+  const file = new ServedFile(CLIP);
+  const play = opened(file);
+  await play.until(() => play.shown.length > 0);
+  expect(play.shown).toEqual([0]);
+  const key = PACKETS[0]!;
+  expect(file.requests).toEqual([
+    [0, 4096],
+    [CLIP.length - 4096, CLIP.length],
+    [4096, key.offset + key.bytes],
+  ]);
+  expect(play.engine.durationSeconds).toBeCloseTo(12 / 30);
+  expect(play.errors).toEqual([]);
+});
+
+test("opened elsewhere, the packets from the key on are read, and no others", async () => {
+  const file = new ServedFile(CLIP);
+  const play = opened(file, PACKETS[8]!.ptsSeconds);
+  await play.until(() => play.shown.at(-1) === 8);
+  expect(play.shown).toEqual([6, 8]);
+  expect(file.requests.slice(2)).toEqual([
+    [4096, PACKETS[0]!.offset],
+    [PACKETS[6]!.offset, PACKETS[9]!.offset],
+  ]);
+});
+
+test("seeking back and forth gives exact frames and fetches what is not there", async () => {
+  const file = new ServedFile(CLIP);
+  const play = opened(file);
+  await play.settled();
+  const before = file.requests.length;
+  const fields = new Map<string, Tensor>();
+  for (const index of [7, 1, 11, 5, 7, 0]) {
+    play.engine.seekFrame(index);
+    for (let last = -1; last !== index; ) {
+      const update = play.engine.tick();
+      for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
+      last = update?.index ?? last;
+      await new Promise((resolve) => setTimeout(resolve, 1));
+    }
+    expectFrame(fields, index);
+  }
+  expect(file.requests.slice(before)).toEqual([
+    [PACKETS[6]!.offset, PACKETS[8]!.offset],
+    [PACKETS[1]!.offset, PACKETS[2]!.offset],
+    [PACKETS[9]!.offset, PACKETS[11]!.offset + PACKETS[11]!.bytes],
+    [PACKETS[3]!.offset, PACKETS[6]!.offset],
+  ]);
+});
+
+test("a seek that is overtaken by another loses no field", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  const fields = new Map<string, Tensor>();
+  for (const index of [4, 10, 2, 8]) {
+    play.engine.seekFrame(index);
+    await new Promise((resolve) => setTimeout(resolve, index));
+  }
+  for (let last = -1; last !== 8; ) {
+    const update = play.engine.tick();
+    for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
+    last = update?.index ?? last;
+    await new Promise((resolve) => setTimeout(resolve, 1));
+  }
+  // What an update leaves out is what the first frame had, which was taken before.
+  const first = readStream(CLIP).frame(0).fields;
+  for (const [name, tensor] of first) if (!fields.has(name)) fields.set(name, tensor);
+  expectFrame(fields, 8);
+});
+
+test("plays to the end, every frame in order, and again from the start", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  let ended = 0;
+  play.engine.on("ended", () => ended++);
+  play.engine.play();
+  await play.until(() => {
+    play.seconds += 1 / 120;
+    return ended === 1;
+  });
+  expect(new Set(play.shown).size).toBeGreaterThan(8);
+  expect(play.shown).toEqual([...play.shown].sort((a, b) => a - b));
+  expect(play.shown.at(-1)).toBe(11);
+  expect([play.engine.paused, play.engine.ended]).toEqual([true, true]);
+  play.engine.play();
+  await play.until(() => play.shown.at(-1) === 0);
+});
+
+test("loops, at another rate", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  play.engine.loop = true;
+  play.engine.playbackRate = 2;
+  play.engine.play();
+  await play.until(() => {
+    play.seconds += 1 / 200;
+    return play.shown.filter((index) => index === 0).length >= 3;
+  });
+  expect(play.engine.paused).toBe(false);
+  expect(() => {
+    play.engine.playbackRate = -1;
+  }).toThrow("expected a positive number");
+});
+
+test("late frames are dropped, and the picture goes on from the next key", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  play.engine.play();
+  await play.until(() => play.engine.buffered[0]?.[1] === play.engine.durationSeconds, "buffer");
+  play.seconds += 0.31; // a hole of nine frames
+  await play.until(() => play.shown.at(-1)! >= 9);
+  // Those decoded ahead were there; the ones between were not made into numbers, nor waited for.
+  expect(play.shown.filter((index) => index > 5)).toEqual([9]);
+  expect(play.engine.stalled).toBe(false);
+});
+
+test("steps", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  for (const [by, at] of [
+    [1, 1],
+    [1, 2],
+    [-1, 1],
+    [-5, 0],
+    [100, 11],
+  ] as const) {
+    play.engine.step(by);
+    await play.until(() => !play.engine.seeking && play.shown.at(-1) === at, `frame ${at}`);
+    expect(play.engine.frameIndex).toBe(at);
+  }
+});
+
+test("a starved clock waits with the last frame, and says so", async () => {
+  const file = new ServedFile(CLIP);
+  const play = opened(file, 0, { aheadSeconds: 0.01 });
+  await play.settled();
+  const stalls: boolean[] = [];
+  play.engine.on("stall", ({ stalled }) => stalls.push(stalled));
+  file.status = 503;
+  play.engine.play();
+  const before = play.engine.currentTime;
+  play.seconds += 0.2;
+  play.engine.tick();
+  expect(stalls).toEqual([true]);
+  expect(play.engine.currentTime).toBeLessThan(before + 0.04);
+  await play.until(() => play.engine.paused, "giving up");
+  expect(play.errors).toEqual(["The server answered 503 where clip.sgs was asked for."]);
+  file.status = undefined;
+  play.engine.play();
+  await play.until(() => {
+    play.seconds += 1 / 120;
+    return play.engine.ended;
+  }, "end");
+  expect(stalls.slice(0, 2)).toEqual([true, false]);
+  expect(play.shown.at(-1)).toBe(11);
+});
+
+describe("a server without ranges", () => {
+  test("is read whole, once, and said so", async () => {
+    const file = new ServedFile(CLIP);
+    file.ranges = false;
+    const play = opened(file);
+    await play.settled();
+    await play.until(() => play.engine.frames.complete);
+    play.engine.seekFrame(10);
+    await play.until(() => play.shown.at(-1) === 10);
+    expect(file.requests.length).toBe(1);
+    expect(play.notices.join()).toContain("(Range)");
+  });
+
+  test("is read again for what was let go of", async () => {
+    const file = new ServedFile(CLIP);
+    file.ranges = false;
+    const play = opened(file, 0, { budgetBytes: 3000 });
+    await play.until(() => play.engine.frames.complete);
+    for (const index of [11, 0, 6]) {
+      play.engine.seekFrame(index);
+      await play.until(() => play.shown.at(-1) === index, `frame ${index}`);
+    }
+    expect(play.errors).toEqual([]);
+  });
+});
+
+test("packets take no more bytes than they may", async () => {
+  const file = new ServedFile(CLIP);
+  const play = opened(file, 0, { budgetBytes: 4000 });
+  await play.settled();
+  play.engine.loop = true;
+  play.engine.play();
+  let most = 0;
+  play.engine.on("progress", ({ buffered }) => {
+    const frames = buffered.flatMap(([start, end]) =>
+      PACKETS.filter((p) => p.ptsSeconds >= start && p.ptsSeconds < end),
+    );
+    most = Math.max(
+      most,
+      frames.reduce((sum, { bytes }) => sum + bytes - 12, 0),
+    );
+  });
+  await play.until(() => {
+    play.seconds += 1 / 200;
+    return play.shown.filter((index) => index === 0).length >= 3;
+  });
+  expect(most).toBeLessThanOrEqual(4000);
+  expect(most).toBeGreaterThan(1000);
+});
+
+describe("a growing file", () => {
+  test("is followed, and its pace is told", async () => {
+    const cut = (frames: number) => CLIP.subarray(0, PACKETS[frames - 1]!.offset + PACKETS[frames - 1]!.bytes + 5);
+    const file = new ServedFile(cut(2));
+    const play = opened(file);
+    await play.until(() => play.engine.frames.count === 2 && play.engine.growing);
+    play.engine.play();
+    const ticking = () => {
+      play.seconds += 1 / 60;
+      return true;
+    };
+    await play.until(() => ticking() && play.shown.at(-1) === 1);
+    await play.until(() => ticking() && play.engine.stalled);
+    expect(play.engine.nextFrameSeconds).toBeUndefined();
+    for (const frames of [3, 4, 5]) {
+      file.bytes = cut(frames);
+      await play.until(() => ticking() && play.shown.at(-1) === frames - 1, `frame ${frames - 1}`);
+    }
+    expect(play.engine.nextFrameSeconds).toBeGreaterThanOrEqual(0);
+    file.bytes = CLIP;
+    await play.until(() => ticking() && play.engine.ended, "end");
+    expect(play.engine.frames.complete).toBe(true);
+    expect(play.errors).toEqual([]);
+  });
+
+  test("that no longer grows comes to an end", async () => {
+    const file = new ServedFile(CLIP.subarray(0, PACKETS[5]!.offset + 20));
+    file.lastModified = new Date(Date.now() - 3_600_000).toUTCString();
+    const play = opened(file);
+    await play.until(() => play.engine.frames.complete);
+    expect(play.engine.frames.count).toBe(5);
+    play.engine.play();
+    await play.until(() => {
+      play.seconds += 1 / 60;
+      return play.engine.ended;
+    });
+    expect(play.shown.at(-1)).toBe(4);
+  });
+
+  test("that was replaced by a shorter one is refused", async () => {
+    const file = new ServedFile(CLIP.subarray(0, PACKETS[5]!.offset));
+    const play = opened(file);
+    await play.until(() => play.engine.growing);
+    file.bytes = CLIP.subarray(0, 9000);
+    await play.until(() => play.errors.length > 0);
+    expect(play.errors[0]).toContain("it was replaced. Load it again");
+  });
+});
+
+describe("damage", () => {
+  test("in a packet costs its group, and is told", async () => {
+    const bytes = CLIP.slice();
+    bytes[PACKETS[4]!.offset + 30]! ^= 4;
+    const play = opened(new ServedFile(bytes));
+    await play.settled();
+    play.engine.play();
+    await play.until(() => {
+      play.seconds += 1 / 120;
+      return play.engine.ended;
+    });
+    expect([...new Set(play.shown)]).toEqual([0, 1, 2, 3, 6, 7, 8, 9, 10, 11]);
+    expect(play.errors).toEqual([`Frames 4 to 5 are lost: its record at byte ${PACKETS[4]!.offset} is damaged.`]);
+    expect(play.engine.frames.lost).toEqual([[4, 6]]);
+    play.engine.seekFrame(5);
+    await play.settled();
+    expect(play.shown.at(-1)).toBe(3);
+  });
+
+  test("in the index is got around by reading all", async () => {
+    const bytes = CLIP.slice();
+    bytes[bytes.length - 30]! ^= 1;
+    const play = opened(new ServedFile(bytes));
+    await play.settled();
+    await play.until(() => play.engine.frames.count === 12);
+    expect(play.errors).toEqual([]);
+  });
+
+  test("of a packet's contents behind a right checksum costs its group", async () => {
+    const { record } = await import("../../core/test/streams.ts");
+    const bytes = CLIP.slice();
+    const { offset, bytes: size } = PACKETS[4]!;
+    const payload = bytes.slice(offset + 8, offset + size - 4);
+    payload.fill(255, 30);
+    bytes.set(record(3, payload), offset);
+    const play = opened(new ServedFile(bytes));
+    await play.settled();
+    play.engine.seekFrame(5);
+    await play.settled();
+    expect(play.errors.join()).toContain("Frames 4 to 5 are lost");
+  });
+
+  test("that leaves no frame is told", async () => {
+    const file = new ServedFile(CLIP.subarray(0, PACKETS[0]!.offset + 20));
+    file.lastModified = new Date(0).toUTCString();
+    const play = opened(file);
+    await play.until(() => play.errors.length > 0);
+    expect(play.errors).toEqual(["clip.sgs has a header and no whole frame to show."]);
+  });
+
+  test("of the header, another format, another version", async () => {
+    const broken = CLIP.slice();
+    broken[5000]! ^= 1;
+    const newer = CLIP.slice();
+    newer[8] = 9;
+    for (const [bytes, sentence] of [
+      [broken, "its init record is damaged"],
+      [newer, "has format version 9.0; this program reads 2.x. Use a newer one."],
+      [new TextEncoder().encode("<html>"), "its first bytes are not the format's signature"],
+    ] as const) {
+      const play = opened(new ServedFile(bytes));
+      await play.until(() => play.errors.length > 0);
+      expect(play.errors[0]).toContain(sentence);
+    }
+  });
+});
+
+test.each([
+  [404, "clip.sgs was not found on the server (404). Check the address."],
+  [403, "The server does not give clip.sgs to this page (403)."],
+  [500, "The server answered 500 where clip.sgs was asked for."],
+])("status %i", async (status, sentence) => {
+  const file = new ServedFile(CLIP);
+  file.status = status;
+  const play = opened(file);
+  await play.until(() => play.errors.length > 0);
+  expect(play.errors).toEqual([sentence]);
+});
+
+test("a server that does not answer is told at once, one that no longer does is asked again", async () => {
+  const file = new ServedFile(CLIP);
+  file.failures = 1;
+  const never = opened(file);
+  await never.until(() => never.errors.length > 0);
+  expect(never.errors[0]).toContain("Access-Control-Allow-Origin");
+  const play = opened(file);
+  await play.settled();
+  file.failures = 2;
+  play.engine.seekFrame(11);
+  await play.until(() => play.shown.at(-1) === 11);
+  expect(play.notices.join()).toContain("The next attempt is in");
+  expect(play.errors).toEqual([]);
+});
+
+test("files of the user's and base64", async () => {
+  for (const source of [
+    { kind: "blob", blob: new Blob([CLIP]), name: "a file" },
+    { kind: "base64", text: `\n${Buffer.from(CLIP).toString("base64")}\n`, name: "a page" },
+  ] as const) {
+    const play = playing(fetch);
+    open.push(play);
+    play.engine.load(source);
+    await play.settled();
+    play.engine.seekFrame(8);
+    await play.until(() => play.shown.at(-1) === 8);
+  }
+  const play = playing(fetch);
+  open.push(play);
+  play.engine.load({ kind: "base64", text: "*", name: "a page" });
+  await play.until(() => play.errors.length > 0);
+  expect(play.errors[0]).toContain("a page is no base64 text");
+});
+
+test("what a packet took is known by field", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  play.engine.seekFrame(4);
+  await play.settled();
+  const facts = play.engine.packetFacts(4)!;
+  expect(facts.bytes).toBe(PACKETS[4]!.bytes);
+  expect([...facts.byField.values()].reduce((sum, bytes) => sum + bytes, 24)).toBe(facts.bytes);
+});
+
+test("a refresh brings every dynamic field", async () => {
+  const play = opened(new ServedFile(CLIP));
+  await play.settled();
+  play.engine.refresh();
+  let fields: string[] = [];
+  for (let i = 0; i < 500 && fields.length === 0; i++) {
+    fields = [...(play.engine.tick()?.fields.keys() ?? [])];
+    await new Promise((resolve) => setTimeout(resolve, 1));
+  }
+  expect(new Set(fields)).toEqual(WHOLE.header!.dynamic);
+});

@@ -1,0 +1,134 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Streams as tests see them: a server that is a function, and an engine with its workers in this very thread. */
+
+import { readFileSync } from "node:fs";
+import { Decoding } from "../src/decode/decoding.ts";
+import type { FromDecoder, ToDecoder } from "../src/decode/messages.ts";
+import { Engine, type EngineOptions } from "../src/engine/engine.ts";
+import type { ReadReply, ReadRequest } from "../src/source/description.ts";
+import { Fetcher, type Patience } from "../src/source/fetcher.ts";
+import type { Port } from "../src/source/port.ts";
+
+export const CLIP = new Uint8Array(readFileSync(new URL("./fixtures/clip.sgs", import.meta.url)));
+export const URL_OF_CLIP = "http://test/clip.sgs";
+
+export const QUICK: Patience = {
+  retries: [0.01, 0.01],
+  firstPoll: 0.01,
+  longestPoll: 0.02,
+  backOff: 1.4,
+  stillAfter: 0.2,
+};
+
+/** A file on a server; `bytes` may be replaced by longer ones. */
+export class ServedFile {
+  readonly requests: [start: number, end: number][] = [];
+  ranges = true;
+  status: number | undefined;
+  /** Answers fail so many times. */
+  failures = 0;
+  lastModified = new Date().toUTCString();
+  chunkBytes = 5000;
+
+  constructor(public bytes: Uint8Array) {}
+
+  readonly fetch = async (_: RequestInfo | URL, init?: RequestInit): Promise<Response> => {
+    await new Promise((resolve) => setTimeout(resolve, 0));
+    init?.signal?.throwIfAborted();
+    if (this.failures > 0) {
+      this.failures--;
+      throw new TypeError("fetch failed");
+    }
+    if (this.status !== undefined) return new Response("", { status: this.status });
+    const range = /^bytes=(\d+)-(\d*)$/.exec(new Headers(init?.headers).get("Range") ?? "");
+    const size = this.bytes.length;
+    const headers = { "Last-Modified": this.lastModified, Date: new Date().toUTCString() };
+    if (!range || !this.ranges) {
+      this.requests.push([0, size]);
+      return new Response(this.body(0, size), { headers: { ...headers, "Content-Length": `${size}` } });
+    }
+    const start = Number(range[1]);
+    const end = range[2] ? Math.min(Number(range[2]) + 1, size) : size;
+    this.requests.push([start, end]);
+    if (start >= size) {
+      return new Response("", { status: 416, headers: { ...headers, "Content-Range": `bytes */${size}` } });
+    }
+    const found = { ...headers, "Content-Range": `bytes ${start}-${end - 1}/${size}` };
+    return new Response(this.body(start, end), { status: 206, headers: found });
+  };
+
+  private body(start: number, end: number): ReadableStream<Uint8Array> {
+    let at = start;
+    const { bytes, chunkBytes } = this;
+    return new ReadableStream({
+      async pull(controller) {
+        await new Promise((resolve) => setTimeout(resolve, 0));
+        if (at >= end) return controller.close();
+        const next = Math.min(at + chunkBytes, end);
+        controller.enqueue(bytes.slice(at, next));
+        at = next;
+      },
+    });
+  }
+}
+
+/** An engine whose clock moves only when a test says so. */
+export interface Playing {
+  readonly engine: Engine;
+  readonly errors: string[];
+  readonly notices: string[];
+  /** Frames given by `tick`, in order. */
+  readonly shown: number[];
+  seconds: number;
+  /** Ticks, letting workers work in between, until `reached`. */
+  until(reached: () => boolean, what?: string): Promise<void>;
+  /** Until the stream is there and nothing is sought; what was found has been given. */
+  settled(): Promise<void>;
+  close(): void;
+}
+
+export function playing(request: typeof fetch, options: EngineOptions = {}): Playing {
+  const [engineLine, fetchLine] = [new MessageChannel(), new MessageChannel()];
+  new Fetcher(fetchLine.port1 as unknown as Port<ReadReply, ReadRequest>, request, QUICK);
+  new Decoding(
+    engineLine.port1 as unknown as Port<FromDecoder, ToDecoder>,
+    fetchLine.port2 as unknown as Port<ReadRequest, ReadReply>,
+    () => new Promise((resolve) => setImmediate(resolve)),
+  );
+  const close = () => {
+    for (const { port1, port2 } of [engineLine, fetchLine]) {
+      port1.close();
+      port2.close();
+    }
+  };
+  const pipeline = {
+    onmessage: undefined as ((message: FromDecoder) => void) | undefined,
+    send: (message: ToDecoder) => engineLine.port2.postMessage(message),
+    close,
+  };
+  engineLine.port2.onmessage = ({ data }: MessageEvent<FromDecoder>) => pipeline.onmessage?.(data);
+  const found: Playing = {
+    engine: new Engine(pipeline, () => found.seconds, options),
+    errors: [],
+    notices: [],
+    shown: [],
+    seconds: 100,
+    async until(reached, what = "what was waited for") {
+      const give = performance.now() + 30_000;
+      while (!reached()) {
+        if (performance.now() > give) throw new Error(`In 30 s there was no ${what}; errors: ${found.errors}`);
+        found.engine.tick();
+        await new Promise((resolve) => setTimeout(resolve, 1));
+      }
+    },
+    async settled() {
+      await found.until(() => found.engine.frames.count > 0 && !found.engine.seeking, "frame that was sought");
+      found.engine.tick();
+    },
+    close,
+  };
+  found.engine.on("error", ({ message }) => found.errors.push(message));
+  found.engine.on("notice", ({ message }) => found.notices.push(message));
+  found.engine.on("frame", ({ index }) => found.shown.push(index));
+  return found;
+}

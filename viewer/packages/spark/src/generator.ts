@@ -1,0 +1,69 @@
+// SPDX-License-Identifier: Apache-2.0
+/** What Spark runs for each splat: an anchor's MLPs for this eye, or a free Gaussian. */
+
+import { dyno } from "@sparkjsdev/spark";
+import { evaluation, mlpLayout, type Shape } from "@structgstream/gl/shading";
+import type { IUniform, Vector3 } from "three";
+
+/** Beside those of the fields. */
+export interface SceneUniforms {
+  readonly eye: IUniform<Vector3>;
+  /** How many of the splats are anchors'; the others are free. */
+  readonly structuredCount: IUniform<number>;
+}
+
+const FREE_TEXELS = 4;
+
+function sceneGlsl(shape: Shape): string {
+  const splats = shape.offsetsPerAnchor;
+  return `${evaluation(shape, mlpLayout(shape), { first: 0, count: splats })}
+uniform sampler2D offsetScales, baseScales, offsets, free;
+uniform int structuredCount;
+
+void structuredSplat(int i, inout Gsplat splat) {
+  int m = i / ${splats};
+  int k = i - m * ${splats};
+  evaluate(m);
+  splat.center = texelFetch(positions, place(m), 0).xyz +
+    texelFetch(offsets, place(i), 0).xyz * exp(texelFetch(offsetScales, place(m), 0).xyz);
+  splat.scales = exp(texelFetch(baseScales, place(m), 0).xyz) * b[k].xyz;
+  splat.quaternion = vec4(c[k].xyz, b[k].w);
+  splat.rgba = vec4(a[k].yzw, a[k].x);
+}
+
+void freeSplat(int i, inout Gsplat splat) {
+  vec4 t[${FREE_TEXELS}];
+  for (int j = 0; j < ${FREE_TEXELS}; j++) t[j] = texelFetch(free, place(i * ${FREE_TEXELS} + j), 0);
+  splat.center = t[0].xyz;
+  splat.scales = exp(vec3(t[0].w, t[1].xy));
+  splat.quaternion = normalize(vec4(t[1].w, t[2].xy, t[1].z)); // x, y, z, w
+  splat.rgba = vec4(t[2].w, t[3].xy, 1.0 / (1.0 + exp(-t[2].z)));
+}
+
+void streamSplat(int i, out Gsplat splat) {
+  splat.index = i;
+  if (i < structuredCount) structuredSplat(i, splat); else freeSplat(i - structuredCount, splat);
+  // True for numbers only: what is not a number is not drawn, nor what the trainer's rasteriser leaves out.
+  splat.flags = splat.rgba.a >= 1.0 / 255.0 ? GSPLAT_FLAG_ACTIVE : 0u;
+}
+`;
+}
+
+/** A dyno block from a splat's number to the splat, in scene units. */
+export function splatOfNumber(
+  shape: Shape,
+  uniforms: Readonly<Record<string, IUniform>> & SceneUniforms,
+  index: dyno.DynoVal<"int">,
+): dyno.DynoVal<typeof dyno.Gsplat> {
+  const block = new dyno.Dyno({
+    inTypes: { index: "int" },
+    outTypes: { gsplat: dyno.Gsplat },
+    inputs: { index },
+    generate: ({ inputs, outputs }) => ({
+      globals: [dyno.defineGsplat, sceneGlsl(shape)],
+      statements: [`streamSplat(${inputs.index}, ${outputs.gsplat});`],
+      uniforms,
+    }),
+  });
+  return block.outputs.gsplat;
+}
