@@ -52,7 +52,7 @@ def main() -> None:
     scene = on_device(reader.scene(options.frame), backend.device)
     rig = reader.header.rig
     views = {name: reader.header.similarity.camera(rig[name]) for name in rig}
-    frames = of_cameras(capture_of(reader, options.capture), tuple(rig)).frames()
+    frames = of_cameras(capture_of(reader.header, options.capture, frames=None), tuple(rig)).frames()
     truths = next(frame for number, frame in enumerate(frames) if number == options.frame).images
     own = {name: rendered(scene, views[name], backend)[0] for name in rig}
     sides = {"training": rig.training, "held out": rig.testing}
