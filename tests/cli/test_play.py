@@ -35,14 +35,18 @@ class Playing:
     process: "subprocess.Popen[bytes]"
     printed: Path
 
-    def address(self) -> str:
-        """The address that is announced, once it is."""
+    def said(self, pattern: str) -> str:
+        """What matches ``pattern``, once it is printed."""
         last = time.monotonic() + PATIENCE_SECONDS
         while time.monotonic() < last:
-            if found := re.search(r"http://127\.0\.0\.1:\d+/", self.printed.read_text()):
+            if found := re.search(pattern, self.printed.read_text()):
                 return found[0]
             time.sleep(0.1)
-        raise AssertionError(f"no address in {self.printed.read_text()!r}")
+        raise AssertionError(f"no {pattern} in {self.printed.read_text()!r}")
+
+    def address(self) -> str:
+        """The address that is announced."""
+        return self.said(r"http://127\.0\.0\.1:\d+/")
 
     def interrupted(self) -> int:
         """Presses Ctrl-C; gives back the exit status."""
@@ -99,9 +103,9 @@ def test_it_serves_until_ctrl_c(tmp_path: Path) -> None:
 def test_it_waits_for_the_file_and_its_whole_header(tmp_path: Path) -> None:
     file = tmp_path / "later.sgs"
     with playing(tmp_path, str(file), "--wait", "--no-browser") as command:
-        time.sleep(0.3)
+        command.said("Waiting for")
         file.write_bytes(STREAM[:100])
-        time.sleep(0.3)
+        time.sleep(1.0)
         assert command.process.poll() is None
         file.write_bytes(STREAM)
         assert fetched(f"{command.address()}stream") == STREAM
@@ -109,7 +113,7 @@ def test_it_waits_for_the_file_and_its_whole_header(tmp_path: Path) -> None:
 
 def test_ctrl_c_ends_waiting(tmp_path: Path) -> None:
     with playing(tmp_path, str(tmp_path / "never.sgs"), "--wait") as command:
-        time.sleep(3.0)  # Python itself must be past its start to take a signal as an exception.
+        command.said("Waiting for")
         assert command.interrupted() == 130
         assert "Traceback" not in command.printed.read_text()
 

@@ -76,9 +76,11 @@ def main(arguments: list[str]) -> None:
 
 
 def _wait_for(stream: "StreamFile") -> None:
-    with Console(stderr=True).status(f"waiting for {stream.path}"):
-        while not stream.has_begun():
-            time.sleep(LOOK_AGAIN_SECONDS)
+    if not stream.has_begun():
+        text = f"Waiting for {stream.path}, which comes when frame 0 is done (Ctrl-C ends)."
+        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
+    while not stream.has_begun():
+        time.sleep(LOOK_AGAIN_SECONDS)
 
 
 def _truth(stream: Path, scene: Path) -> "Truth":
