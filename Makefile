@@ -47,6 +47,10 @@ wheel:
 wheel-test:
 	scripts/wheel --python $(PYTHON) --test-only $(WHEEL_OPTIONS)
 
+# The documentation as a site, in site/.
+docs:
+	scripts/docs $(PYTHON)
+
 clean:
 	rm -rf $(VENV) .venv-wheel .venv-docs build dist site demo viewer/node_modules viewer/packages/*/dist viewer/packages/player/types viewer/packages/*/*.tsbuildinfo
 
