@@ -34,7 +34,11 @@ API_HEAD = """# API reference
 What `import structgstream` gives; names are resolved on first use. Axes, units and letters of shapes:
 [conventions](conventions.md).
 """
-GROUPS = {"Functions": str.islower, "Classes": lambda name: not name.islower() and not name.isupper(), "Constants": str.isupper}
+GROUPS = {
+    "Functions": str.islower,
+    "Classes": lambda name: not name.islower() and not name.isupper(),
+    "Constants": str.isupper,
+}
 
 STYLE = "css/site.css"
 
