@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check viewer-test player clean
+.PHONY: demo test check viewer-test player wheel wheel-test docs clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
@@ -39,8 +39,20 @@ $(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]'
 	touch $@ $(VENV)/.demo-ready
 
+# A wheel in dist/ that runs on other machines, tried in an empty environment. WHEEL_OPTIONS: see scripts/wheel.
+wheel:
+	scripts/wheel --python $(PYTHON) $(WHEEL_OPTIONS)
+
+# Only the trial of the wheel in dist/, with another Python for instance.
+wheel-test:
+	scripts/wheel --python $(PYTHON) --test-only $(WHEEL_OPTIONS)
+
+# The documentation as a site, in site/.
+docs:
+	scripts/docs $(PYTHON)
+
 clean:
-	rm -rf $(VENV) build dist demo viewer/node_modules viewer/packages/*/dist viewer/packages/player/types viewer/packages/*/*.tsbuildinfo
+	rm -rf $(VENV) .venv-wheel .venv-docs build dist site demo viewer/node_modules viewer/packages/*/dist viewer/packages/player/types viewer/packages/*/*.tsbuildinfo
 
 # Tables of the documents, from the results beside them.
 .PHONY: tables
