@@ -18,7 +18,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.data.wrappers import of_cameras
 from structgstream.evaluation.evaluate import Picture, rendered
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
-from structgstream.export.bake import Baking, baked
+from structgstream.exporters.bake import Baking, baked
 from structgstream.kernels.backend import select_backend
 from structgstream.scene.state import on_device
 

@@ -15,7 +15,7 @@ from streams import compact_header, header_for, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.export.bake import Baking
+from structgstream.exporters.bake import Baking
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 

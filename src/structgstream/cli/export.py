@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, StreamFile, parsed
 from structgstream.cli.progress import human_bytes
-from structgstream.export.formats import FORMATS, PAGES, Format, PageFormat
+from structgstream.exporters.formats import FORMATS, PAGES, Format, PageFormat
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -63,8 +63,8 @@ def main(arguments: list[str]) -> None:
         return
     degree = checked_degree(options.sh_degree, format)
     from structgstream.codec.reader import open_stream
-    from structgstream.export.bake import Baking, baked
-    from structgstream.export.write import write_gaussians
+    from structgstream.exporters.bake import Baking, baked
+    from structgstream.exporters.write import write_gaussians
     from structgstream.kernels.backend import select_backend
     from structgstream.scene.state import on_device
 
