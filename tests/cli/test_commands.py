@@ -14,7 +14,8 @@ import av
 import pytest
 
 from drawn import pixels_of
-from structgstream.cli import main, reconstruct, render
+from structgstream import recorder
+from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.data.clip import bundled_clip_path
@@ -312,7 +313,7 @@ def test_exit_status_of_the_program(tmp_path: Path) -> None:
 def test_the_check_before_the_first_frame_sees_a_folder_without_permission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(reconstruct.os, "access", lambda path, mode: False)  # root may write anywhere
+    monkeypatch.setattr(recorder.os, "access", lambda path, mode: False)  # root may write anywhere
     assert "permission" in error_of(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs")], capsys, status=1)
 
 

@@ -56,7 +56,7 @@ def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, capsy
     assert [entry.name for entry in tmp_path.iterdir()] == ["one.ply"]
     reader = open_stream(stream)
     header, scene = reader.header, reader.scene(1)
-    camera = header.similarity.camera(header.rig[header.rig.training[0]])
+    camera = header.camera(header.rig.training[0])
     drawn = scene.gaussians(camera, reference_backend())
     wanted = header.similarity.inverse_points(drawn.means[drawn.opacities > 0.5])
     found = torch.from_numpy(np.stack([vertices[axis] for axis in "xyz"], axis=1).copy())

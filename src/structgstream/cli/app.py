@@ -9,9 +9,10 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from structgstream.errors import StructGStreamError
+from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
     "demo": "reconstruct the bundled clip and show everything there is to see",
@@ -34,6 +35,19 @@ class UsageError(Exception):
 
 class Interrupted(Exception):
     """The user pressed Ctrl-C; the message says what is stored and how to go on."""
+
+
+@contextmanager
+def usage_checked() -> Iterator[None]:
+    """What the options ask for is checked here: a value that cannot work is wrong usage.
+
+    Raises:
+        UsageError: in place of a ``ConfigError``.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
