@@ -287,11 +287,25 @@ def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: p
     assert "is a file" in error_of(["demo", "--output", str(stream)], capsys, status=2)
 
 
-def test_the_configuration_has_help_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["reconstruct", "--preset", "fast", "--help-config"]) == 0
+@pytest.mark.parametrize("given", [["--preset", "fast"], ["--preset=fast"], ["--preset", "rig", "--preset=fast"]])
+def test_the_configuration_has_help_of_its_own(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    from structgstream.presets import DEFAULT_PRESET, PRESETS
+
+    assert main(["reconstruct", *given, "--help-config"]) == 0
     text = capsys.readouterr().out
     assert "--online.patching.grad-threshold" in text
     assert "'fast'" in text
+    ours, default = (PRESETS[name].initial.iterations for name in ("fast", DEFAULT_PRESET))
+    shown = text[text.index("--initial.iterations") :].split("default: ")[1]
+    assert shown.startswith(f"{ours})")
+    assert ours != default
+
+
+@pytest.mark.parametrize("given", [["--preset", "tny"], ["--preset=tny"], ["--preset"]])
+def test_a_wrong_preset_has_no_help(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(["reconstruct", "--help-config", *given], capsys, status=2)
+    assert error.count("\n") == 1
+    assert "preset" in error
 
 
 def test_the_presets_named_in_help_are_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:

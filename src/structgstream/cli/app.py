@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(overview(), file=sys.stdout if given else sys.stderr)
         return DONE if given else USAGE
     if given[0] == "--version":
-        from structgstream import __version__
+        from structgstream.version import __version__
 
         print(__version__)
         return DONE
@@ -84,6 +84,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         _say(f"structgstream: {error}")
+        return PROBLEM
+    except MemoryError as error:
+        if debug:
+            traceback.print_exc()
+        said = f" ({error})" if str(error) else ""
+        _say(
+            f"structgstream: memory does not suffice{said}; end other programs, or take smaller pictures (--scale 0.5)."
+        )
         return PROBLEM
     except Exception as error:
         if debug:

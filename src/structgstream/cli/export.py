@@ -54,16 +54,14 @@ def main(arguments: list[str]) -> None:
     options = parsed(Export, "export", arguments=arguments)
     from structgstream.exporters.request import check_page, checked_degree, chosen_frames, destination
 
+    frame, frames = options.frame, options.frames
     with usage_checked():
-        frame, frames = options.frame, options.frames
         output, format = destination(options.stream, options.output, format=options.format, frame=frame, frames=frames)
         if format == "html" or format == "site":
             check_page(frame=frame, frames=frames, sh_degree=options.sh_degree)
-        else:
-            degree = checked_degree(options.sh_degree, format)
-    if format == "html" or format == "site":
-        _export_page(options.stream, output, format)
-        return
+            _export_page(options.stream, output, format)
+            return
+        degree = checked_degree(options.sh_degree, format)
     from structgstream.codec.reader import open_stream
     from structgstream.exporters.frames import write_frames
     from structgstream.kernels.backend import select_backend

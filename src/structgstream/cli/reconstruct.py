@@ -149,6 +149,12 @@ def reconstructed(
 
 
 def _print_config(arguments: list[str]) -> None:
-    given = arguments.index("--preset") + 1 if "--preset" in arguments else len(arguments)
-    preset = arguments[given] if given < len(arguments) else None
+    preset = None
+    for argument, following in zip(arguments, [*arguments[1:], None], strict=True):
+        if argument == "--preset":
+            if following is None:
+                raise UsageError("--preset needs a name after it, such as --preset fast.")
+            preset = following
+        elif argument.startswith("--preset="):
+            preset = argument.removeprefix("--preset=")
     resolved_config(preset, ["--help"], command="reconstruct SCENE -o OUT.sgs", seed=None)
