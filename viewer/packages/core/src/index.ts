@@ -5,8 +5,9 @@ export type { Damage } from "./damage.js";
 export { checkFollows, type Frame, fieldBytes, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 export { StreamError } from "./errors.js";
 export { FIELD_NAMES, type FieldName, type Fields, type Tensor } from "./fields.js";
-export { type Camera, type Similarity, type StreamHeader, unpackedHeader } from "./header.js";
-export { FOOTER_BYTES, type IndexEntry, indexEntries, indexOffset } from "./index.js";
+export { FOOTER_BYTES, type IndexEntry, indexEntries, indexOffset } from "./fileIndex.js";
+export type { Camera, Similarity, StreamHeader } from "./header.js";
+export { unpackedHeader } from "./initRecord.js";
 export { type PacketInfo, type ReaderState, readStream, StreamReader } from "./reader.js";
 export {
   CHECKSUM_BYTES,

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The init record: what a receiver knows before the first frame (docs/bitstream.md, section Init record). */
+/** Reads a header from the init record (docs/bitstream.md, section Init record). */
 
 import { mixedBlocks } from "./blocks.js";
 import { checkCodec } from "./compact.js";
 import { StreamError } from "./errors.js";
 import { checkShapes, type FieldName, type Fields, isFieldName, isScene, mergedFields, type Tensor } from "./fields.js";
+import { type Camera, type StreamHeader, trainingCameras } from "./header.js";
 import { unpackedJson } from "./json.js";
 import { viewOf } from "./records.js";
 import { AS_THEY_ARE, decodedFields } from "./staticFields.js";
@@ -13,44 +14,6 @@ const LENGTH_BYTES = 4;
 const MAX_IMAGE_SIDE = 65535;
 const LEAST_STEP = 2 ** -64;
 const RIGID = 1e-3;
-
-/** A camera of the capture, in the capture's own units. */
-export interface Camera {
-  readonly name: string;
-  /** 16 numbers, row by row: world to camera, OpenCV axes. */
-  readonly viewmat: readonly number[];
-  /** 9 numbers, row by row: pixels, centre of the top-left pixel at (0.5, 0.5). */
-  readonly K: readonly number[];
-  readonly width: number;
-  readonly height: number;
-  readonly near: number;
-  readonly heldOut: boolean;
-}
-
-/** `scene = (capture - center) * scale`. */
-export interface Similarity {
-  readonly center: readonly [number, number, number];
-  readonly scale: number;
-}
-
-/** What the init record says; `reference` is what key packets of the `compact` codec change. */
-export interface StreamHeader {
-  readonly cameras: readonly Camera[];
-  readonly similarity: Similarity;
-  readonly fps: number;
-  readonly codec: string;
-  readonly dynamic: ReadonlySet<FieldName>;
-  readonly static: Fields;
-  readonly reference: Fields;
-  readonly steps: ReadonlyMap<string, number>;
-  readonly distanceInput: boolean;
-  readonly config: Readonly<Record<string, unknown>>;
-  readonly metadata: Readonly<Record<string, unknown>>;
-}
-
-export function trainingCameras(header: StreamHeader): number {
-  return header.cameras.filter((camera) => !camera.heldOut).length;
-}
 
 /**
  * The header of an init record's payload.
