@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -150,3 +150,25 @@ def test_exports(stream: Path, tmp_path: Path) -> None:
         structgstream.export(stream, tmp_path / "x.html", frame=0)
     with pytest.raises(ConfigError, match="give one of them"):
         structgstream.export(stream, tmp_path / "x", frame=0, frames=(0, 1))
+
+
+def classes_in(hint: Any) -> set[type]:
+    """The package's own classes in a type, those that are inside of others too."""
+    found = {kind for part in get_args(hint) for kind in classes_in(part)}
+    return found | ({hint} if isinstance(hint, type) and hint.__module__.startswith("structgstream") else set())
+
+
+def test_what_is_returned_is_exported() -> None:
+    returned = set[type]()
+    for function in (
+        structgstream.reconstruct,
+        structgstream.evaluate,
+        structgstream.export,
+        structgstream.open_stream,
+    ):
+        returned |= classes_in(get_type_hints(function)["return"])
+    for kind in [*returned]:
+        for hint in get_type_hints(kind).values():
+            returned |= classes_in(hint)
+    assert {kind.__name__ for kind in returned} >= {"FrameReport", "FrameScores", "Report", "Scores", "StreamReader"}
+    assert not {kind.__name__ for kind in returned} - {*structgstream.__all__}

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from structgstream.evaluation.report import FrameScores, Report, Scores
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
+    from structgstream.memory import PeakKind
     from structgstream.presets import PRESETS, StreamConfig
     from structgstream.scene.render import Rendering, render
     from structgstream.scene.scene import Scene
@@ -45,6 +46,7 @@ _HOMES = {
     "Packet": "codec.packets",
     "PacketInfo": "codec.reader",
     "PacketKind": "codec.packets",
+    "PeakKind": "memory",
     "Rendering": "scene.render",
     "Report": "evaluation.report",
     "Scene": "scene.scene",
@@ -78,6 +80,7 @@ __all__ = [
     "Packet",
     "PacketInfo",
     "PacketKind",
+    "PeakKind",
     "Rendering",
     "Report",
     "Scene",
