@@ -13,12 +13,12 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Read once, when torch loads OpenMP.
 
-from structgstream.cli.evaluate import capture_of
 from structgstream.codec.reader import open_stream
 from structgstream.data.wrappers import of_cameras
+from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import Picture, rendered
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
-from structgstream.export.bake import Baking, baked
+from structgstream.exporters.bake import Baking, baked
 from structgstream.kernels.backend import select_backend
 from structgstream.scene.state import on_device
 
@@ -51,7 +51,7 @@ def main() -> None:
     reader = open_stream(options.stream, by_index=True)
     scene = on_device(reader.scene(options.frame), backend.device)
     rig = reader.header.rig
-    views = {name: reader.header.similarity.camera(rig[name]) for name in rig}
+    views = {name: reader.header.camera(name) for name in rig}
     frames = of_cameras(capture_of(reader.header, options.capture, frames=None), tuple(rig)).frames()
     truths = next(frame for number, frame in enumerate(frames) if number == options.frame).images
     own = {name: rendered(scene, views[name], backend)[0] for name in rig}

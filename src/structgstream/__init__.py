@@ -1,45 +1,67 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ring of synchronised cameras to a free-viewpoint video stream, frame by frame.
 
+:func:`reconstruct` makes a stream of a capture, :func:`open_stream` opens it for looking at, :func:`evaluate` scores it
+and :func:`export` writes it in other formats. Cameras and points are in the units of the capture, except in a
+:class:`Scene`, which is normalised (``docs/conventions.md``).
+
 Names are resolved on first use, so that ``import structgstream`` costs nothing and needs no optional package.
 """
 
 import importlib
 from typing import TYPE_CHECKING
 
+from structgstream.version import __version__ as __version__
+
 if TYPE_CHECKING:
+    from structgstream.api import evaluate, export, reconstruct
     from structgstream.cameras import Camera, CameraRig
-    from structgstream.codec.packets import Packet, StreamHeader
-    from structgstream.codec.reader import StreamReader, open_stream
+    from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+    from structgstream.codec.reader import PacketInfo, StreamReader, open_stream
     from structgstream.codec.sinks import FileSink, MemorySink
     from structgstream.data.open import open_capture
+    from structgstream.data.source import FrameSource
     from structgstream.errors import StructGStreamError
+    from structgstream.evaluation.report import FrameScores, Report, Scores
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
+    from structgstream.memory import PeakKind
     from structgstream.presets import PRESETS, StreamConfig
-    from structgstream.scene.render import render
+    from structgstream.scene.render import Rendering, render
     from structgstream.scene.scene import Scene
-    from structgstream.session import Session
-
-__version__ = "0.1.0"
+    from structgstream.session import FrameReport, Session
+    from structgstream.similarity import Similarity
 
 _HOMES = {
     "Backend": "kernels.backend",
     "Camera": "cameras",
     "CameraRig": "cameras",
     "FileSink": "codec.sinks",
+    "FrameReport": "session",
+    "FrameScores": "evaluation.report",
+    "FrameSource": "data.source",
     "MemorySink": "codec.sinks",
     "MultiViewFrame": "frames",
     "PRESETS": "presets",
     "Packet": "codec.packets",
+    "PacketInfo": "codec.reader",
+    "PacketKind": "codec.packets",
+    "PeakKind": "memory",
+    "Rendering": "scene.render",
+    "Report": "evaluation.report",
     "Scene": "scene.scene",
+    "Scores": "evaluation.report",
     "Session": "session",
+    "Similarity": "similarity",
     "StreamConfig": "presets",
     "StreamHeader": "codec.packets",
     "StreamReader": "codec.reader",
     "StructGStreamError": "errors",
+    "evaluate": "api",
+    "export": "api",
     "open_capture": "data.open",
     "open_stream": "codec.reader",
+    "reconstruct": "api",
     "render": "scene.render",
     "select_backend": "kernels.backend",
 }
@@ -50,17 +72,30 @@ __all__ = [
     "Camera",
     "CameraRig",
     "FileSink",
+    "FrameReport",
+    "FrameScores",
+    "FrameSource",
     "MemorySink",
     "MultiViewFrame",
     "Packet",
+    "PacketInfo",
+    "PacketKind",
+    "PeakKind",
+    "Rendering",
+    "Report",
     "Scene",
+    "Scores",
     "Session",
+    "Similarity",
     "StreamConfig",
     "StreamHeader",
     "StreamReader",
     "StructGStreamError",
+    "evaluate",
+    "export",
     "open_capture",
     "open_stream",
+    "reconstruct",
     "render",
     "select_backend",
 ]
@@ -70,3 +105,7 @@ def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

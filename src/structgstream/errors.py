@@ -10,6 +10,7 @@
     |-- StorageError            the stream cannot be written (disk full, no permission)
     |-- BackendError            a compute back-end is not available on this machine
     |-- ConfigError             an option has a value that cannot work
+    |-- OutOfMemoryError        memory does not suffice for a kernel; a MemoryError too
     |-- PlayerError             the player cannot be served, or does not fit in a page
     |-- ExperimentError         a step of a sweep failed; the others are done
     `-- MissingExtraError       an optional dependency is not installed
@@ -45,6 +46,13 @@ class BackendError(StructGStreamError):
 
 class ConfigError(StructGStreamError):
     """A configuration value cannot work."""
+
+
+class OutOfMemoryError(StructGStreamError, MemoryError):
+    """Memory does not suffice; the message says for what."""
+
+    def __init__(self, work: str) -> None:
+        super().__init__(f"Memory does not suffice {work}; end other programs, or take smaller pictures (--scale 0.5).")
 
 
 class PlayerError(StructGStreamError):

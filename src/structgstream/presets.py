@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configurations as values. Paper mode is a preset, not a fork; the paper's ablations are edits of one."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig
+from structgstream.errors import ConfigError
 from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig
 from structgstream.training.disturbance import DisturbanceConfig
@@ -21,6 +23,8 @@ from structgstream.training.optim import Rate
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.rounding import RoundingConfig
 from structgstream.training.solidity import SolidityConfig
+
+MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,53 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
         return value
 
     return plain(asdict(config))
+
+
+def preset_named(name: str) -> StreamConfig:
+    """The configuration of a preset.
+
+    Raises:
+        ConfigError: there is no such preset.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"there is no preset {name!r}; there are {', '.join(PRESETS)}.")
+    return PRESETS[name]
+
+
+def with_budget(config: StreamConfig, *, name: str | None, quality: float | None, mbits: float | None) -> StreamConfig:
+    """``config`` with another quality, and with a rate to keep to, as far as they are given.
+
+    Args:
+        config: of a compact stream.
+        name: its preset's, for messages.
+        quality: of compact streams, 0 is the preset's own, and 1 more makes every step half as large.
+        mbits: of compact streams, the rate in Mbit/s.
+
+    Raises:
+        ConfigError: the stream's codec has neither, or the value is out of range.
+    """
+    if quality is None and mbits is None:
+        return config
+    if config.codec != "compact":
+        option = "--mbits" if quality is None else "--quality"
+        made = "this configuration" if name is None else f"the preset {name!r}"
+        raise ConfigError(
+            f"{option} is for streams with the codec compact; {made} makes one with the codec {config.codec}. "
+            "Add --preset compact."
+        )
+    if quality is not None:
+        if not abs(quality) <= MOST_QUALITY:
+            raise ConfigError(
+                f"--quality {quality:g} is not one of {-MOST_QUALITY:g} to {MOST_QUALITY:g}: 0 is the preset's own, "
+                "and 1 more makes every step half as large."
+            )
+        rounding = replace(config.online.rounding, quality=quality)
+        config = replace(config, online=replace(config.online, rounding=rounding))
+    if mbits is not None:
+        if not 0 < mbits < math.inf:
+            raise ConfigError(f"--mbits {mbits:g} is no rate; it is in megabits a second, such as --mbits 5.")
+        config = replace(config, rate=replace(config.rate, target_mbits=mbits))
+    return config
 
 
 def decayed(rates: InitialRates, share: float) -> InitialRates:

@@ -4,7 +4,7 @@
 While a frame is fitted, the next one is read and what moves in its pictures is looked for (``lookahead``)."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -121,7 +121,7 @@ class Session:
         if resumed is not None:
             check_resumable(resumed.header, source, config=config, metadata=self._metadata)
 
-    def run(self) -> Iterator[FrameReport]:
+    def run(self) -> Generator[FrameReport, None, None]:
         """Fit, encode and write every frame that the sink does not hold yet; yields a report for each.
 
         The sink is closed, with its index, however the loop ends; only a sink that could not write gets no index.

@@ -4,9 +4,11 @@
 import ast
 import importlib
 import pkgutil
+import re
 import statistics
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import structgstream
@@ -20,6 +22,19 @@ def test_layers() -> None:
     program = Path(sys.executable).with_name("lint-imports")
     result = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout
+
+
+def test_the_picture_of_layers_is_that_of_the_contract() -> None:
+    """Row by row; and every module of the package has a place in it."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (layers,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
+    stated = [{name.removeprefix("structgstream.") for name in row.split(" | ")} for row in layers]
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    picture = text.split("## Layers")[1].split("```")[1]
+    drawn = [set(re.findall(r"`(\w+)`", line)) for line in picture.splitlines() if line.strip()]
+    assert drawn == stated
+    modules = {module.name for module in pkgutil.iter_modules(structgstream.__path__)}
+    assert set().union(*drawn) == modules - {"__main__"}
 
 
 def test_modules_stay_small() -> None:

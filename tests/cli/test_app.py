@@ -10,7 +10,7 @@ import pytest
 import structgstream
 from structgstream.cli import app
 from structgstream.cli.app import COMMANDS, main
-from structgstream.errors import CaptureError
+from structgstream.errors import CaptureError, OutOfMemoryError
 
 
 @pytest.fixture
@@ -58,6 +58,19 @@ def test_a_problem_is_one_sentence_without_a_traceback(command, capsys: pytest.C
     assert capsys.readouterr().err == "structgstream: The capture x is an empty folder.\n"
     assert main(["inspect", "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "error", [OutOfMemoryError("to lift flow"), MemoryError(), MemoryError("Unable to allocate 3 TiB")]
+)
+def test_exhausted_memory_is_one_sentence(command, error: MemoryError, capsys: pytest.CaptureFixture[str]) -> None:
+    command(raising(error))
+    assert main(["reconstruct"]) == 1
+    text = capsys.readouterr().err
+    assert text.startswith("structgstream: ")
+    assert text.count("\n") == 1
+    assert "emory does not suffice" in text
+    assert "--scale" in text
 
 
 def test_a_bug_says_that_it_is_one(command, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,8 @@ import av
 import pytest
 
 from drawn import pixels_of
-from structgstream.cli import main, reconstruct, render
+from structgstream import recorder
+from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.data.clip import bundled_clip_path
@@ -286,11 +287,25 @@ def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: p
     assert "is a file" in error_of(["demo", "--output", str(stream)], capsys, status=2)
 
 
-def test_the_configuration_has_help_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["reconstruct", "--preset", "fast", "--help-config"]) == 0
+@pytest.mark.parametrize("given", [["--preset", "fast"], ["--preset=fast"], ["--preset", "rig", "--preset=fast"]])
+def test_the_configuration_has_help_of_its_own(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    from structgstream.presets import DEFAULT_PRESET, PRESETS
+
+    assert main(["reconstruct", *given, "--help-config"]) == 0
     text = capsys.readouterr().out
     assert "--online.patching.grad-threshold" in text
     assert "'fast'" in text
+    ours, default = (PRESETS[name].initial.iterations for name in ("fast", DEFAULT_PRESET))
+    shown = text[text.index("--initial.iterations") :].split("default: ")[1]
+    assert shown.startswith(f"{ours})")
+    assert ours != default
+
+
+@pytest.mark.parametrize("given", [["--preset", "tny"], ["--preset=tny"], ["--preset"]])
+def test_a_wrong_preset_has_no_help(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(["reconstruct", "--help-config", *given], capsys, status=2)
+    assert error.count("\n") == 1
+    assert "preset" in error
 
 
 def test_the_presets_named_in_help_are_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
@@ -312,7 +327,7 @@ def test_exit_status_of_the_program(tmp_path: Path) -> None:
 def test_the_check_before_the_first_frame_sees_a_folder_without_permission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(reconstruct.os, "access", lambda path, mode: False)  # root may write anywhere
+    monkeypatch.setattr(recorder.os, "access", lambda path, mode: False)  # root may write anywhere
     assert "permission" in error_of(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs")], capsys, status=1)
 
 

@@ -15,7 +15,7 @@ from streams import compact_header, header_for, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.export.bake import Baking
+from structgstream.exporters.bake import Baking
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 
@@ -56,7 +56,7 @@ def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, capsy
     assert [entry.name for entry in tmp_path.iterdir()] == ["one.ply"]
     reader = open_stream(stream)
     header, scene = reader.header, reader.scene(1)
-    camera = header.similarity.camera(header.rig[header.rig.training[0]])
+    camera = header.camera(header.rig.training[0])
     drawn = scene.gaussians(camera, reference_backend())
     wanted = header.similarity.inverse_points(drawn.means[drawn.opacities > 0.5])
     found = torch.from_numpy(np.stack([vertices[axis] for axis in "xyz"], axis=1).copy())

@@ -14,13 +14,13 @@ from structgstream.evaluation.metrics import (
     mean_of_squares,
     ms_ssim,
     psnr,
-    quantised,
     squared_errors,
     ssim,
     ssim_map,
 )
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.scene.render import quantised
 
 
 def pictures(height: int = 37, width: int = 53) -> tuple[np.ndarray, np.ndarray]:

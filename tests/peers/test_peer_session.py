@@ -62,7 +62,7 @@ def longer(config: ThreeDGStreamConfig) -> ThreeDGStreamConfig:
 def test_the_file_gives_back_what_was_fitted_exactly(runs: dict[str, Run], name: str) -> None:
     run = runs[name]
     reader = open_peer(run.path)
-    camera = reader.header.similarity.camera(run.capture.rig["cam00"])
+    camera = reader.header.camera(run.capture.rig["cam00"])
     frames = list(reader.scenes())
     assert len(frames) == len(run.watched.fits) == 3
     for (info, state), fit in zip(frames, run.watched.fits, strict=True):
@@ -73,7 +73,7 @@ def test_the_file_gives_back_what_was_fitted_exactly(runs: dict[str, Run], name:
 @pytest.mark.parametrize("name", NAMES)
 def test_any_frame_can_be_asked_for_first(runs: dict[str, Run], name: str) -> None:
     reader = open_peer(runs[name].path)
-    camera = reader.header.similarity.camera(runs[name].capture.rig["cam00"])
+    camera = reader.header.camera(runs[name].capture.rig["cam00"])
     whole = [render(state, camera, BACKEND).image for _, state in reader.scenes()]
     ((info, state),) = reader.scenes(2)
     assert info.index == 2

@@ -62,7 +62,7 @@ def paused_at(tab: Tab, frame: int) -> None:
 def decibels(picture: NDArray[np.uint8], stream: Path, frame: int) -> float:
     """How near a picture is to what Python renders for the first training camera."""
     reader = open_stream(stream)
-    camera = reader.header.similarity.camera(reader.header.rig[reader.header.rig.training[0]])
+    camera = reader.header.camera(reader.header.rig.training[0])
     wanted, _ = rendered(reader.scene(frame), camera.resized(WIDTH, HEIGHT), reference_backend())
     assert picture.shape == wanted.shape
     assert wanted.std() > 20  # something is there to be seen

@@ -9,9 +9,10 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from structgstream.errors import StructGStreamError
+from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
     "demo": "reconstruct the bundled clip and show everything there is to see",
@@ -36,6 +37,19 @@ class Interrupted(Exception):
     """The user pressed Ctrl-C; the message says what is stored and how to go on."""
 
 
+@contextmanager
+def usage_checked() -> Iterator[None]:
+    """What the options ask for is checked here: a value that cannot work is wrong usage.
+
+    Raises:
+        UsageError: in place of a ``ConfigError``.
+    """
+    try:
+        yield
+    except ConfigError as error:
+        raise UsageError(str(error)) from None
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; the exit status is 0 done, 1 a problem, 2 wrong usage, 130 interrupted."""
     # Two threads that spin while they wait for each other are slower than one on a machine that does anything else.
@@ -48,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(overview(), file=sys.stdout if given else sys.stderr)
         return DONE if given else USAGE
     if given[0] == "--version":
-        from structgstream import __version__
+        from structgstream.version import __version__
 
         print(__version__)
         return DONE
@@ -70,6 +84,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         _say(f"structgstream: {error}")
+        return PROBLEM
+    except MemoryError as error:
+        if debug:
+            traceback.print_exc()
+        said = f" ({error})" if str(error) else ""
+        _say(
+            f"structgstream: memory does not suffice{said}; end other programs, or take smaller pictures (--scale 0.5)."
+        )
         return PROBLEM
     except Exception as error:
         if debug:

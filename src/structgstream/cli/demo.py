@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> None:
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
     from structgstream.cli.evaluate import scored
-    from structgstream.cli.reconstruct import check_output, reconstructed
+    from structgstream.cli.reconstruct import reconstructed
     from structgstream.cli.render import path_pictures, write_pictures
     from structgstream.codec.reader import open_stream
     from structgstream.data.clip import bundled_clip_path
@@ -53,6 +53,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.player.stream_file import StreamFile
     from structgstream.player.write import write_page
     from structgstream.presets import DEMO_PRESET
+    from structgstream.recorder import check_output
 
     began = time.perf_counter()
     console = Console()

@@ -12,7 +12,6 @@ from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, pars
 from structgstream.cli.tables import quality, report_tables
 
 if TYPE_CHECKING:
-    from structgstream.codec.packets import StreamHeader
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
     from structgstream.evaluation.instruments import Selection
@@ -55,6 +54,7 @@ def main(arguments: list[str]) -> None:
     """Evaluates and prints a table."""
     options = parsed(Evaluate, "evaluate", arguments=arguments)
     from structgstream.codec.reader import open_stream
+    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.report import as_json, write_json
     from structgstream.kernels.backend import select_backend
 
@@ -76,24 +76,6 @@ def main(arguments: list[str]) -> None:
     console.print(report_tables(report, title=options.stream.name))
     if options.report is not None:
         console.print(f"Report: {options.report}", highlight=False, markup=False, soft_wrap=True)
-
-
-def capture_of(header: "StreamHeader", scene: Path, *, frames: int | None) -> "FrameSource":
-    """The part of the capture in folder ``scene`` that a stream was made from, at the stream's sizes.
-
-    Args:
-        header: the stream's.
-        scene: the capture's folder.
-        frames: how many the stream has; None for all that the capture has from its first on.
-    """
-    from structgstream.data.open import open_capture
-
-    start = int(header.metadata.get("start", 0))
-    whole = open_capture(scene, start=start)
-    shared = [name for name in header.rig if name in whole.rig.cameras]
-    scale = header.rig[shared[0]].width / whole.rig[shared[0]].width if shared else 1.0
-    wanted = len(whole) if frames is None else min(frames, len(whole))
-    return open_capture(scene, start=start, frames=wanted, scale=min(scale, 1.0))
 
 
 def scored(

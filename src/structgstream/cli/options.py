@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import tyro
 
-from structgstream.cli.app import UsageError
+from structgstream.cli.app import usage_checked
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -57,17 +57,17 @@ def resolved_config(
     Raises:
         UsageError: there is no such preset.
     """
-    from structgstream.presets import DEFAULT_PRESET, PRESETS, StreamConfig
+    from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named
 
     name = DEFAULT_PRESET if preset is None else preset
-    if name not in PRESETS:
-        raise UsageError(f"there is no preset {name!r}; there are {', '.join(PRESETS)}.")
+    with usage_checked():
+        default = preset_named(name)
     description = f"Fields of the configuration, with the values of the preset {name!r} as defaults."
     config = tyro.cli(
         StreamConfig,
         prog=f"structgstream {command}",
         description=description,
-        default=PRESETS[name],
+        default=default,
         args=overrides,
         config=(tyro.conf.FlagConversionOff,),
     )

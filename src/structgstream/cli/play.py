@@ -89,8 +89,8 @@ def _truth(stream: Path, scene: Path) -> "Truth":
     Raises:
         CaptureError: it is not the capture that the stream was made from.
     """
-    from structgstream.cli.evaluate import capture_of
     from structgstream.codec.reader import open_stream
+    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.facts import check_same_rig
     from structgstream.player.truth import Truth
 

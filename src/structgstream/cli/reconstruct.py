@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream reconstruct``."""
 
-import math
-import os
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import Interrupted, UsageError
+from structgstream.cli.app import Interrupted, UsageError, usage_checked
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -22,14 +20,11 @@ from structgstream.cli.options import (
     resolved_config,
 )
 from structgstream.cli.progress import display, human_bytes
-from structgstream.errors import StorageError, StructGStreamError
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
-
-MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
 
 @dataclass(frozen=True)
@@ -80,10 +75,13 @@ def main(arguments: list[str]) -> None:
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolved_config(options.preset, rest, command="reconstruct", seed=options.seed)
-    config = with_budget(config, preset=preset, quality=options.quality, mbits=options.mbits)
+    from structgstream.presets import departures, with_budget
+    from structgstream.recorder import check_output
+
+    with usage_checked():
+        config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
     check_output(options.output, may_exist=options.resume or options.overwrite)
     from structgstream.kernels.backend import select_backend
-    from structgstream.presets import departures
 
     source = opened_capture(options.scene, options.capture)
     backend = select_backend(options.device)
@@ -129,33 +127,16 @@ def reconstructed(
         Interrupted: the user pressed Ctrl-C; whole frames are in the file.
         StructGStreamError: whatever goes wrong; whole frames are in the file.
     """
-    from structgstream.codec.sinks import FileSink
-    from structgstream.data.prefetch import Prefetch
-    from structgstream.evaluation.run_log import append_log, begin_log, log_entry
-    from structgstream.session import Session
+    from structgstream.recorder import Recorder
 
-    sink, resumed = FileSink.resume(output) if resume else (FileSink(output, overwrite=True), None)
-    done = 0 if resumed is None else len(resumed)
+    recorder = Recorder(output, resume=resume)
+    done = recorder.done
     peaks: dict[str, int] = {}
     try:
         with display(len(source), done=done) as progress:
-            try:
-                session = Session(
-                    Prefetch(source),
-                    sink,
-                    config,
-                    backend,
-                    resumed=resumed,
-                    metadata=metadata,
-                    on_step=progress.step,
-                )
-                begin_log(output, frames=done)
-            except StructGStreamError:
-                sink.close()  # resuming took the index off the file
-                raise
-            with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
+            recording = recorder.record(source, config, backend, metadata=metadata, on_step=progress.step)
+            with closing(recording) as reports:
                 for report in reports:
-                    append_log(output, log_entry(report))
                     on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
                     for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
                         peaks[stage] = max(size, peaks.get(stage, 0))
@@ -167,56 +148,13 @@ def reconstructed(
     return peaks
 
 
-def with_budget(config: "StreamConfig", *, preset: str, quality: float | None, mbits: float | None) -> "StreamConfig":
-    """``config`` with the options ``--quality`` and ``--mbits``, which are short for fields of it.
-
-    Raises:
-        UsageError: the stream's codec has neither, or the value is out of range.
-    """
-    if quality is None and mbits is None:
-        return config
-    if config.codec != "compact":
-        option = "--mbits" if quality is None else "--quality"
-        raise UsageError(
-            f"{option} is for streams with the codec compact; the preset {preset!r} makes one with the codec "
-            f"{config.codec}. Add --preset compact."
-        )
-    if quality is not None:
-        if not abs(quality) <= MOST_QUALITY:
-            raise UsageError(
-                f"--quality {quality:g} is not one of {-MOST_QUALITY:g} to {MOST_QUALITY:g}: 0 is the preset's own, "
-                "and 1 more makes every step half as large."
-            )
-        rounding = replace(config.online.rounding, quality=quality)
-        config = replace(config, online=replace(config.online, rounding=rounding))
-    if mbits is not None:
-        if not 0 < mbits < math.inf:
-            raise UsageError(f"--mbits {mbits:g} is no rate; it is in megabits a second, such as --mbits 5.")
-        config = replace(config, rate=replace(config.rate, target_mbits=mbits))
-    return config
-
-
-def check_output(output: Path, *, may_exist: bool) -> None:
-    """Whether the stream can be written is found out before the first frame takes its minutes.
-
-    Raises:
-        StorageError: the file exists, its folder cannot be made, or nothing may be written there.
-    """
-    if output.is_dir():
-        raise StorageError(f"{output} is a folder; give the name of a file, such as {output / 'scene.sgs'}.")
-    if output.exists() and not may_exist:
-        raise StorageError(
-            f"{output} exists; continue it with --resume, replace it with --overwrite, or choose another name."
-        )
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"The folder {output.parent} cannot be made ({error.strerror}).") from None
-    if not os.access(output if output.exists() else output.parent, os.W_OK):
-        raise StorageError(f"{output} cannot be written (no permission).")
-
-
 def _print_config(arguments: list[str]) -> None:
-    given = arguments.index("--preset") + 1 if "--preset" in arguments else len(arguments)
-    preset = arguments[given] if given < len(arguments) else None
+    preset = None
+    for argument, following in zip(arguments, [*arguments[1:], None], strict=True):
+        if argument == "--preset":
+            if following is None:
+                raise UsageError("--preset needs a name after it, such as --preset fast.")
+            preset = following
+        elif argument.startswith("--preset="):
+            preset = argument.removeprefix("--preset=")
     resolved_config(preset, ["--help"], command="reconstruct SCENE -o OUT.sgs", seed=None)

@@ -123,7 +123,7 @@ def camera_pictures(
     from structgstream.evaluation.evaluate import rendered
     from structgstream.scene.state import on_device
 
-    view = reader.header.similarity.camera(reader.header.rig[camera])
+    view = reader.header.camera(camera)
     for scene in scenes_of(reader, frame):
         yield rendered(on_device(scene, backend.device), view, backend)[0]
 
@@ -149,14 +149,14 @@ def path_pictures(
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
     for view, scene in zip(views, _forth_and_back(reader, frame, count=count), strict=True):
-        yield rendered(on_device(scene, backend.device), header.similarity.camera(view), backend)[0]
+        yield rendered(on_device(scene, backend.device), header.camera(view), backend)[0]
 
 
 def compared_pictures(
     reader: "StreamReader", scene: Path, *, backend: "Backend", options: Render
 ) -> "Iterator[NDArray[np.uint8]]":
     """Truth, rendering and difference of a camera, frame by frame."""
-    from structgstream.cli.evaluate import capture_of
+    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from structgstream.codec import reference_decisions as reference
 from structgstream.codec.models import Arithmetic, Model
 from structgstream.codec.rans import takes_native
-from structgstream.errors import StreamError
+from structgstream.errors import OutOfMemoryError, StreamError
 from structgstream.kernels._load import native_library
 
 _NO_MEMORY, _DAMAGED = 1, 2
@@ -131,11 +131,11 @@ def _check(result: int) -> bool:
     """Whether what was coded is sound.
 
     Raises:
-        MemoryError: memory does not suffice.
+        OutOfMemoryError: memory does not suffice.
         StreamError: a model does not fit.
     """
     if result == _NO_MEMORY:
-        raise MemoryError
+        raise OutOfMemoryError("to code decisions")
     if result > _DAMAGED:
         raise StreamError("Decisions to code do not fit their models.")
     return not result

@@ -8,7 +8,8 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import Camera, CameraRig
+from structgstream.errors import ConfigError
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity
 
@@ -45,6 +46,21 @@ class StreamHeader:
     steps: Mapping[str, float] = field(default_factory=dict)
     reference: Mapping[FieldName, Tensor] = field(default_factory=dict)
     init_steps: Mapping[FieldName, float] = field(default_factory=dict)
+
+    def camera(self, camera: Camera | str) -> Camera:
+        """A camera as the decoded scenes need it: the same pictures, in the scenes' normalised units.
+
+        Args:
+            camera: the name of one of the rig, or any camera in the units of the capture.
+
+        Raises:
+            ConfigError: the rig has no camera of that name.
+        """
+        if isinstance(camera, str):
+            if camera not in self.rig.cameras:
+                raise ConfigError(f"The stream has no camera {camera!r}; it has {', '.join(self.rig)}.")
+            camera = self.rig[camera]
+        return self.similarity.camera(camera)
 
 
 class PacketKind(IntEnum):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from structgstream.codec.reference_rans import decode_lanes, encode_lanes
 from structgstream.codec.tables import COST_BITS, TOTAL, FrequencyTables, code_costs
-from structgstream.errors import StreamError
+from structgstream.errors import OutOfMemoryError, StreamError
 from structgstream.kernels._load import native_library, native_reason
 
 MAX_SYMBOLS = 2**31 - 1
@@ -187,8 +187,10 @@ def _native_encode(
         _pointer(words),
         ctypes.byref(word_count),
     )
+    if result == _NO_MEMORY:
+        raise OutOfMemoryError("to encode symbols")
     if result:
-        raise MemoryError if result == _NO_MEMORY else StreamError("Symbols to encode do not fit their tables.")
+        raise StreamError("Symbols to encode do not fit their tables.")
     return states, words[: word_count.value]
 
 
@@ -207,7 +209,7 @@ def _native_decode(
         _pointer(symbols),
     )
     if result == _NO_MEMORY:
-        raise MemoryError
+        raise OutOfMemoryError("to decode symbols")
     return None if result else symbols
 
 

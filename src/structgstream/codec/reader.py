@@ -5,7 +5,8 @@ Note [Nothing is kept]
 ~~~~~~~~~~~~~~~~~~~~~~
 A stream is as long as the event. A reader keeps the header and eight bytes a packet, and reads everything else when it
 is asked for: what a packet is, from the heads of its record and fields; a scene, from its record, whose checksum is
-verified then. With the ``raw`` codec every packet stands alone, so any frame is as near as any other.
+verified then. Only the scene that was rendered last stays. With the ``raw`` codec every packet stands alone, so any
+frame is as near as any other.
 """
 
 import math
@@ -17,9 +18,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import overload
 
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
 from structgstream.codec.blocks import blocks_in
 from structgstream.codec.damage import Damage, Search, next_index
 from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
+from structgstream.codec.frame_renderer import FrameRenderer
 from structgstream.codec.header import field_bytes_of, unpacked_header
 from structgstream.codec.index import indexed_offsets
 from structgstream.codec.packets import Packet, PacketKind
@@ -38,6 +44,7 @@ from structgstream.codec.records import (
 )
 from structgstream.codec.stored import Part, Stored, StoredFile
 from structgstream.errors import StreamError
+from structgstream.kernels.backend import Backend, BackendName
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName
 
@@ -175,6 +182,7 @@ class StreamReader:
         self.cut_reason = None if self.complete else self._reason(end)
         self._decoder = SceneDecoder(self.header)
         self._decoded = NOTHING
+        self._renderer = FrameRenderer()
 
     def _scan(self, end: int) -> int:
         """Verify every record from byte ``end`` on; returns where the last whole one ends."""
@@ -279,6 +287,21 @@ class StreamReader:
         assert scene is not None, "a group holds the frame that was asked for"
         self._decoded = index
         return scene
+
+    def render(self, index: int, camera: Camera | str, *, backend: BackendName | Backend = "auto") -> NDArray[np.uint8]:
+        """What a camera sees of one frame, ``[H, W, 3]`` in 8-bit sRGB; its scene is kept for the next picture.
+
+        Args:
+            index: the frame.
+            camera: the name of a camera of the stream's rig (``header.rig``), or any, in the units of the capture.
+            backend: what renders.
+
+        Raises:
+            StreamError: there is no such frame, or it has been damaged.
+            ConfigError: the rig has no camera of that name.
+            BackendError: the back-end is not available.
+        """
+        return self._renderer.picture(index, self.header.camera(camera), decode=self.scene, backend=backend)
 
     def _missing(self, index: int) -> StreamError:
         for damage in self.damage:

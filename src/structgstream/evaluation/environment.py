@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import structgstream
+from structgstream.version import __version__
 
 
 def environment() -> dict[str, Any]:
@@ -18,7 +18,7 @@ def environment() -> dict[str, Any]:
 
     cuda = torch.cuda.is_available()
     return {
-        "structgstream": structgstream.__version__,
+        "structgstream": __version__,
         "commit": source_commit(),
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -48,7 +48,7 @@ def processor_name() -> str:
 
 def source_commit() -> str | None:
     """The commit of the working copy that this package runs from; ``-dirty`` when it has changes."""
-    folder = Path(structgstream.__file__).parent
+    folder = Path(__file__).parents[1]
     git = shutil.which("git")
     # Sources must be tracked: an environment inside some other repository would give that one's commit.
     if git is None or _output(git, "ls-files", "--error-unmatch", "__init__.py", folder=folder) is None:

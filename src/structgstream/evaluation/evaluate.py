@@ -29,12 +29,12 @@ from structgstream.evaluation.facts import (
 from structgstream.evaluation.flow import Flow
 from structgstream.evaluation.instruments import Seen, Selection, instruments, measured
 from structgstream.evaluation.masks import changed_pixels
-from structgstream.evaluation.metrics import decibels, mean_of_squares, quantised, squared_errors, ssim
+from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors, ssim
 from structgstream.evaluation.recording import Drawable, Recording, counts, placed
 from structgstream.evaluation.report import FrameScores, Report, Scores, course, drawing_facts, mean_scores
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
-from structgstream.scene.render import render
+from structgstream.scene.render import quantised, render
 
 Picture = NDArray[np.uint8]
 
@@ -89,7 +89,7 @@ def evaluate(
     names = scored_cameras(recording.header, cameras)
     check_same_rig(recording.header, source, names)
     check_same_frames(recording, source)
-    views = {name: recording.header.similarity.camera(recording.header.rig[name]) for name in names}
+    views = {name: recording.header.camera(name) for name in names}
     tools = None
     if metrics == "all":
         size = len(recording.packets)
@@ -203,7 +203,7 @@ def compared_frames(
         CaptureError: see :func:`evaluate`.
     """
     check_same_rig(recording.header, source, (camera,))
-    view = recording.header.similarity.camera(recording.header.rig[camera])
+    view = recording.header.camera(camera)
     for frame, (_, scene) in zip(of_cameras(source, (camera,)).frames(), recording.scenes(0)):
         yield frame.images[camera], rendered(placed(scene, backend.device), view, backend)[0]
 

@@ -22,11 +22,6 @@ SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # exponents of MS-SSIM, fines
 SMALLEST_OF_SCALES = (WINDOW - 1) * 2 ** (len(SCALES) - 1) + 1  # pixels: the window fits five times halved pictures
 
 
-def quantised(image: Tensor) -> NDArray[np.uint8]:
-    """A rendering ``[H, W, 3]`` in sRGB as the 8-bit picture that a viewer sees: clamped, then rounded."""
-    return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8).cpu().numpy()
-
-
 def squared_errors(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Squared difference of two 8-bit pictures ``[H, W, 3]``, summed over channels, ``[H, W]``, exactly."""
     squares = np.square(np.subtract(picture, truth, dtype=np.int16), dtype=np.int32)

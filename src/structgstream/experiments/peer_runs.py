@@ -2,7 +2,6 @@
 """Peers as tasks of an experiment, beside the variants of our own method."""
 
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from structgstream.presets import to_json
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
     from structgstream.kernels.backend import Backend
+    from structgstream.session import FrameReport
 
 PEER_TITLES: Mapping[str, str] = {
     "3dgstream": "3DGStream's method",
@@ -76,9 +76,9 @@ class PeerRun:
     def _reconstruct(self, backend: "Backend") -> None:
         from structgstream.data.prefetch import Prefetch
         from structgstream.evaluation.environment import environment
-        from structgstream.evaluation.run_log import append_log, begin_log, log_entry
         from structgstream.peers.methods import METHODS
         from structgstream.peers.session import PeerSession
+        from structgstream.recorder import logged
 
         self.stream.parent.mkdir(parents=True, exist_ok=True)
         source = Prefetch(self.capture.open())
@@ -87,11 +87,9 @@ class PeerRun:
             source, self.stream, METHODS[self.key], backend, seed=self.seed, resume=True, metadata=part
         )
         machine = environment() | {"backend": backend.name}
-        first = True
-        with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
-            for report in reports:
-                if first:
-                    begin_log(self.stream, frames=report.index)
-                    first = False
-                entry = log_entry(report)
-                append_log(self.stream, entry | {"trained_by": machine} if report.index == 0 else entry)
+
+        def remarks(report: "FrameReport") -> Mapping[str, Any]:
+            return {} if report.index else {"trained_by": machine}
+
+        for _ in logged(session.run(), self.stream, done=session.done, remarks=remarks):
+            pass

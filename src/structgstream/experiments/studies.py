@@ -268,7 +268,7 @@ def _write_details(
     pictures: dict[str, Picture] = {}
     for run in results:
         recording = run.recording()
-        view = recording.header.similarity.camera(recording.header.rig[camera])
+        view = recording.header.camera(camera)
         _, scene = next(iter(recording.scenes(index // run.capture.every)))
         pictures[titles[run.key]] = rendered(scene, view, backend)[0]
     write_details(path, pictures, truth, title=f"{source.name}, camera {camera}, frame {index}")

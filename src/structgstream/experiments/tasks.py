@@ -4,7 +4,6 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ from structgstream.training.online import OnlineConfig
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
     from structgstream.kernels.backend import Backend
+    from structgstream.session import FrameReport
     from structgstream.training.result import FitResult
 
 
@@ -193,35 +193,30 @@ def _reconstruct(
     capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrame | None
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
-    from structgstream.codec.sinks import FileSink
-    from structgstream.data.prefetch import Prefetch
     from structgstream.evaluation.environment import environment
-    from structgstream.evaluation.run_log import append_log, begin_log, log_entry
-    from structgstream.session import Session
+    from structgstream.recorder import Recorder
 
     source = capture.open()
     stream.parent.mkdir(parents=True, exist_ok=True)
-    sink, resumed = FileSink.resume(stream)
-    done = 0 if resumed is None else len(resumed)
-    fitted = first.fitted() if first is not None and done == 0 else None
+    recorder = Recorder(stream, resume=True)
+    machine = environment() | {"backend": backend.name}
+
+    def remarks(report: "FrameReport") -> Mapping[str, Any]:
+        # What frame 0 cost is what it cost when it was fitted, also where it is shared.
+        shared = first.log() if first is not None and report.index == 0 else {}
+        return {**shared, "trained_by": machine} if report.index == 0 else {}
+
+    fitted = first.fitted() if first is not None and recorder.done == 0 else None
     metadata = {"start": capture.start, "scale": capture.scale}
     try:
-        session = Session(Prefetch(source), sink, config, backend, resumed=resumed, metadata=metadata, first=fitted)
+        reports = recorder.record(source, config, backend, metadata=metadata, first=fitted, remarks=remarks)
     except ConfigError as error:
         raise ExperimentError(f"{stream} answers another question, so choose another folder. {error}") from None
-    if done > len(source):
+    if recorder.done > len(source):
         raise ExperimentError(
-            f"{stream} has {done} frames already and {len(source)} are asked for; choose another folder for fewer."
+            f"{stream} has {recorder.done} frames already and {len(source)} are asked for; choose another folder for "
+            "fewer."
         )
-    if done == len(source):
-        return
-    begin_log(stream, frames=done)
-    machine = environment() | {"backend": backend.name}
-    with closing(session.run()) as reports:  # pyright: ignore[reportArgumentType] -- a generator
-        for report in reports:
-            entry = log_entry(report)
-            if report.index == 0:
-                # What frame 0 cost is what it cost when it was fitted, also where it is shared.
-                shared = first.log() if first is not None else {}
-                entry = entry | shared | {"trained_by": machine}
-            append_log(stream, entry)
+    if recorder.done < len(source):
+        for _ in reports:
+            pass

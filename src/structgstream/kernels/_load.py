@@ -8,9 +8,9 @@ from importlib.resources import files
 from pathlib import Path
 
 from structgstream.errors import BackendError
+from structgstream.kernels.prototypes import declare
 
 _NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
-_POINTER_RESULTS = ("sgs_raster_forward",)
 ABI_VERSION = 1
 """Of csrc/include/structgstream.h, which says when it rises."""
 
@@ -38,11 +38,7 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
             f"The CPU kernels at {path} have version {version} of their interface, and this structgstream calls "
             f"version {ABI_VERSION}; install structgstream again, so that both are of one version."
         )
-    for name in _POINTER_RESULTS:
-        getattr(library, name).restype = ctypes.c_void_p
-    library.sgs_anchors_visible.restype = ctypes.c_int64
-    library.sgs_volume.restype = ctypes.c_double
-    library.sgs_excess.restype = ctypes.c_double
+    declare(library)
     return library, None
 
 

@@ -206,12 +206,17 @@ def backend_remarks() -> dict[str, str]:
     return {"cuda": loss_plan()[1]}
 
 
-def select_backend(name: BackendName) -> Backend:
+def select_backend(name: BackendName | Backend) -> Backend:
     """The back-end of that name; ``auto`` takes the first of cuda, cpu, reference that this machine has.
+
+    Args:
+        name: its name; a back-end stands for itself.
 
     Raises:
         BackendError: the named one is not available, with the reason and the way to get it.
     """
+    if isinstance(name, Backend):
+        return name
     builders = {"cuda": cuda_backend, "cpu": cpu_backend, "reference": reference_backend}
     if name != "auto":
         return builders[name]()

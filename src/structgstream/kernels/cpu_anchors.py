@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from structgstream.errors import BackendError
+from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.kernels._load import native_library
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
 from structgstream.kernels.raster_types import tiles_of
@@ -166,7 +166,7 @@ def visible_anchors(
 
     Raises:
         BackendError: a tensor of another precision.
-        MemoryError: there is no room for a byte an anchor.
+        OutOfMemoryError: there is no room for a byte an anchor.
     """
     tensors = [positions, log_offset_scales, log_base_scales, offsets]
     if any(tensor.dtype != torch.float32 for tensor in tensors):
@@ -191,7 +191,7 @@ def visible_anchors(
         ctypes.c_int(torch.get_num_threads()),
     )
     if seen < 0:
-        raise MemoryError("There is no memory left to find the anchors in view.")
+        raise OutOfMemoryError("to find the anchors in view")
     return found[:seen]
 
 

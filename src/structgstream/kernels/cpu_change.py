@@ -6,6 +6,7 @@ import ctypes
 import torch
 from torch import Tensor
 
+from structgstream.errors import OutOfMemoryError
 from structgstream.kernels._load import native_library
 
 
@@ -13,7 +14,7 @@ def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixel
     """Mask ``[H, W]`` of what changed, see ``kernels.reference_change.changed_pixels``.
 
     Raises:
-        MemoryError: there is no room for three bytes a pixel.
+        OutOfMemoryError: there is no room for three bytes a pixel.
     """
     assert before.shape == now.shape, (before.shape, now.shape)
     assert before.dtype == now.dtype == torch.uint8, (before.dtype, now.dtype)
@@ -31,5 +32,5 @@ def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixel
         ctypes.c_int(torch.get_num_threads()),
     )
     if failed:
-        raise MemoryError("There is no memory left to compare pictures.")
+        raise OutOfMemoryError("to compare two pictures")
     return changed.bool()

@@ -6,6 +6,7 @@ import ctypes
 import torch
 from torch import Tensor
 
+from structgstream.errors import OutOfMemoryError
 from structgstream.kernels._load import native_library
 from structgstream.kernels.reference_lift import Lifted
 
@@ -26,7 +27,7 @@ def lift(
     """Displacements of ``T`` targets, see ``kernels.reference_lift.lift``; float32.
 
     Raises:
-        MemoryError: there is no room for the terms of one target a thread.
+        OutOfMemoryError: there is no room for the terms of one target a thread.
     """
     views, movers = weights.shape
     targets, count = neighbours.shape
@@ -53,5 +54,5 @@ def lift(
         ctypes.c_int(torch.get_num_threads()),
     )
     if failed:
-        raise MemoryError("There is no memory left to lift flow.")
+        raise OutOfMemoryError("to lift flow to displacements")
     return found

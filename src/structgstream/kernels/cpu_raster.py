@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from structgstream.errors import BackendError
+from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.kernels._load import native_library
 from structgstream.kernels.raster_types import RasterOutput, tiles_of
 
@@ -23,7 +23,7 @@ class _State:
 
     def __init__(self, address: int | None) -> None:
         if not address:
-            raise MemoryError("The rasteriser has no memory left; draw fewer or smaller Gaussians.")
+            raise OutOfMemoryError("for the lists of the Gaussians that each tile draws")
         self.pointer = ctypes.c_void_p(address)
         weakref.finalize(self, native_library().sgs_raster_free, self.pointer)
 
@@ -93,7 +93,7 @@ class _Rasterize(torch.autograd.Function):
             ctypes.c_int(torch.get_num_threads()),
         )
         if failed:
-            raise MemoryError("The rasteriser has no memory left for gradients; draw fewer or smaller Gaussians.")
+            raise OutOfMemoryError("for the gradients of the Gaussians that are drawn")
         return *results, offsets, *(None,) * 8
 
 
@@ -121,7 +121,7 @@ def rasterize(
 
     Raises:
         BackendError: a tensor is not float32 on the CPU.
-        MemoryError: the lists of what each tile draws do not fit.
+        OutOfMemoryError: the lists of what each tile draws do not fit.
     """
     gaussians = (means, quats, scales, opacities, colors)
     given = gaussians if screen_offsets is None else (*gaussians, screen_offsets)
@@ -171,7 +171,7 @@ def blending_weights(
     """Sums of blending weights ``[N, C]``, see ``kernels.reference_raster.blending_weights``; float32.
 
     Raises:
-        MemoryError: the lists of what each tile draws do not fit.
+        OutOfMemoryError: the lists of what each tile draws do not fit.
     """
     tensors = [t.detach().float().contiguous() for t in (means, quats, scales, opacities, viewmat, K)]
     maps = maps.float().contiguous()
@@ -190,5 +190,5 @@ def blending_weights(
         ctypes.c_int(torch.get_num_threads()),
     )
     if failed:
-        raise MemoryError("The rasteriser has no memory left; draw fewer or smaller Gaussians.")
+        raise OutOfMemoryError("for the lists of the Gaussians that each tile draws")
     return weights

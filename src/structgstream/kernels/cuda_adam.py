@@ -21,8 +21,8 @@ def adam_step(
 ) -> None:
     """Move ``param`` in place by one step, see ``kernels.reference_adam.adam_step``; the host waits for nothing.
 
-    ``lr`` and ``step`` may also be ``[]`` float32 on the parameter's device, so that a recorded graph (``cuda_graph``)
-    can be told new ones. Selected ``rows`` take the reference's way.
+    ``lr`` and ``step`` may also be ``[]`` float32 on the parameter's device. Selected ``rows`` take the reference's
+    way.
     """
     if rows is not None:
         assert isinstance(lr, float)

@@ -2,7 +2,7 @@
 """The loop for peers: as this project's, with another method in its middle and another file at its end."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, cast
@@ -79,7 +79,12 @@ class PeerSession(Generic[State, Memory]):
         )
         self._resumed = self._existing(resume)
 
-    def run(self) -> Iterator[FrameReport]:
+    @property
+    def done(self) -> int:
+        """How many frames the file held when the session was made."""
+        return 0 if self._resumed is None else len(self._resumed)
+
+    def run(self) -> Generator[FrameReport, None, None]:
         """Fit and write every frame that the file does not hold yet; yields a report for each.
 
         The file is closed however the loop ends, and marked as complete when no frame is missing.

@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from structgstream.errors import StorageError
-from structgstream.export.whole_file import write_whole
+from structgstream.exporters.whole_file import write_whole
 from structgstream.player.bundle import bundle
 from structgstream.player.page import linked_page, single_page
 from structgstream.player.stream_file import StreamFile, check_begun, pieces

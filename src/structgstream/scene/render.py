@@ -4,7 +4,9 @@
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.cameras import Camera
@@ -97,3 +99,8 @@ def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
         if not isinstance(scene, Scene) or scene.environment is None:
             return rendering
         return replace(rendering, image=in_environment(rendering.image, rendering.alpha, camera, scene.environment))
+
+
+def quantised(image: Tensor) -> NDArray[np.uint8]:
+    """A rendering ``[H, W, 3]`` in sRGB as the 8-bit picture that a viewer sees: clamped, then rounded."""
+    return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8).cpu().numpy()

@@ -3,7 +3,7 @@
 // A file: `python viewer/packages/core/test/make_fixtures.py --bench 100000 bench.sgs`.
 
 import { readFileSync } from "node:fs";
-import { readStream } from "../dist/main.js";
+import { readStream } from "../dist/index.js";
 
 const [file, rounds = "5"] = process.argv.slice(2);
 const start = performance.now();

@@ -10,7 +10,8 @@ import { ByteQueue } from "./byteQueue.js";
 import { type Damage, Search, type Standing } from "./damage.js";
 import { checkFollows, type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 import { StreamError } from "./errors.js";
-import { type StreamHeader, unpackedHeader } from "./header.js";
+import type { StreamHeader } from "./header.js";
+import { unpackedHeader } from "./initRecord.js";
 import {
   CHECKSUM_BYTES,
   checkPrefix,

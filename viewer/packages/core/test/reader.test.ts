@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 
 import { describe, expect, test } from "vitest";
-import { indexEntries, indexOffset } from "../src/index.ts";
+import { indexEntries, indexOffset } from "../src/fileIndex.ts";
 import { readStream, StreamReader } from "../src/reader.ts";
 import { RecordType } from "../src/records.ts";
 import { bytesOf, expectSame, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.ts";

@@ -23,7 +23,7 @@ import {
   unprojected,
   upAxis,
   type Vector,
-} from "../src/main.ts";
+} from "../src/index.ts";
 import { quaternionOf, rotationOf } from "../src/vectors.ts";
 
 const CAMERA: Camera = {

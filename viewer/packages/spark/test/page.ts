@@ -6,7 +6,7 @@ import { readStream, type StreamReader } from "@structgstream/core";
 import { type Camera, rigCamera, SplatRenderer } from "@structgstream/gl";
 import { Matrix4, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { base64, pixelsOf } from "../../gl/test/support/pixels.ts";
-import { StreamSplats } from "../src/main.ts";
+import { StreamSplats } from "../src/index.ts";
 
 /** Spark sorts beside; its order is that of the picture once it has been at rest for so many pictures in a row. */
 const PICTURES = 4;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Reads what the MLP passes wrote out of their textures; waits for the GPU. */
 
-import type { SplatRenderer } from "../../src/main.js";
+import type { SplatRenderer } from "../../src/index.js";
 import { halfFloat } from "./halfFloat.js";
 
 /** Numbers of a Gaussian: opacity, rgb, shares of the scales, quaternion, and one that is unused (`shaders/mlp.ts`). */

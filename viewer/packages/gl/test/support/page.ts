@@ -9,7 +9,7 @@ import {
   type RenderStats,
   rigCamera,
   SplatRenderer,
-} from "../../src/main.js";
+} from "../../src/index.js";
 import { HeldWorker } from "./heldWorker.js";
 import { mlpOutputs } from "./mlpOutputs.js";
 import { base64, pixelsOf } from "./pixels.js";

@@ -3,7 +3,7 @@
 
 import { readFileSync } from "node:fs";
 import { join } from "node:path";
-import type { MlpPath, RenderStats } from "../../src/main.js";
+import type { MlpPath, RenderStats } from "../../src/index.js";
 import type { Stage } from "./browser.js";
 import { bytesOf, type Difference, difference } from "./compare.js";
 import type { Lesser, PlainCamera } from "./page.js";

@@ -4,7 +4,7 @@
 import { readStream } from "@structgstream/core";
 import { deviceOf } from "../../src/gpu/device.js";
 import { Pipeline } from "../../src/gpu/pipeline.js";
-import { type Camera, type MlpPath, rigCamera } from "../../src/main.js";
+import { type Camera, type MlpPath, rigCamera } from "../../src/index.js";
 import { Placement } from "../../src/sorting/placement.js";
 import { Sorter } from "../../src/sorting/sorter.js";
 

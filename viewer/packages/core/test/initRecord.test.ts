@@ -3,7 +3,7 @@
 import { decompress } from "fzstd";
 import { expect, test } from "vitest";
 import { blocksIn } from "../src/blocks.ts";
-import { unpackedHeader } from "../src/header.ts";
+import { unpackedHeader } from "../src/initRecord.ts";
 import { unpackedJson } from "../src/json.ts";
 import { viewOf } from "../src/records.ts";
 import { bytesOf, FIXTURES, joined, piecesOf, VECTORS } from "./streams.ts";

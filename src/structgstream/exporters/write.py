@@ -4,12 +4,12 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from structgstream.export.baked import BakedGaussians
-from structgstream.export.formats import Format
-from structgstream.export.ply import ply_bytes
-from structgstream.export.splat import splat_bytes
-from structgstream.export.spz import spz_bytes
-from structgstream.export.whole_file import write_whole
+from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.formats import Format
+from structgstream.exporters.ply import ply_bytes
+from structgstream.exporters.splat import splat_bytes
+from structgstream.exporters.spz import spz_bytes
+from structgstream.exporters.whole_file import write_whole
 
 FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
     "ply": ply_bytes,

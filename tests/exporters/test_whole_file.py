@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.export.whole_file import write_whole
+from structgstream.exporters.whole_file import write_whole
 
 
 def test_parts_follow_each_other_and_folders_are_made(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.errors import StreamError
-from structgstream.export.bake import Baking, baked, blend_weights, matrix_quaternions
-from structgstream.export.baked import BakedGaussians
+from structgstream.exporters.bake import Baking, baked, blend_weights, matrix_quaternions
+from structgstream.exporters.baked import BakedGaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import MAX_DEGREE, sh_basis

@@ -19,12 +19,12 @@ from torch import Tensor
 from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.errors import ConfigError, StorageError
-from structgstream.export.baked import BakedGaussians
-from structgstream.export.formats import FORMATS, Format
-from structgstream.export.ply import ply_bytes
-from structgstream.export.splat import splat_bytes
-from structgstream.export.spz import fractional_bits, spz_bytes
-from structgstream.export.write import write_gaussians
+from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.formats import FORMATS, Format
+from structgstream.exporters.ply import ply_bytes
+from structgstream.exporters.splat import splat_bytes
+from structgstream.exporters.spz import fractional_bits, spz_bytes
+from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import Y0

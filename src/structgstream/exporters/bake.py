@@ -19,7 +19,7 @@ from torch import Tensor
 
 from structgstream.cameras import Camera
 from structgstream.errors import StreamError
-from structgstream.export.baked import BakedGaussians
+from structgstream.exporters.baked import BakedGaussians
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import Backend

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of a stream, baked and written one after the other."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from structgstream.codec.reader import StreamReader
+from structgstream.exporters.bake import Baking, baked
+from structgstream.exporters.formats import Format
+from structgstream.exporters.request import is_one_file
+from structgstream.exporters.write import write_gaussians
+from structgstream.kernels.backend import Backend
+from structgstream.scene.state import on_device
+
+
+@dataclass(frozen=True)
+class WrittenFrame:
+    """One file: its place, its bytes, and how many Gaussians it holds."""
+
+    path: Path
+    bytes: int
+    gaussians: int
+
+
+def write_frames(
+    reader: StreamReader,
+    numbers: Sequence[int],
+    output: Path,
+    *,
+    format: Format,
+    backend: Backend,
+    degree: int | None = None,
+) -> Iterator[WrittenFrame]:
+    """Bakes frames as the training cameras see them and writes each, in the units of the capture.
+
+    Args:
+        reader: the stream.
+        numbers: of the frames; one, if ``output`` names a file.
+        output: the file, or a folder for ``frame_000000.ply`` and so on.
+        format: of the files.
+        backend: what evaluates the MLPs.
+        degree: of the spherical harmonics; None for the measured choice.
+
+    Raises:
+        StreamError: a frame is lost.
+        StorageError: a file cannot be written.
+    """
+    single = is_one_file(output)
+    baking = Baking() if degree is None else replace(Baking(), degree=degree)
+    header = reader.header
+    cameras = [header.camera(name) for name in header.rig.training]
+    for number in numbers:
+        plain = baked(on_device(reader.scene(number), backend.device), cameras, backend, baking=baking)
+        path = output if single else output / f"frame_{number:06d}.{format}"
+        size_bytes = write_gaussians(path, plain.in_capture_units(header.similarity), format=format)
+        yield WrittenFrame(path, size_bytes, len(plain))

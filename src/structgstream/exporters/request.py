@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an export writes and where: the answers that follow from a few optional wishes, and what contradicts itself."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from structgstream.errors import ConfigError
+from structgstream.exporters.formats import FORMATS, PAGES, Format, PageFormat
+
+
+def destination(
+    stream: Path,
+    output: Path | None,
+    *,
+    format: Format | PageFormat | None,
+    frame: int | None,
+    frames: tuple[int, int] | None,
+) -> tuple[Path, Format | PageFormat]:
+    """Where to write and in which format.
+
+    Args:
+        stream: the stream's file.
+        output: the file or folder that was asked for; None for one beside the stream.
+        format: that was asked for; None for what the name of ``output`` says, else ``ply``.
+        frame: the only frame to write, or None.
+        frames: the first and the last, or None.
+
+    Raises:
+        ConfigError: the name asks for a format that there is not, or for another than ``format``; or both ``frame`` and
+            ``frames`` are given.
+    """
+    if frame is not None and frames is not None:
+        raise ConfigError("--frame names one frame, --frames the first and the last; give one of them.")
+    if output is None:
+        format = format or "ply"
+        if format == "html":
+            return stream.with_suffix(".html"), format
+        name = f"{stream.stem}-{format}" if frame is None else f"{stream.stem}-{frame}.{format}"
+        return stream.with_name(name), format
+    ending = output.suffix.lower().lstrip(".")
+    if format == "html" and (output.is_dir() or ending != "html"):
+        raise ConfigError(f"a page is a file whose name ends in .html, unlike {output.name}.")
+    if format == "site" or output.is_dir() or not ending:
+        return output, format or "ply"
+    for known in (*FORMATS, "html"):
+        if ending == known:
+            if format not in (None, known):
+                raise ConfigError(f"the name {output.name} asks for .{ending}, and --format for {format}.")
+            return output, known
+    if format is None:
+        known = ", ".join((*FORMATS, *PAGES))
+        raise ConfigError(f"there is no format .{ending}; there are {known}. For a folder of this name add --format.")
+    return output, format
+
+
+def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: int | None) -> None:
+    """A page has no wishes.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if frame is not None or frames is not None or sh_degree is not None:
+        raise ConfigError("a page holds the whole stream; --frame, --frames and --sh-degree are for other formats.")
+
+
+def checked_degree(degree: int | None, format: Format) -> int | None:
+    """The degree that is baked, or None for the measured choice.
+
+    Raises:
+        ConfigError: there is no such degree, or the format cannot hold it.
+    """
+    from structgstream.scene.harmonics import MAX_DEGREE
+
+    if degree is not None and not 0 <= degree <= MAX_DEGREE:
+        raise ConfigError(f"--sh-degree {degree} is not one of 0 to {MAX_DEGREE}.")
+    if format == "splat":
+        if degree:
+            raise ConfigError(f"a .splat file holds one colour a Gaussian; --sh-degree {degree} needs ply or spz.")
+        return 0
+    return degree
+
+
+def chosen_frames(
+    runs: Sequence[range], output: Path, *, frame: int | None, frames: tuple[int, int] | None
+) -> list[int]:
+    """Numbers of the frames to write.
+
+    Args:
+        runs: the frames that the stream can show.
+        output: where they go; a file whose name ends like a format holds one.
+        frame: the only one, or None.
+        frames: the first and the last, or None for all.
+
+    Raises:
+        ConfigError: there is no such frame, it is lost, or several would be written into one file.
+    """
+    if not runs:
+        raise ConfigError("the stream has no whole frame.")
+    if frame is None and frames is None:
+        numbers = [index for run in runs for index in run]
+    else:
+        first, last = frames or (frame or 0, frame or 0)
+        if first > last:
+            raise ConfigError(f"--frames names the first frame, then the last; {first} comes after {last}.")
+        if not any(first in run and last in run for run in runs):
+            asked = f"frame {first}" if first == last else f"range from {first} to {last}"
+            have = " and ".join(f"{run.start} to {run.stop - 1}" for run in runs)
+            raise ConfigError(f"the stream has frames {have}; there is no {asked}.")
+        numbers = list(range(first, last + 1))
+    if is_one_file(output) and len(numbers) > 1:
+        raise ConfigError(f"{output.name} holds one frame: choose it with --frame, or name a folder and --format.")
+    return numbers
+
+
+def is_one_file(output: Path) -> bool:
+    """Whether ``output`` names a file of one frame, not a folder."""
+    return output.suffix.lower().lstrip(".") in FORMATS and not output.is_dir()

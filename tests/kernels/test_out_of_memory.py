@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a kernel says when it gets no memory becomes an error of the package that still is a ``MemoryError``."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from structgstream.codec import decisions, rans
+from structgstream.errors import OutOfMemoryError
+from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_raster
+from structgstream.kernels._load import native_reason
+
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
+Z = torch.zeros
+SPLATS = (Z(1, 3), Z(1, 4), Z(1, 3), Z(1), Z(1, 3))
+VIEW = {"width": 8, "height": 8, "near": 0.1}
+
+
+def backward() -> None:
+    """Forward has memory, backward has none."""
+    means = Z(1, 3, requires_grad=True)
+    drawn = cpu_raster.rasterize(means, *SPLATS[1:], torch.eye(4), torch.eye(3), **VIEW)
+    short = SimpleNamespace(sgs_raster_backward=lambda *_: 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cpu_raster, "native_library", lambda: short)
+        drawn.image.sum().backward()
+
+
+def tables() -> rans.FrequencyTables:
+    return rans.FrequencyTables(np.array([[2048, 2048]], np.uint16))
+
+
+CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
+    "raster": (
+        cpu_raster,
+        "sgs_raster_forward",
+        None,
+        lambda: cpu_raster.rasterize(*SPLATS, torch.eye(4), torch.eye(3), **VIEW),
+    ),
+    "weights": (
+        cpu_raster,
+        "sgs_raster_weights",
+        1,
+        lambda: cpu_raster.blending_weights(*SPLATS[:4], torch.eye(4), torch.eye(3), Z(8, 8, 1), near=0.1),
+    ),
+    "lift": (
+        cpu_lift,
+        "sgs_lift_flow",
+        1,
+        lambda: cpu_lift.lift(
+            Z(1, 3), Z(1, 1), Z(1, 1, 2), Z(1, 4, 4), Z(1, 3, 3), Z(1), Z(1, 1).long(), Z(1, 1), Z(1, 3), share=0.5
+        ),
+    ),
+    "change": (
+        cpu_change,
+        "sgs_changed_pixels",
+        1,
+        lambda: cpu_change.changed_pixels(Z(8, 8, 3).byte(), Z(8, 8, 3).byte(), threshold=0.1, reach_pixels=1),
+    ),
+    "anchors": (
+        cpu_anchors,
+        "sgs_anchors_visible",
+        -1,
+        lambda: cpu_anchors.visible_anchors(Z(1, 3), Z(1, 3), Z(1, 3), Z(1, 2, 3), torch.eye(4), torch.eye(3), **VIEW),
+    ),
+    "encode": (
+        rans,
+        "sgs_rans_encode",
+        1,
+        lambda: rans._native_encode(np.zeros(2, np.uint8), np.zeros(2, np.uint16), tables(), lanes=1),
+    ),
+    "decode": (
+        rans,
+        "sgs_rans_decode",
+        1,
+        lambda: rans._native_decode(np.zeros(2, np.uint16), np.zeros(1, np.uint32), np.zeros(2, np.uint16), tables()),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_no_memory(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, function, result, call = CALLS[name]
+    monkeypatch.setattr(module, "native_library", lambda: SimpleNamespace(**{function: lambda *_: result}))
+    with pytest.raises(OutOfMemoryError, match="^Memory does not suffice"):
+        call()
+
+
+def test_no_memory_for_gradients() -> None:
+    with pytest.raises(OutOfMemoryError, match="gradients"):
+        backward()
+
+
+def test_no_memory_for_decisions() -> None:
+    with pytest.raises(OutOfMemoryError, match="decisions"):
+        decisions._check(decisions._NO_MEMORY)

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of functions is the header's, and ctypes refuses calls with other arguments."""
+
+import ctypes
+import re
+from pathlib import Path
+
+import pytest
+
+from structgstream.kernels._load import native_library, native_reason
+from structgstream.kernels.prototypes import PROTOTYPES, TYPES
+
+HEADER = Path(__file__).parents[2] / "csrc" / "include" / "structgstream.h"
+LETTERS = {"int": "i", "int64_t": "l", "float": "f", "double": "d", "void": "v"}
+
+
+def letter(declaration: str) -> str:
+    """The letter of a C type, with or without the name of an argument."""
+    return "p" if "*" in declaration else LETTERS[declaration.replace("const", "").split()[0]]
+
+
+def declared() -> dict[str, tuple[str, str]]:
+    """What the header says, read by its text alone."""
+    text = re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.DOTALL)
+    found = re.findall(r"^(\w[\w ]*[ *]+)(sgs_\w+)\(([^)]*)\);", text, flags=re.MULTILINE)
+    return {
+        name: (letter(result), "" if given.strip() == "void" else "".join(map(letter, given.split(","))))
+        for result, name, given in found
+    }
+
+
+def test_the_table_is_the_header_s() -> None:
+    header = declared()
+    assert len(header) > 20
+    assert header.keys() == {
+        *re.findall(r"\b(sgs_\w+)\(", re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.DOTALL))
+    }
+    assert header == PROTOTYPES
+    assert TYPES.keys() == {*LETTERS.values(), "p"}
+
+
+@pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
+def test_a_call_with_other_arguments_is_refused() -> None:
+    library = native_library()
+    for name, (_, arguments) in PROTOTYPES.items():
+        assert len(getattr(library, name).argtypes) == len(arguments)
+    scales, drawn = (ctypes.c_float * 3)(2.0, 3.0, 4.0), ctypes.c_int64()
+    opacities = (ctypes.c_float * 1)(1.0)
+    assert library.sgs_volume(scales, opacities, 1, ctypes.byref(drawn)) == 24.0
+    assert drawn.value == 1
+    with pytest.raises(ctypes.ArgumentError):
+        library.sgs_volume(scales, opacities, 1.0, ctypes.byref(drawn))
+    with pytest.raises(ctypes.ArgumentError):
+        library.sgs_volume(scales, opacities, ctypes.c_int(1), ctypes.byref(drawn))
+    with pytest.raises(TypeError):
+        library.sgs_volume(scales, opacities, 1)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package's functions beside the commands: the same bytes, the capture's units, one sentence for mistakes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+import torch
+
+import structgstream
+from structgstream.cli import main
+from structgstream.data.clip import bundled_clip_path
+from structgstream.errors import ConfigError, StorageError, StreamError
+from structgstream.evaluation.evaluate import rendered
+from structgstream.evaluation.report import as_json
+from structgstream.evaluation.run_log import read_log
+from structgstream.kernels._load import native_reason
+from structgstream.kernels.backend import BackendName, select_backend
+from structgstream.presets import TINY
+
+CLIP = bundled_clip_path()
+BACKEND: BackendName = "cpu" if native_reason() is None else "reference"
+QUICK = replace(
+    TINY,
+    initial=replace(TINY.initial, iterations=3),
+    online=replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1)),
+)
+PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": BACKEND}
+
+
+@pytest.fixture(scope="module")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames of 80x60 pixels, hardly trained."""
+    path = tmp_path_factory.mktemp("stream") / "clip.sgs"
+    told = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(structgstream.PRESETS, "tiny", QUICK)
+        reports = structgstream.reconstruct(str(CLIP), path, preset="tiny", on_frame=told.append, **PART)
+    assert reports == told
+    assert [report.index for report in reports] == [0, 1]
+    return path
+
+
+def test_the_bytes_are_those_of_the_command(stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(structgstream.PRESETS, "tiny", QUICK)
+    arguments = ["reconstruct", str(CLIP), "-o", str(tmp_path / "command.sgs"), "--preset", "tiny"]
+    assert main([*arguments, "--frames", "2", "--scale", "0.25", "--device", BACKEND]) == 0
+    assert stream.read_bytes() == (tmp_path / "command.sgs").read_bytes()
+    logs = [read_log(path) for path in (stream, tmp_path / "command.sgs")]
+    assert [*logs[0]] == [0, 1]
+    assert [entry.keys() for entry in logs[0].values()] == [entry.keys() for entry in logs[1].values()]
+
+
+def test_an_interrupted_call_goes_on(stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(structgstream.PRESETS, "tiny", QUICK)
+
+    def stop(report: structgstream.FrameReport) -> None:
+        raise KeyboardInterrupt
+
+    path = tmp_path / "again.sgs"
+    with pytest.raises(KeyboardInterrupt):
+        structgstream.reconstruct(CLIP, path, preset="tiny", on_frame=stop, **PART)
+    with pytest.raises(StorageError, match="exists"):
+        structgstream.reconstruct(CLIP, path, preset="tiny", **PART)
+    reports = structgstream.reconstruct(CLIP, path, preset="tiny", resume=True, **PART)
+    assert [report.index for report in reports] == [1]
+    assert path.read_bytes() == stream.read_bytes()
+    assert [*read_log(path)] == [0, 1]
+
+
+def test_a_capture_that_is_open(stream: Path, tmp_path: Path) -> None:
+    source = structgstream.open_capture(CLIP, frames=1, scale=0.25)
+    with pytest.raises(ConfigError, match="open_capture takes them"):
+        structgstream.reconstruct(source, tmp_path / "x.sgs", frames=1)
+    structgstream.reconstruct(source, tmp_path / "x.sgs", preset=QUICK, backend=BACKEND)
+    ours, theirs = structgstream.open_stream(tmp_path / "x.sgs"), structgstream.open_stream(stream)
+    assert torch.equal(ours.scene(0).anchors.positions, theirs.scene(0).anchors.positions)
+
+
+@pytest.mark.parametrize(
+    ("wishes", "words"),
+    [
+        ({"preset": "tny"}, "there is no preset 'tny'; there are paper-n3dv"),
+        ({"preset": "rig", "mbits": 5.0}, "the codec compact"),
+        ({"preset": replace(QUICK, codec="raw"), "quality": 1.0}, "this configuration makes one with the codec raw"),
+        ({"quality": 90.0}, "not one of -6 to 6"),
+        ({"resume": True, "overwrite": True}, "choose one"),
+        ({"scale": 3.0}, "(0, 1]"),
+    ],
+)
+def test_wrong_wishes_are_told_before_anything_is_written(tmp_path: Path, wishes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        structgstream.reconstruct(CLIP, tmp_path / "x.sgs", **wishes)
+    assert words in str(caught.value)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_pictures_are_asked_for_in_the_units_of_the_capture(stream: Path) -> None:
+    reader, backend = structgstream.open_stream(stream), select_backend(BACKEND)
+    header, name = reader.header, reader.header.rig.testing[0]
+    assert not torch.equal(header.camera(name).viewmat, header.rig[name].viewmat)
+    for index in (1, 0):
+        wanted = rendered(
+            structgstream.open_stream(stream).scene(index), header.similarity.camera(header.rig[name]), backend
+        )
+        picture = reader.render(index, name, backend=BACKEND)
+        assert picture.shape == (60, 80, 3)
+        assert picture.dtype == np.uint8
+        assert np.array_equal(picture, wanted[0])
+        assert np.array_equal(picture, reader.render(index, header.rig[name], backend=backend))
+    with pytest.raises(ConfigError, match="no camera 'cam77'; it has cam00"):
+        reader.render(0, "cam77", backend=BACKEND)
+    with pytest.raises(StreamError, match="there is no frame 2"):
+        reader.render(2, name, backend=BACKEND)
+
+
+def test_a_scene_is_decoded_once_for_all_cameras(stream: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = structgstream.open_stream(stream)
+    decoded, scene = [], reader.scene
+    monkeypatch.setattr(reader, "scene", lambda index: decoded.append(index) or scene(index))
+    for name in [*reader.header.rig][:3]:
+        reader.render(1, name, backend=BACKEND)
+    assert decoded == [1]
+
+
+def test_scores_are_those_of_the_command(stream: Path, tmp_path: Path) -> None:
+    report = structgstream.evaluate(stream, CLIP, metrics="basic", backend=BACKEND)
+    assert isinstance(report, structgstream.Report)
+    assert [*report.cameras] == ["cam00"]
+    assert all(isinstance(frame, structgstream.FrameScores) and frame.log for frame in report.frames)
+    opened = structgstream.open_capture(CLIP, frames=2, scale=0.25)
+    same = structgstream.evaluate(stream, opened, metrics="basic", backend=BACKEND)
+    timed = {"render_seconds", "seconds"}
+    first, second = ({k: v for k, v in as_json(one)["mean"].items() if k not in timed} for one in (report, same))
+    assert first == second
+
+
+def test_exports(stream: Path, tmp_path: Path) -> None:
+    page = structgstream.export(stream, tmp_path / "clip.html")
+    assert "<structgstream-player" in page.read_text()
+    frame = structgstream.export(stream, tmp_path / "one.spz", frame=1, sh_degree=0, backend=BACKEND)
+    folder = structgstream.export(stream, tmp_path / "all", format="spz", sh_degree=0, backend=BACKEND)
+    assert [entry.name for entry in sorted(folder.iterdir())] == ["frame_000000.spz", "frame_000001.spz"]
+    assert frame.read_bytes() == (folder / "frame_000001.spz").read_bytes()
+    with pytest.raises(ConfigError, match="holds one frame"):
+        structgstream.export(stream, tmp_path / "two.ply", backend=BACKEND)
+    with pytest.raises(ConfigError, match="a page holds the whole stream"):
+        structgstream.export(stream, tmp_path / "x.html", frame=0)
+    with pytest.raises(ConfigError, match="give one of them"):
+        structgstream.export(stream, tmp_path / "x", frame=0, frames=(0, 1))
+
+
+def classes_in(hint: Any) -> set[type]:
+    """The package's own classes in a type, those that are inside of others too."""
+    found = {kind for part in get_args(hint) for kind in classes_in(part)}
+    return found | ({hint} if isinstance(hint, type) and hint.__module__.startswith("structgstream") else set())
+
+
+def test_what_is_returned_is_exported() -> None:
+    returned = set[type]()
+    for function in (
+        structgstream.reconstruct,
+        structgstream.evaluate,
+        structgstream.export,
+        structgstream.open_stream,
+    ):
+        returned |= classes_in(get_type_hints(function)["return"])
+    for kind in [*returned]:
+        for hint in get_type_hints(kind).values():
+            returned |= classes_in(hint)
+    assert {kind.__name__ for kind in returned} >= {"FrameReport", "FrameScores", "Report", "Scores", "StreamReader"}
+    assert not {kind.__name__ for kind in returned} - {*structgstream.__all__}

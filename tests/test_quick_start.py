@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The quick-start of the README is run as it is printed, on a capture and a preset that take seconds."""
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from structgstream.data.clip import bundled_clip_path
+from structgstream.presets import PRESETS, TINY
+
+README = Path(__file__).parents[1] / "README.md"
+SMALLER = {"frames=20": "frames=2, scale=0.25", "render(19,": "render(1,"}
+
+
+def test_the_quick_start_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+    assert len(blocks) == 1
+    code = blocks[0]
+    assert re.findall(r"^(?:import|from) .*", code, flags=re.MULTILINE) == ["import structgstream"]
+    for printed, small in SMALLER.items():
+        assert code.count(printed) == 1, printed
+        code = code.replace(printed, small)
+    online = replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1))
+    quick = replace(TINY, initial=replace(TINY.initial, iterations=3), online=online)
+    monkeypatch.setitem(PRESETS, "compact", quick)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "basketball").symlink_to(bundled_clip_path())
+    names: dict[str, object] = {}
+    exec(compile(code, str(README), "exec"), names)
+    said = capsys.readouterr().out
+    assert [line.split()[0] for line in said.splitlines()[:2]] == ["0", "1"]
+    assert " dB at the cameras" in said
+    assert getattr(names["picture"], "shape", None) == (60, 80, 3)
+    assert {"ball.sgs", "ball.log.jsonl", "ball.html"} <= {entry.name for entry in tmp_path.iterdir()}
+    assert "structgstream" in sys.modules

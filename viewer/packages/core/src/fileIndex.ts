@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Index and footer: where packets are in a stored file, without reading them (docs/bitstream.md). */
+
+import { RecordType, recordIn, viewOf } from "./records.js";
+
+export const FOOTER_BYTES = 16;
+const ENTRY_BYTES = 13;
+const FOOTER_MAGIC = "SGSINDEX";
+
+/** Where one packet is. */
+export interface IndexEntry {
+  readonly index: number;
+  readonly isKey: boolean;
+  readonly offset: number;
+}
+
+/** Offset of the index record by the last 16 bytes of a file of `fileBytes`; undefined when it must be scanned. */
+export function indexOffset(footer: Uint8Array, fileBytes: number): number | undefined {
+  if (footer.length !== FOOTER_BYTES || String.fromCharCode(...footer.subarray(8)) !== FOOTER_MAGIC) return undefined;
+  const offset = Number(viewOf(footer).getBigUint64(0, true));
+  return offset + FOOTER_BYTES < fileBytes ? offset : undefined;
+}
+
+/**
+ * The packets of a file by its index; undefined when it must be scanned. The records they lead to have to be verified
+ * when they are read.
+ *
+ * @param bytes the index record: from its offset to the footer
+ */
+export function indexEntries(bytes: Uint8Array, offset: number): IndexEntry[] | undefined {
+  const record = recordIn(bytes, offset);
+  if (record?.type !== RecordType.index || record.payload.length % ENTRY_BYTES) return undefined;
+  const view = viewOf(record.payload);
+  const entries: IndexEntry[] = [];
+  for (let at = 0, before = 0; at < record.payload.length; at += ENTRY_BYTES) {
+    const type = view.getUint8(at + 4);
+    const entry = {
+      index: view.getUint32(at, true),
+      isKey: type === RecordType.key,
+      offset: Number(view.getBigUint64(at + 5, true)),
+    };
+    const isPacket = entry.isKey || (type === RecordType.delta && entries.length > 0);
+    if (!isPacket || entry.index !== entries.length || entry.offset <= before || entry.offset >= offset)
+      return undefined;
+    before = entry.offset;
+    entries.push(entry);
+  }
+  return entries;
+}
