@@ -26,6 +26,13 @@ from structgstream.player import running
 
 STREAM = small_stream()
 PATIENCE_SECONDS = 60.0
+# As `python -m structgstream`, with Ctrl-C as a terminal has it: whoever starts the tests in the background has it
+# ignored, and children inherit that.
+COMMAND = """
+import runpy, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module("structgstream", run_name="__main__", alter_sys=True)
+"""
 
 
 @dataclass
@@ -61,7 +68,7 @@ def playing(folder: Path, *arguments: str) -> Iterator[Playing]:
     printed = folder / "printed"
     with printed.open("wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "structgstream", "play", *arguments], stdout=output, stderr=output, env=environ
+            [sys.executable, "-c", COMMAND, "play", *arguments], stdout=output, stderr=output, env=environ
         )
     try:
         yield Playing(process, printed)
