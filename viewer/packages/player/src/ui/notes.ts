@@ -13,6 +13,8 @@ export class Notes {
   private readonly middle = made("div", { class: "middle" });
   private readonly spoken = made("div", { class: "quiet", role: "status", "aria-live": "polite" });
   private until = 0;
+  private readonly later: string[] = [];
+  private passing = false;
 
   constructor() {
     const close = made("button", { type: "button", "aria-label": "Close" }, icon("close"));
@@ -21,16 +23,36 @@ export class Notes {
     this.root.append(this.middle, this.note, this.spoken);
   }
 
-  /** @param bad it is an error, and stays until it is closed or another comes */
+  /**
+   * Says `text` when what is said has had its time; "" ends everything.
+   *
+   * @param bad it is an error: it is said at once, and stays until it is closed or another comes
+   */
   say(text: string, now: number, bad = false): void {
+    if (text === "") this.later.length = 0;
+    else if (!bad && !this.note.hidden && !this.passing) {
+      this.later.push(text);
+      return;
+    }
+    this.passing = false;
     setText(this.text, text);
     this.note.classList.toggle("bad", bad);
     this.note.hidden = text === "";
     this.until = bad ? Number.POSITIVE_INFINITY : now + NOTE_SECONDS;
   }
 
+  /** Says how things stand at this moment, for a second; gives way to everything else. */
+  status(text: string, now: number): void {
+    if (!this.note.hidden && !this.passing) return;
+    this.passing = true;
+    this.say(text, now - NOTE_SECONDS + 1);
+    this.passing = true;
+  }
+
   tick(now: number): void {
     if (!this.note.hidden && now > this.until) this.hide();
+    const next = this.note.hidden && this.later.shift();
+    if (next) this.say(next, now);
   }
 
   /** A line for screen readers only. */

@@ -222,7 +222,7 @@ export class Surface {
     if (!engine?.growing || engine.paused || !engine.stalled) return;
     const seconds = engine.nextFrameSeconds;
     const when = seconds === undefined ? "the next is awaited" : `next in about ${Math.ceil(seconds)} s`;
-    this.notes.say(`Frame ${engine.frames.count - 1}, ${when}`, performance.now() / 1000 - 5);
+    this.notes.status(`Frame ${engine.frames.count - 1}, ${when}`, performance.now() / 1000);
   }
 
   private tapped(): void {
