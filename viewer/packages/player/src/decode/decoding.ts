@@ -70,7 +70,7 @@ export class Decoding {
     let indexed = false;
     let taken = 0;
     return {
-      opening: (loadedBytes, totalBytes) => this.tell({ type: "opening", loadedBytes, totalBytes }),
+      opening: (loadedBytes, totalBytes, ended) => this.tell({ type: "opening", loadedBytes, totalBytes, ended }),
       header: (header, ranged, index) => {
         const catalog = new Catalog(header.fps, header.codec === "raw");
         const store = new PacketStore(budgetBytes);

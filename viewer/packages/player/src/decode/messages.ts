@@ -52,7 +52,12 @@ export interface CatalogFacts {
 }
 
 export type FromDecoder =
-  | { readonly type: "opening"; readonly loadedBytes: number; readonly totalBytes: number | undefined }
+  | {
+      readonly type: "opening";
+      readonly loadedBytes: number;
+      readonly totalBytes: number | undefined;
+      readonly ended: boolean;
+    }
   | { readonly type: "header"; readonly header: StreamHeader; readonly ranged: boolean }
   | { readonly type: "catalog"; readonly facts: CatalogFacts }
   /** Packets that are there, and bytes fetched so far, everything counted. */

@@ -24,7 +24,8 @@ const MOST_INDEX_BYTES = 2 ** 24;
 
 /** What comes out of opening, in this order: progress, the header, the index if there is one, then packets. */
 export interface OpeningEvents {
-  opening(loadedBytes: number, totalBytes: number | undefined): void;
+  /** `ended`: the file ends within its header, so far. */
+  opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
   /** `index` is given when it says where all packets are, with the byte where they end. */
   header(header: StreamHeader, ranged: boolean, index: { entries: IndexEntry[]; end: number } | undefined): void;
   /** The reader has packets that were not there before, or knows of damage; after `ended` nothing more comes. */
@@ -125,9 +126,7 @@ export class Opening {
       end: () => this.finish(),
       failed: (message) => this.events.failed(message),
       waiting: (seconds, problem) => {
-        if (!this.announced && problem === undefined && this.loaded >= (this.fileBytes ?? 0)) {
-          this.events.opening(this.loaded, undefined);
-        }
+        if (!this.announced && problem === undefined) this.events.opening(this.loaded, undefined, true);
         this.events.waiting(seconds, problem);
       },
     });
@@ -146,7 +145,7 @@ export class Opening {
       this.reader.push(bytes);
       const complete = this.reader.state === "complete";
       this.lookedForIndex ||= complete;
-      if (!this.announced) this.events.opening(this.loaded, this.index?.entries[0]?.offset ?? this.fileBytes);
+      if (!this.announced) this.events.opening(this.loaded, this.index?.entries[0]?.offset ?? this.fileBytes, false);
       this.announceIfThere();
       if (this.announced) this.events.read(this.reader, complete);
       if (complete) this.stop();

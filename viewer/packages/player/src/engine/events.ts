@@ -8,7 +8,7 @@ export type TimeRange = readonly [startSeconds: number, endSeconds: number];
 
 export interface EngineEvents {
   /** Bytes of the header are coming; the total may never be known. */
-  opening: { readonly loadedBytes: number; readonly totalBytes: number | undefined };
+  opening: { readonly loadedBytes: number; readonly totalBytes: number | undefined; readonly ended: boolean };
   header: StreamHeader;
   /** Another frame is to be drawn. */
   frame: { readonly index: number; readonly ptsSeconds: number };

@@ -75,7 +75,8 @@ kbd { font: 11px/1.2 ui-monospace, monospace; border: 1px solid var(--line); bor
 .middle { position: absolute; inset: 0; display: grid; place-content: center; justify-items: center; gap: 12px; padding: 24px; text-align: center;
   pointer-events: none; }
 .middle p { margin: 0; max-width: 46ch; }
-.middle.bad { pointer-events: auto; background: var(--ground); }
+.middle.bad, .middle[data-is="loading"] { background: var(--ground); }
+.middle.bad { pointer-events: auto; }
 .middle .soft { color: var(--soft); font-variant-numeric: tabular-nums; }
 progress { appearance: none; width: min(220px, 60vw); height: 3px; border: 0; border-radius: 2px; background: var(--rail); overflow: hidden; }
 progress::-webkit-progress-bar { background: var(--rail); } progress::-webkit-progress-value { background: var(--accent); }

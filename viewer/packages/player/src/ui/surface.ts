@@ -178,9 +178,11 @@ export class Surface {
       const file = event.dataTransfer?.files[0];
       if (file) this.options.open({ kind: "blob", blob: file, name: file.name });
     });
-    player.on("opening", ({ loadedBytes, totalBytes }) => {
-      const rest = totalBytes === undefined ? "; more is awaited" : ` of ${bytesText(totalBytes)}`;
-      this.notes.loading(loadedBytes, totalBytes, `${bytesText(loadedBytes)}${rest}`);
+    player.on("opening", ({ loadedBytes, totalBytes, ended }) => {
+      const rest = ended
+        ? ": the stream ends within its header. It is being written, or was cut off; waiting for more."
+        : totalBytes && ` of ${bytesText(totalBytes)}`;
+      this.notes.loading(loadedBytes, totalBytes, bytesText(loadedBytes) + (rest ?? ""));
     });
     player.on("header", () => {
       if (!player.rig) return;

@@ -108,6 +108,29 @@ describe.skipIf(!executable)("the player in a browser", () => {
     expectQuiet();
   });
 
+  test("says that a stream ends within its header, and begins when the rest has come", async () => {
+    const header = CLIP.subarray(0, Math.floor(PACKETS[0]!.offset / 2));
+    stage.server.put("/clip.sgs", header, { changed: new Date() });
+    const page = await open();
+    await page.getByText("the stream ends within its header").waitFor();
+    stage.server.put("/clip.sgs", CLIP, { changed: new Date() });
+    await shows(page, 0);
+    stage.server.put("/old.sgs", header);
+    await ask(page, (player) => player.load("old.sgs"));
+    await page.getByRole("alert").getByText("old.sgs").waitFor();
+    expectQuiet();
+  });
+
+  test("says one thing after the other: what a link wanted, and that there are no ranges", async () => {
+    stage.server.put("/clip.sgs", CLIP, { ranges: false });
+    const page = await open('src="clip.sgs"', "?t=never");
+    await page.getByText('The link\'s "t" was not taken').waitFor();
+    await page.getByText("gives no parts of files (Range)").waitFor();
+    await page.getByRole("button", { name: "Close" }).click();
+    await shows(page, 0);
+    expectQuiet();
+  });
+
   test("plays a cut stream up to the cut, and a damaged one around the damage", async () => {
     stage.server.put("/clip.sgs", CLIP.subarray(0, PACKETS[5]!.offset + 9));
     const page = await open('src="clip.sgs" autoplay');
