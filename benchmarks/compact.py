@@ -10,9 +10,9 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.blocks import packed_block, unpacked_blocks
-from structgstream.codec.compact import CompactDecoder, CompactEncoder, CompactState, quantised
+from structgstream.codec.container.blocks import packed_block, unpacked_blocks
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene.compact import CompactDecoder, CompactEncoder, CompactState, quantised
 from structgstream.scene.order import space_order
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity

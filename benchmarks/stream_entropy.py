@@ -11,8 +11,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.adaptive import AdaptiveDecoder
-from structgstream.codec.coder import Contexts, Decoder
+from structgstream.codec.entropy.adaptive import AdaptiveDecoder
+from structgstream.codec.entropy.coder import Contexts, Decoder
 from structgstream.codec.reader import open_stream
 
 

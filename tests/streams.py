@@ -7,12 +7,12 @@ from dataclasses import replace
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS
-from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS
+from structgstream.codec.scene.compact import quantised
+from structgstream.codec.scene.static_fields import AS_THEY_ARE, on_bins
 from structgstream.codec.sinks import MemorySink
-from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 from structgstream.similarity import Similarity

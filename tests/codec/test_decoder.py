@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from streams import header_for, same, small_scene
-from structgstream.codec.blocks import packed_block
+from structgstream.codec.container.blocks import packed_block
 from structgstream.codec.decoder import SceneDecoder, packet_of
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind

@@ -10,7 +10,7 @@ import torch
 import zstandard
 
 from streams import header_for, small_scene
-from structgstream.codec.blocks import packed_block
+from structgstream.codec.container.blocks import packed_block
 from structgstream.codec.header import MAX_JSON_BYTES, packed_header, unpacked_header
 from structgstream.errors import StreamError
 from structgstream.scene.state import STATE_TABLE

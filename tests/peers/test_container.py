@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rigs import arc_rig
+from structgstream.codec.container.records import PREFIX, scanned
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.records import PREFIX, scanned
 from structgstream.errors import StorageError, StreamError
 from structgstream.peers.container import PeerReader, PeerWriter, is_peer_file, packed_array, unpacked_arrays
 from structgstream.peers.method import Arrays

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from peers.captures import Capture, Watched, moving_capture
+from structgstream.codec.container.records import scanned
 from structgstream.codec.packets import PacketKind
-from structgstream.codec.records import scanned
 from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.kernels.backend import reference_backend
 from structgstream.peers.container import is_peer_file

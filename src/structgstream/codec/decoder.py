@@ -7,10 +7,10 @@ from collections.abc import Set
 
 from torch import Tensor
 
-from structgstream.codec.blocks import blocks_in, coded_fields, unpacked_blocks
-from structgstream.codec.compact import CompactDecoder, CompactState
+from structgstream.codec.container.blocks import blocks_in, coded_fields, unpacked_blocks
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.shapes import check_shapes
+from structgstream.codec.scene.compact import CompactDecoder, CompactState
+from structgstream.codec.scene.shapes import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, scene_of

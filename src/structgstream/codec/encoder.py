@@ -10,10 +10,10 @@ decodes the bytes it has just made and returns that. Without it trainer and view
 import math
 from dataclasses import dataclass
 
-from structgstream.codec.blocks import coded_block, packed_block
-from structgstream.codec.compact import CompactEncoder
+from structgstream.codec.container.blocks import coded_block, packed_block
 from structgstream.codec.decoder import FRAME, SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene.compact import CompactEncoder
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of

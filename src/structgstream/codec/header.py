@@ -13,10 +13,10 @@ from torch import Tensor
 from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.blocks import blocks_in, coded_block, mixed_blocks, packed_block
+from structgstream.codec.container.blocks import blocks_in, coded_block, mixed_blocks, packed_block
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.shapes import check_shapes
-from structgstream.codec.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
+from structgstream.codec.scene.shapes import check_shapes
+from structgstream.codec.scene.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import REQUIRED, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity

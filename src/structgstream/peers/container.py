@@ -22,12 +22,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from structgstream.codec.container.records import PREFIX, RecordType, packed, record_at, scanned, why_stopped
+from structgstream.codec.container.stored import Stored, StoredFile
 from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.reader import PacketInfo
-from structgstream.codec.records import PREFIX, RecordType, packed, record_at, scanned, why_stopped
-from structgstream.codec.stored import Stored, StoredFile
 from structgstream.errors import StorageError, StreamError
 from structgstream.peers.method import Arrays, PeerMethod, State
 from structgstream.scene.state import FieldName

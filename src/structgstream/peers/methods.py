@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from structgstream.codec.container.stored import StoredFile
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.stored import StoredFile
 from structgstream.errors import StreamError
 from structgstream.peers.additions import AdditionsConfig
 from structgstream.peers.container import PeerReader

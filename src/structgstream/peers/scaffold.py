@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.codec.shapes import check_shapes
+from structgstream.codec.scene.shapes import check_shapes
 from structgstream.errors import StreamError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend

@@ -11,10 +11,10 @@ import torch
 
 from structgstream.beginning import frame_seed, initial_points_of
 from structgstream.cameras import CameraRig
+from structgstream.codec.container.records import PREFIX, record_at
+from structgstream.codec.container.stored import StoredFile
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.records import PREFIX, record_at
-from structgstream.codec.stored import StoredFile
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
