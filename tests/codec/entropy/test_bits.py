@@ -4,7 +4,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.entropy.bits import BitReader, fixed, golomb, numbers_of, packed_bits, signed_golomb, zigzag
+from structgstream.codec.entropy.bits import (
+    BitReader,
+    fixed,
+    golomb,
+    numbers_of,
+    packed_bits,
+    signed_golomb,
+    unzigzag,
+    zigzag,
+)
 from structgstream.errors import StreamError
 
 WHERE = "It"
@@ -21,7 +30,11 @@ def test_golomb_codes_come_back(pieces: list[tuple[int, int]]) -> None:
 def test_the_codes_of_the_document() -> None:
     """docs/entropy.md, section Bits."""
     assert [golomb(value, order=2) for value in (0, 3, 4, 5, 12)] == ["100", "111", "01000", "01001", "0010000"]
-    assert [zigzag(value) for value in (0, -1, 1, -2, 2)] == [0, 1, 2, 3, 4]
+    values = [0, -1, 1, -2, 2, 2**62 - 1, -(2**62)]
+    assert [zigzag(value) for value in values] == [0, 1, 2, 3, 4, 2**63 - 2, 2**63 - 1]
+    assert [unzigzag(zigzag(value)) for value in values] == values
+    assert zigzag(np.array(values)).tolist() == [zigzag(value) for value in values]
+    assert unzigzag(zigzag(np.array(values))).tolist() == values
 
 
 def test_more_zeros_than_allowed_and_a_cut() -> None:

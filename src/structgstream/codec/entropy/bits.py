@@ -2,11 +2,14 @@
 """Numbers as bits, the highest first, and Exp-Golomb codes (docs/entropy.md, section Bits)."""
 
 from collections.abc import Iterable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import StreamError
+
+Whole = TypeVar("Whole", int, NDArray[np.int64])
 
 
 def packed_bits(pieces: Iterable[str]) -> bytes:
@@ -32,9 +35,14 @@ def signed_golomb(value: int, *, order: int) -> str:
     return golomb(zigzag(value), order=order)
 
 
-def zigzag(value: int) -> int:
-    """The place of ``value`` in 0, -1, 1, -2, 2 ..."""
-    return 2 * value if value >= 0 else -2 * value - 1
+def zigzag(values: Whole) -> Whole:
+    """The places of values of 63 bits in 0, -1, 1, -2, 2 ..."""
+    return values << 1 ^ values >> 63
+
+
+def unzigzag(places: Whole) -> Whole:
+    """The values at these places, see :func:`zigzag`."""
+    return places >> 1 ^ -(places & 1)
 
 
 def numbers_of(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
@@ -99,8 +107,7 @@ class BitReader:
         Raises:
             StreamError: as :meth:`golomb`.
         """
-        place = self.golomb(order=order, most_zeros=most_zeros)
-        return -(place + 1 >> 1) if place % 2 else place >> 1
+        return unzigzag(self.golomb(order=order, most_zeros=most_zeros))
 
     def end(self) -> None:
         """Nothing but the zeros that fill the last byte is left.

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.bits import BitReader, fixed, golomb, packed_bits
+from structgstream.codec.entropy.bits import BitReader, fixed, golomb, packed_bits, unzigzag, zigzag
 from structgstream.errors import StreamError
 
 ALPHABET = 16
@@ -27,7 +27,7 @@ def symbols_of(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes
     if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
         raise StreamError("A residual is beyond 32 bits; the step it was divided by is too small.")
     size = np.abs(values)
-    symbols = np.where(size > LARGEST, ESCAPE, 2 * size - (values < 0)).astype(np.uint8)
+    symbols = np.where(size > LARGEST, ESCAPE, zigzag(values)).astype(np.uint8)
     large = values[size > LARGEST].tolist()
     return symbols, packed_bits(golomb(abs(v) - LARGEST - 1, order=_ORDER) + fixed(v < 0, 1) for v in large)
 
@@ -43,8 +43,7 @@ def residuals_of(
     """
     if (symbols > ESCAPE).any():
         raise StreamError(f"{where} belongs to symbols above {ESCAPE}; they are damaged.")
-    size = symbols.astype(np.int64) + 1 >> 1
-    values = np.where(symbols % 2 == 1, -size, size)
+    values = unzigzag(symbols.astype(np.int64))
     places = np.flatnonzero(symbols == ESCAPE)
     # An escape takes 4 bits at least and 61 at most.
     if not 4 * len(places) <= 8 * len(escapes) <= 61 * len(places) + 7:

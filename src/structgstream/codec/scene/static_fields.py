@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from structgstream.codec.entropy.bits import unzigzag, zigzag
 from structgstream.codec.entropy.coder import Bins, Coder, Contexts, Decoder, Encoder, Naturals, Tables, bit_lengths
 from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMBOL
 from structgstream.codec.scene.bins import LARGEST, nearest_bins, values_of
@@ -183,7 +184,7 @@ def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
         steps = np.diff(morton_keys(torch.from_numpy(cells)).numpy(), prepend=0)
     descends = coder.number("anchor_positions.descends", None if steps is None else int((steps < 0).any()))
     if steps is not None and descends:
-        steps = np.where(steps < 0, -2 * steps - 1, 2 * steps)
+        steps = zigzag(steps)
     far = coder.naturals(
         "anchor_positions.far", None if steps is None else steps >> _HALF, np.zeros(count, np.uint16), count=1
     )
@@ -197,7 +198,7 @@ def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
         raise StreamError(f"{_WHERE} holds a position beyond {3 * CELL_BITS} bits; it is damaged.")
     steps = (far << _HALF) + near
     if descends:
-        steps = np.where(steps & 1, ~(steps >> 1), steps >> 1)
+        steps = unzigzag(steps)
     # The sums of both halves stay below 2^53, however damaged.
     low = np.cumsum(steps & (1 << _HALF) - 1)
     high = np.cumsum(steps >> _HALF) + (low >> _HALF)
@@ -259,19 +260,14 @@ def _coded_numbers(coder: Coder, name: FieldName, bins: Bins | None, budget: _Bu
         coder.number(f"{name}.count", None if bins is None else len(bins)), MOST_WEIGHTS, f"numbers of {name}"
     )
     budget.take(count)
-    values = None if bins is None else _zigzag(bins.astype(np.int64))
+    values = None if bins is None else zigzag(bins.astype(np.int64))
     values = coder.naturals(f"{name}.value", values, np.zeros(count, np.uint16), count=1)
-    return _checked(np.where(values & 1, ~(values >> 1), values >> 1))
+    return _checked(unzigzag(values))
 
 
 def _coded_signed(coder: Coder, name: str, value: int | None) -> int:
-    found = coder.number(name, None if value is None else int(_zigzag(np.int64(value))))
-    found = ~(found >> 1) if found & 1 else found >> 1
-    return int(_checked(np.array([found]))[0])
-
-
-def _zigzag(values: Naturals | np.int64) -> Naturals:
-    return np.where(values < 0, -2 * values - 1, 2 * values)
+    found = coder.number(name, None if value is None else zigzag(int(value)))
+    return int(_checked(np.array([unzigzag(found)]))[0])
 
 
 def _bounded(number: int, most: int, what: str) -> int:
