@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import (
     BitReader,
+    bit_lengths,
     fixed,
     golomb,
     numbers_of,
@@ -71,3 +72,8 @@ def test_numbers_of_many_widths(pieces: list[tuple[int, int]]) -> None:
     data = packed_bits(fixed(value, width) for width, value in pieces if width)
     widths = np.array([width for width, _ in pieces], np.int64)
     assert numbers_of(data, widths, where=WHERE).tolist() == [value for _, value in pieces]
+
+
+def test_bit_lengths_are_exact() -> None:
+    values = [0, 1, 2, 3, 4, 2**30 - 1, 2**30, 2**31 - 1]
+    assert bit_lengths(np.array(values, np.int64)).tolist() == [v.bit_length() for v in values]

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import fixed, numbers_of, packed_bits
-from structgstream.codec.entropy.coder import Decoder, Encoder, Tables, bit_lengths, varint
+from structgstream.codec.entropy.coder import Decoder, Encoder, Tables, varint
 from structgstream.errors import StreamError
 
 NATURAL = st.one_of(st.integers(0, 20), st.integers(0, 2**31 - 1), st.sampled_from([2**30 - 1, 2**30, 2**31 - 1]))
@@ -65,11 +65,6 @@ def test_numbers_have_seven_bits_a_byte() -> None:
     assert [varint(n) for n in (0, 127, 128, 2**32 - 1)] == [b"\0", b"\x7f", b"\x80\x01", b"\xff\xff\xff\xff\x0f"]
     for n in (0, 1, 127, 128, 300, 2**28 - 1, 2**28, 2**32 - 1):
         assert reader({"one": varint(n)}).number("one.count", None) == n
-
-
-def test_bit_lengths_are_exact() -> None:
-    values = [0, 1, 2, 3, 4, 2**30 - 1, 2**30, 2**31 - 1]
-    assert bit_lengths(np.array(values, np.int64)).tolist() == [v.bit_length() for v in values]
 
 
 @pytest.mark.parametrize("value", [-1, 2**31])

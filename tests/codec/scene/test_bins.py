@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rigs import random_scene
 from streams import STEPS
 from structgstream.codec.scene.bins import LARGEST, anchor_fields, binned, valued
-from structgstream.codec.scene.compact import CODABLE, quantised
+from structgstream.codec.scene.compact import CODABLE
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, state_of
@@ -52,7 +52,7 @@ def test_a_value_that_no_bin_stands_for(value: float) -> None:
     state = state_of(random_scene(3))
     state["anchor_positions"][1, 2] = value
     with pytest.raises(StreamError, match="steps from zero, at most 4194304 can be coded"):
-        quantised(state, STEPS, frozenset({"anchor_positions"}))
+        binned(state, frozenset({"anchor_positions"}), STEPS)
 
 
 def test_columns_stand_in_the_order_of_the_state_table() -> None:

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.scene import free_rows
-from structgstream.codec.scene.free_rows import MOST_FREE, FreeBins, coded_free
-from structgstream.codec.scene.rows import Change
+from structgstream.codec.scene.bins import FreeBins
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.free_rows import MOST_FREE, coded_free
 from structgstream.errors import StreamError
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 import documented
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
-from structgstream.codec.scene.rows import Change, coded_change
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.rows import coded_change
 from structgstream.errors import StreamError
 
 GROUPS = (("anchor_positions", 0, 2), ("offset_scales", 2, 3))

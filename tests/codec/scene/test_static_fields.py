@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from streams import small_scene
 from structgstream.codec.entropy.coder import Encoder, Tables, varint
+from structgstream.codec.scene.bins import on_bins
 from structgstream.codec.scene.static_fields import (
     AS_THEY_ARE,
     FREE_NUMBERS,
@@ -21,7 +22,6 @@ from structgstream.codec.scene.static_fields import (
     MOST_WEIGHTS,
     decoded_fields,
     encoded_fields,
-    on_bins,
 )
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.coder import Bins, Flags, Naturals
+from structgstream.codec.arrays import Bins, Flags, Naturals
 from structgstream.codec.entropy.decisions import code_activity, code_numbers, code_residuals
 from structgstream.codec.entropy.models import (
     ACTIVITY_CONTEXTS,

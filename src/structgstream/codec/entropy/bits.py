@@ -45,6 +45,11 @@ def unzigzag(places: Whole) -> Whole:
     return places >> 1 ^ -(places & 1)
 
 
+def bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of binary digits, 0 for 0."""
+    return np.frexp(values.astype(np.float64))[1].astype(np.int64)  # exact below 2^53
+
+
 def numbers_of(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
     """Numbers int64 ``[n]`` of the widths 0 to 56 ``[n]`` that fill ``data``, but for zeros in the last byte.
 

@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.bits import fixed, numbers_of, packed_bits
+from structgstream.codec.arrays import Bins, Contexts, Naturals
+from structgstream.codec.entropy.bits import bit_lengths, fixed, numbers_of, packed_bits
 from structgstream.codec.entropy.rans import decode, encode, section_bytes
 from structgstream.codec.entropy.residual_symbols import ALPHABET, residuals_of, symbols_of
 from structgstream.codec.entropy.table_choice import chosen_tables
@@ -23,10 +24,6 @@ from structgstream.codec.entropy.tables import FrequencyTables, geometric_family
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
-Bins = NDArray[np.int32]
-Naturals = NDArray[np.int64]
-Flags = NDArray[np.bool_]
-Contexts = NDArray[np.uint16]
 CLASSES = 32
 """Alphabet of the bit lengths of natural numbers below 2^31."""
 _FLAT = 128  # of the geometric rows: what is expected of a context that has not been seen
@@ -177,8 +174,3 @@ def varint(value: int) -> bytes:
         out.append(value & 127 | 128)
         value >>= 7
     return bytes([*out, value])
-
-
-def bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of binary digits, 0 for 0."""
-    return np.frexp(values.astype(np.float64))[1].astype(np.int64)  # exact below 2^53

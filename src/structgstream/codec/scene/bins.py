@@ -12,10 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.codec.entropy.adaptive import AdaptiveCoder
-from structgstream.codec.entropy.coder import Bins
-from structgstream.codec.scene.free_rows import FreeBins, coded_free
-from structgstream.codec.scene.rows import Change, coded_change
+from structgstream.codec.arrays import Bins
+from structgstream.codec.scene.change import Change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FREE_COLUMNS, FieldName
 
@@ -26,6 +24,30 @@ FREE_STEPS = ("free_means", "free_log_scales", "free_quats", "free_logit_opaciti
 _FREE_WIDTHS = (3, 3, 4, 1, 3)
 LARGEST = 2**22
 """Of bins: with their products rounded to float32, the nearest bin of a value is still the one it was made of."""
+
+
+@dataclass(frozen=True)
+class FreeBins:
+    """Free Gaussians as bins.
+
+    Args:
+        births: int64 ``[F]``, ascending.
+        bins: ``[F, 14]``.
+        change: what the last frame did to them; what was born in it did not change.
+    """
+
+    births: NDArray[np.int64]
+    bins: Bins
+    change: Change
+
+    @classmethod
+    def none(cls) -> "FreeBins":
+        """No free Gaussians."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
+
+    def unmoved(self) -> "FreeBins":
+        """The same, without a last change: what a key frame starts from."""
+        return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
 
 
 @dataclass(frozen=True)
@@ -61,7 +83,7 @@ def anchor_fields(dynamic: frozenset[FieldName]) -> tuple[FieldName, ...]:
     return tuple(name for name in ANCHOR_ROWS if name in dynamic)
 
 
-def _columns(fields: Sequence[FieldName], total: int) -> list[tuple[FieldName, int, int]]:
+def anchor_columns(fields: Sequence[FieldName], total: int) -> list[tuple[FieldName, int, int]]:
     """``(name, first column, end)`` of each field: three columns, and for the appearance what remains of ``total``."""
     found: list[tuple[FieldName, int, int]] = []
     first = 0
@@ -96,7 +118,7 @@ def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], ste
 def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> dict[FieldName, Tensor]:
     """The dynamic fields that bins stand for."""
     state: dict[FieldName, Tensor] = {}
-    for name, first, end in _columns(anchor_fields(dynamic), bins.anchors.shape[1]):
+    for name, first, end in anchor_columns(anchor_fields(dynamic), bins.anchors.shape[1]):
         state[name] = values_of(bins.anchors[:, first:end], steps[name])
     for name, weights in bins.weights.items():
         state[name] = values_of(weights[:, 0], steps[name])
@@ -106,37 +128,16 @@ def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, f
     return state
 
 
-def coded_scene(
-    coder: AdaptiveCoder,
-    after: SceneBins | None,
-    before: SceneBins,
-    *,
-    fields: Sequence[FieldName],
-    has_free: bool,
-    where: str,
-) -> SceneBins:
-    """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
+def on_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
+    """The fields that have a step, as their nearest bins stand for them; all others as they are.
 
     Raises:
-        StreamError: what is decoded contradicts itself.
+        StreamError: a value is too many steps from zero.
     """
-    groups = _columns(fields, before.anchors.shape[1])
-    given = None if after is None else Change.of(after.anchors - before.anchors)
-    change = coded_change(coder, given, before.change, groups=groups)
-    anchors = before.anchors + change.residuals
-    weights: dict[FieldName, Bins] = {}
-    changes: dict[FieldName, Change] = {}
-    for name, bins in before.weights.items():
-        given = None if after is None else Change.of(after.weights[name] - bins)
-        changes[name] = coded_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
-        weights[name] = bins + changes[name].residuals
-    free = before.free
-    if has_free:
-        free = coded_free(coder, None if after is None else after.free, before.free, where=where)
-    for found in (anchors, *weights.values(), free.bins):
-        if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
-            raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
-    return SceneBins(anchors, change, weights, changes, free)
+    return {
+        name: values_of(nearest_bins(value, steps[name]), steps[name]) if name in steps else value
+        for name, value in state.items()
+    }
 
 
 def _free_steps(steps: Mapping[str, float]) -> NDArray[np.float32]:

@@ -5,29 +5,67 @@ A key packet follows the header's reference state instead, with models that have
 does the group of packets up to the next one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
+from structgstream.codec.arrays import Bins
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene.bins import (
     ANCHOR_ROWS,
     FREE_STEPS,
+    LARGEST,
     WEIGHTS,
     SceneBins,
+    anchor_columns,
     anchor_fields,
     binned,
-    coded_scene,
     valued,
 )
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.free_rows import coded_free
+from structgstream.codec.scene.rows import coded_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
 CODABLE: frozenset[FieldName] = frozenset({*ANCHOR_ROWS, *WEIGHTS, "free", "free_births"})
 """Fields that may be dynamic."""
+
+
+def coded_scene(
+    coder: AdaptiveCoder,
+    after: SceneBins | None,
+    before: SceneBins,
+    *,
+    fields: Sequence[FieldName],
+    has_free: bool,
+    where: str,
+) -> SceneBins:
+    """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
+
+    Raises:
+        StreamError: what is decoded contradicts itself.
+    """
+    groups = anchor_columns(fields, before.anchors.shape[1])
+    given = None if after is None else Change.of(after.anchors - before.anchors)
+    change = coded_change(coder, given, before.change, groups=groups)
+    anchors = before.anchors + change.residuals
+    weights: dict[FieldName, Bins] = {}
+    changes: dict[FieldName, Change] = {}
+    for name, bins in before.weights.items():
+        given = None if after is None else Change.of(after.weights[name] - bins)
+        changes[name] = coded_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
+        weights[name] = bins + changes[name].residuals
+    free = before.free
+    if has_free:
+        free = coded_free(coder, None if after is None else after.free, before.free, where=where)
+    for found in (anchors, *weights.values(), free.bins):
+        if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
+            raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
+    return SceneBins(anchors, change, weights, changes, free)
 
 
 @dataclass(frozen=True)
@@ -133,10 +171,3 @@ class CompactDecoder(_Compact):
         decoder.end()
         self._keep(kind, index, bins, models)
         return valued(bins, self._header.dynamic, self._header.steps)
-
-
-def quantised(
-    state: Mapping[FieldName, Tensor], steps: Mapping[str, float], names: frozenset[FieldName]
-) -> dict[FieldName, Tensor]:
-    """The fields ``names`` of a state as their bins stand for them."""
-    return valued(binned(state, names, steps), names, steps)

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free Gaussians from frame to frame: some die, some change, some are born (docs/bitstream.md, section Free 3DGs)."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.codec.arrays import Bins, Flags
 from structgstream.codec.entropy.adaptive import AdaptiveCoder
-from structgstream.codec.entropy.coder import Bins, Flags, bit_lengths
-from structgstream.codec.scene.rows import Change, coded_change
+from structgstream.codec.entropy.bits import bit_lengths
+from structgstream.codec.scene.bins import FreeBins
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.rows import coded_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FREE_COLUMNS
 
@@ -24,30 +25,6 @@ MOST_FREE = 2**18
 _MEANS = range(6, 11)  # quaternions and opacities
 _LED = (12, 13)  # green and blue
 _FRAME_BITS = 32  # a birth is frame * 2^32 + number
-
-
-@dataclass(frozen=True)
-class FreeBins:
-    """Free Gaussians as bins.
-
-    Args:
-        births: int64 ``[F]``, ascending.
-        bins: ``[F, 14]``.
-        change: what the last frame did to them; what was born in it did not change.
-    """
-
-    births: NDArray[np.int64]
-    bins: Bins
-    change: Change
-
-    @classmethod
-    def none(cls) -> "FreeBins":
-        """No free Gaussians."""
-        return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
-
-    def unmoved(self) -> "FreeBins":
-        """The same, without a last change: what a key frame starts from."""
-        return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
 
 
 def coded_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:

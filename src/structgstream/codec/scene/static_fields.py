@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.codec.entropy.bits import unzigzag, zigzag
-from structgstream.codec.entropy.coder import Bins, Coder, Contexts, Decoder, Encoder, Naturals, Tables, bit_lengths
+from structgstream.codec.arrays import Bins, Contexts, Naturals
+from structgstream.codec.entropy.bits import bit_lengths, unzigzag, zigzag
+from structgstream.codec.entropy.coder import Coder, Decoder, Encoder, Tables
 from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMBOL
 from structgstream.codec.scene.bins import LARGEST, nearest_bins, values_of
 from structgstream.errors import StreamError
@@ -58,18 +59,6 @@ class _Budget:
 
 def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
     return FREE_NUMBERS + NUMBERS_A_BYTE * sum(map(len, coded))
-
-
-def on_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
-    """The fields that have a step, as their nearest bins stand for them; all others as they are.
-
-    Raises:
-        StreamError: a value is too many steps from zero.
-    """
-    return {
-        name: values_of(nearest_bins(value, steps[name]), steps[name]) if name in steps else value
-        for name, value in state.items()
-    }
 
 
 def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
