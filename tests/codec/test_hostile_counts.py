@@ -14,9 +14,10 @@ import torch
 
 from streams import compact_header, small_scene
 from structgstream.codec.container.blocks import BLOCK, blocks_in, mixed_blocks
+from structgstream.codec.container.init_record import LENGTH
 from structgstream.codec.entropy import coder, rans
 from structgstream.codec.entropy.coder import Decoder, varint
-from structgstream.codec.header import LENGTH, packed_header, unpacked_header
+from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
 from structgstream.codec.scene.static_fields import decoded_fields

@@ -25,6 +25,8 @@ from structgstream.cameras import Camera
 from structgstream.codec.container.blocks import blocks_in
 from structgstream.codec.container.damage import Damage, Search, next_index
 from structgstream.codec.container.index import indexed_offsets
+from structgstream.codec.container.init_record import field_bytes_of
+from structgstream.codec.container.payload import FRAME, packet_of
 from structgstream.codec.container.records import (
     CHECKSUM,
     PREFIX,
@@ -39,9 +41,9 @@ from structgstream.codec.container.records import (
     why_stopped,
 )
 from structgstream.codec.container.stored import Part, Stored, StoredFile
-from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
+from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.frame_renderer import FrameRenderer
-from structgstream.codec.header import field_bytes_of, unpacked_header
+from structgstream.codec.header import unpacked_header
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName

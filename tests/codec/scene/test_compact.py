@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from rigs import random_scene
 from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 from structgstream.codec.container.blocks import coded_fields
+from structgstream.codec.container.payload import FRAME, packet_of
 from structgstream.codec.container.records import RECORD, RecordType, scanned
-from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
+from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from structgstream.codec.container.index import INDEX_ENTRY
+from structgstream.codec.container.payload import FRAME
 from structgstream.codec.container.records import CHECKSUM, RECORD, Record, RecordType, head_at, record_at
 from structgstream.codec.container.stored import Stored
-from structgstream.codec.decoder import FRAME
 
 LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
 _CHUNK_BYTES = 2**20

@@ -5,6 +5,7 @@ import struct
 from array import array
 from collections.abc import Iterable
 
+from structgstream.codec.container.payload import FRAME
 from structgstream.codec.container.records import (
     CHECKSUM,
     FOOTER,
@@ -17,7 +18,6 @@ from structgstream.codec.container.records import (
     record_at,
 )
 from structgstream.codec.container.stored import Stored
-from structgstream.codec.decoder import FRAME
 
 INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 

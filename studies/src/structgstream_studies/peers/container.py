@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from structgstream.codec.container.payload import FRAME
 from structgstream.codec.container.records import PREFIX, RecordType, packed, record_at, scanned, why_stopped
 from structgstream.codec.container.stored import Stored, StoredFile
-from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.reader import PacketInfo
