@@ -26,7 +26,7 @@ player:
 	scripts/build-player
 
 # A plain (not editable) install: what is tested is what a user gets. Sources are listed so that a change reinstalls.
-SOURCES := pyproject.toml CMakeLists.txt $(shell find csrc src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
+SOURCES := pyproject.toml CMakeLists.txt studies/pyproject.toml studies/README.md $(shell find csrc src studies/src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -36,7 +36,7 @@ $(VENV)/.demo-ready: $(SOURCES) | $(BIN)/python
 	touch $@
 
 $(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]' ./studies
 	touch $@ $(VENV)/.demo-ready
 
 # A wheel in dist/ that runs on other machines, tried in an empty environment. WHEEL_OPTIONS: see scripts/wheel.
@@ -57,4 +57,4 @@ clean:
 # Tables of the documents, from the results beside them.
 .PHONY: tables
 tables: $(VENV)/.test-ready
-	$(BIN)/python -m structgstream.experiments results docs/ablations.md docs/compact.md docs/evaluation.md docs/method.md
+	$(BIN)/python -m structgstream_studies.experiments results docs/ablations.md docs/compact.md docs/evaluation.md docs/method.md

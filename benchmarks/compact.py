@@ -10,9 +10,10 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.blocks import packed_block, unpacked_blocks
-from structgstream.codec.compact import CompactDecoder, CompactEncoder, CompactState, quantised
+from structgstream.codec.container.blocks import packed_block, unpacked_blocks
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene.bins import binned, valued
+from structgstream.codec.scene.compact import CompactDecoder, CompactEncoder, CompactState
 from structgstream.scene.order import space_order
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity
@@ -69,7 +70,7 @@ def workload(anchors: int) -> Work:
         config={},
         metadata={},
         steps=STEPS,
-        reference=quantised(state, STEPS, ROWS),
+        reference=_rounded(state, ROWS),
     )
     encoder = CompactEncoder(header)
     encoder.encode(state, kind=PacketKind.KEY, index=0)
@@ -79,7 +80,7 @@ def workload(anchors: int) -> Work:
     assert before is not None
     state = _moved(state, active, 2, g)
     coded = encoder.encode(state, kind=PacketKind.DELTA, index=2)
-    seen = quantised(state, STEPS, DYNAMIC)
+    seen = _rounded(state, DYNAMIC)
     raw = b"".join(packed_block(name, seen[name]) for name in sorted(DYNAMIC))
     return Work(header, before, state, raw, coded)
 
@@ -103,6 +104,11 @@ def _moved(state: State, active: Tensor, frame: int, g: torch.Generator) -> Stat
     }
 
 
+def _rounded(state: State, names: frozenset[FieldName]) -> State:
+    """The fields ``names`` as a decoder has them."""
+    return valued(binned(state, names, STEPS), names, STEPS)
+
+
 def _told(state: State) -> Results:
     return [state[name] for name in sorted(DYNAMIC)]
 
@@ -120,7 +126,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
     def encode() -> Results:
         encoder.follow(work.before)
         encoder.encode(work.frame, kind=PacketKind.DELTA, index=2)
-        return _told(quantised(work.frame, STEPS, DYNAMIC))
+        return _told(_rounded(work.frame, DYNAMIC))
 
     def facts(name: str) -> Callable[[], Mapping[str, float]]:
         return lambda: {"bytes": sizes[name]}

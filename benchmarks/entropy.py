@@ -11,11 +11,11 @@ import zstandard
 
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
-from structgstream.codec import rans
-from structgstream.codec.residual_symbols import ALPHABET, symbols_of
-from structgstream.codec.table_choice import chosen_tables
-from structgstream.codec.table_sets import decoded_tables
-from structgstream.codec.tables import FrequencyTables, geometric
+from structgstream.codec.entropy import rans
+from structgstream.codec.entropy.residual_symbols import ALPHABET, symbols_of
+from structgstream.codec.entropy.table_choice import chosen_tables
+from structgstream.codec.entropy.table_sets import decoded_tables
+from structgstream.codec.entropy.tables import FrequencyTables, geometric
 
 CONTEXTS = 50
 Symbols = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -11,8 +11,9 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.adaptive import AdaptiveDecoder
-from structgstream.codec.coder import Contexts, Decoder
+from structgstream.codec.arrays import Contexts
+from structgstream.codec.entropy.adaptive import AdaptiveDecoder
+from structgstream.codec.entropy.coder import Decoder
 from structgstream.codec.reader import open_stream
 
 

@@ -7,12 +7,11 @@ from dataclasses import replace
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS
-from structgstream.codec.compact import quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS, binned, on_bins, valued
+from structgstream.codec.scene.static_fields import AS_THEY_ARE
 from structgstream.codec.sinks import MemorySink
-from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 from structgstream.similarity import Similarity
@@ -45,7 +44,7 @@ def compact_header(
     rows = dynamic.difference(["free", "free_births"])
     used = {name: step for name, step in steps.items() if name in rows or (name in FREE_STEPS and "free" in dynamic)}
     state = state_of(scene)
-    reference = quantised(state, used, rows)
+    reference = valued(binned(state, rows, used), rows, used)
     init_steps: dict[FieldName, float] = {
         name: used.get(name, STATIC_STEP) for name in state if name not in AS_THEY_ARE
     }

@@ -14,9 +14,9 @@ from streams import moved, same, small_scene
 from structgstream import session
 from structgstream.beginning import frame_seed
 from structgstream.cameras import CameraRig
+from structgstream.codec.container.records import scanned
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.records import scanned
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry

@@ -14,9 +14,9 @@ from small_presets import TINY_RIG
 from streams import same
 from structgstream import session
 from structgstream.cameras import CameraRig
-from structgstream.codec.bins import FREE_STEPS
+from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.records import scanned
+from structgstream.codec.scene.bins import FREE_STEPS
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame

@@ -11,8 +11,8 @@ import pytest
 
 from small_presets import TINY_RIG
 from structgstream.cameras import CameraRig
+from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.records import scanned
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from structgstream.codec.bins import FREE_STEPS
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.static_fields import on_bins
+from structgstream.codec.scene.bins import FREE_STEPS, on_bins
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
 from structgstream.frames import MultiViewFrame

@@ -12,9 +12,10 @@ import tomllib
 from pathlib import Path
 
 import structgstream
+import structgstream_studies
 
 ROOT = Path(__file__).parents[2]
-SOURCES = sorted((ROOT / "src" / "structgstream").rglob("*.py"))
+SOURCES = sorted(path for folder in ("src", "studies/src") for path in (ROOT / folder).rglob("*.py"))
 
 
 def test_layers() -> None:
@@ -24,17 +25,24 @@ def test_layers() -> None:
     assert result.returncode == 0, result.stdout
 
 
-def test_the_picture_of_layers_is_that_of_the_contract() -> None:
-    """Row by row; and every module of the package has a place in it."""
+def drawn_and_stated() -> list[tuple[list[set[str]], list[set[str]]]]:
+    """Rows of each picture of ARCHITECTURE's section Layers beside those of each contract on layers, in their order."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    (layers,) = (contract["layers"] for contract in contracts if contract["type"] == "layers")
-    stated = [{name.removeprefix("structgstream.") for name in row.split(" | ")} for row in layers]
-    text = (ROOT / "ARCHITECTURE.md").read_text()
-    picture = text.split("## Layers")[1].split("```")[1]
-    drawn = [set(re.findall(r"`(\w+)`", line)) for line in picture.splitlines() if line.strip()]
-    assert drawn == stated
+    layers = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
+    stated = [[{name.removeprefix("structgstream.") for name in row.split(" | ")} for row in rows] for rows in layers]
+    section = (ROOT / "ARCHITECTURE.md").read_text().split("\n## Layers")[1].split("\n## ")[0]
+    pictures = [picture.splitlines() for picture in section.split("```")[1::2]]
+    drawn = [[set(re.findall(r"`(\w+)`", line)) for line in lines if line.strip()] for lines in pictures]
+    return list(zip(drawn, stated, strict=True))
+
+
+def test_the_pictures_of_layers_are_those_of_the_contracts() -> None:
+    """Row by row; and every module of the package has a place in the first."""
+    for drawn, stated in drawn_and_stated():
+        assert drawn == stated
+    whole, _ = drawn_and_stated()[0]
     modules = {module.name for module in pkgutil.iter_modules(structgstream.__path__)}
-    assert set().union(*drawn) == modules - {"__main__"}
+    assert set().union(*whole) == modules - {"__main__"} | {"structgstream_studies"}
 
 
 def test_modules_stay_small() -> None:
@@ -73,6 +81,13 @@ def test_architecture_names_every_package() -> None:
     assert not [name for name in packages if f"`{name}" not in text]
 
 
+def test_both_distributions_are_of_one_version() -> None:
+    projects = [tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"] for folder in (".", "studies")]
+    assert {project["version"] for project in projects} == {structgstream.__version__}
+    assert {project["requires-python"] for project in projects} == {projects[0]["requires-python"]}
+    assert projects[1]["dependencies"] == [f"structgstream[capture,report,eval]=={structgstream.__version__}"]
+
+
 def test_importing_the_package_is_light() -> None:
     code = (
         "import sys, structgstream, structgstream.cli; "
@@ -92,6 +107,7 @@ def test_the_player_path_needs_no_optional_package() -> None:
 
 
 def test_every_module_imports() -> None:
-    for module in pkgutil.walk_packages(structgstream.__path__, "structgstream."):
-        if module.name != "structgstream.__main__":
-            importlib.import_module(module.name)
+    for package in (structgstream, structgstream_studies):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith(".__main__"):
+                importlib.import_module(module.name)

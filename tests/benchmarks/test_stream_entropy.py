@@ -5,8 +5,8 @@ import pytest
 from benchmarks.stream_entropy import counted_init, packet_bytes, told
 
 from streams import compact_header, moved, small_scene, write_stream
-from structgstream.codec.adaptive import AdaptiveDecoder
-from structgstream.codec.coder import Decoder
+from structgstream.codec.entropy.adaptive import AdaptiveDecoder
+from structgstream.codec.entropy.coder import Decoder
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 

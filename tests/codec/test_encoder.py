@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from rigs import random_scene
 from streams import header_for, moved, same, small_scene
-from structgstream.codec.decoder import SceneDecoder, packet_of
+from structgstream.codec.container.payload import packet_of
+from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind

@@ -13,13 +13,14 @@ import pytest
 import torch
 
 from streams import compact_header, small_scene
-from structgstream.codec import coder, rans
-from structgstream.codec.blocks import BLOCK, blocks_in, mixed_blocks
-from structgstream.codec.coder import Decoder, varint
-from structgstream.codec.compact import CODABLE, CompactDecoder, CompactEncoder
-from structgstream.codec.header import LENGTH, packed_header, unpacked_header
+from structgstream.codec.container.blocks import BLOCK, blocks_in, mixed_blocks
+from structgstream.codec.container.init_record import LENGTH
+from structgstream.codec.entropy import coder, rans
+from structgstream.codec.entropy.coder import Decoder, varint
+from structgstream.codec.header import packed_header, unpacked_header
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.static_fields import decoded_fields
+from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
+from structgstream.codec.scene.static_fields import decoded_fields
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scanned
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import packed_header
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader, open_stream, readable_part
-from structgstream.codec.records import PREFIX, RecordType, packed, prefix, scanned
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
 

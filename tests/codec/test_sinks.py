@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.container.records import RecordType, scanned
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.records import RecordType, scanned
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StorageError, StreamError
 

@@ -15,8 +15,8 @@ import pytest
 import torch
 import zstandard
 
+from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.records import scanned
 from structgstream.scene.state import state_of
 from vectors.generate import (
     COMPACT_EXPECTED,

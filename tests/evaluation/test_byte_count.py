@@ -7,8 +7,8 @@ import pytest
 
 from rigs import random_scene
 from streams import compact_header, header_for, moved, small_scene, write_stream
+from structgstream.codec.container.records import PREFIX
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.records import PREFIX
 from structgstream.codec.sinks import MemorySink
 from structgstream.evaluation.byte_count import (
     FIRST,

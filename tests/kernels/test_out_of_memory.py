@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.codec import decisions, rans
+from structgstream.codec.entropy import decisions, rans
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_raster
 from structgstream.kernels._load import native_reason

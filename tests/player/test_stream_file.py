@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from streams import small_stream
+from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.records import FOOTER, FOOTER_MAGIC
 from structgstream.errors import StreamError
 from structgstream.player.stream_file import PIECE_BYTES, StreamFile, check_begun, pieces
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, LARGEST, WEIGHTS, binned, valued
-from structgstream.codec.compact import CODABLE
+from structgstream.codec.scene.bins import ANCHOR_ROWS, FREE_STEPS, LARGEST, WEIGHTS, binned, valued
+from structgstream.codec.scene.compact import CODABLE
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of
 from structgstream.training.parameters import Parameters, parameters_of_fields

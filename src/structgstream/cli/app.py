@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 
 from structgstream.errors import ConfigError, StructGStreamError
 
@@ -22,10 +23,12 @@ COMMANDS = {
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .splat, .spz",
     "inspect": "show what a stream file holds",
-    "ablate": "run the paper's ablations on a capture, ours beside the paper's figures",
-    "compare": "run several methods on a capture and score their files alike",
     "doctor": "show what this machine has, what is missing, and how to mend it",
 }
+ENTRY_POINTS = "structgstream.commands"
+"""What other distributions call their packages of commands: with ``COMMANDS`` and, for each, a module with ``main``."""
+STUDIES = ("ablate", "compare")
+"""Commands of the distribution structgstream-studies, which not everybody installs."""
 DONE, PROBLEM, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
@@ -106,7 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def overview() -> str:
     """The text of ``structgstream --help``."""
-    commands = "\n".join(f"  {name:<12} {text}" for name, text in COMMANDS.items())
+    further = {name: text for package in _packages() for name, text in package.COMMANDS.items()}
+    commands = "\n".join(f"  {name:<12} {text}" for name, text in {**COMMANDS, **further}.items())
     return f"""usage: structgstream COMMAND [options]
 
 A ring of synchronised cameras to a free-viewpoint video stream, frame by frame.
@@ -128,11 +132,26 @@ examples:
 
 
 def _run(command: str, arguments: list[str]) -> None:
-    if command not in COMMANDS:
-        near = difflib.get_close_matches(command, COMMANDS, n=1)
+    homes = dict.fromkeys(COMMANDS, "structgstream.cli")
+    if command not in homes:
+        homes |= {name: package.__name__ for package in _packages() for name in package.COMMANDS}
+    if command not in homes and command in STUDIES:
+        raise UsageError(
+            f"the command {command!r} is one of structgstream-studies, which is not installed; "
+            "install it with: pip install ./studies (in the repository of structgstream)"
+        )
+    if command not in homes:
+        near = difflib.get_close_matches(command, homes, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(COMMANDS)}.")
-    importlib.import_module(f"structgstream.cli.{command}").main(arguments)
+        raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(homes)}.")
+    importlib.import_module(f"{homes[command]}.{command}").main(arguments)
+
+
+def _packages() -> list[ModuleType]:
+    """Packages of commands that other distributions bring."""
+    from importlib.metadata import entry_points
+
+    return [point.load() for point in entry_points(group=ENTRY_POINTS)]
 
 
 def _say(text: str) -> None:

@@ -1,36 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A packet to a scene: everything a receiver needs besides a renderer."""
 
-import math
-import struct
 from collections.abc import Set
 
 from torch import Tensor
 
-from structgstream.codec.blocks import blocks_in, coded_fields, unpacked_blocks
-from structgstream.codec.compact import CompactDecoder, CompactState
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.shapes import check_shapes
+from structgstream.codec.container.blocks import coded_fields, unpacked_blocks
+from structgstream.codec.container.payload import FRAME
+from structgstream.codec.packets import Packet, StreamHeader
+from structgstream.codec.scene.compact import CompactDecoder, CompactState
+from structgstream.codec.scene.shapes import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, scene_of
-
-FRAME = struct.Struct("<Id")  # index, presentation time in seconds
-
-
-def packet_of(payload: bytes, kind: PacketKind) -> Packet:
-    """The packet in a key or delta record.
-
-    Raises:
-        StreamError: the payload contradicts the format.
-    """
-    if len(payload) < FRAME.size:
-        raise StreamError("A packet is too short to hold its index and time.")
-    index, pts_seconds = FRAME.unpack_from(payload)
-    if not math.isfinite(pts_seconds):
-        raise StreamError(f"Packet {index} has the presentation time {pts_seconds}, which is no time.")
-    blocks = blocks_in(payload, FRAME.size, where=f"Packet {index}")
-    return Packet(kind, index, pts_seconds, payload, {block.name: block.end - block.start for block in blocks})
 
 
 class SceneDecoder:

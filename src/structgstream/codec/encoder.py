@@ -10,10 +10,11 @@ decodes the bytes it has just made and returns that. Without it trainer and view
 import math
 from dataclasses import dataclass
 
-from structgstream.codec.blocks import coded_block, packed_block
-from structgstream.codec.compact import CompactEncoder
-from structgstream.codec.decoder import FRAME, SceneDecoder
+from structgstream.codec.container.blocks import coded_block, packed_block
+from structgstream.codec.container.payload import packet_with
+from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene.compact import CompactEncoder
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
@@ -61,17 +62,15 @@ class SceneEncoder:
                 f"({self._last_pts_seconds} s); the capture's time stamps must rise."
             )
         state = state_of(scene)
-        lengths: dict[FieldName, int] = {}
-        parts = [FRAME.pack(index, pts_seconds)]
         coded = None if self._compact is None else self._compact.encode(state, kind=kind, index=index)
-        for row in STATE_TABLE:
-            if row.name in self._header.dynamic:
-                block = (
-                    packed_block(row.name, state[row.name]) if coded is None else coded_block(row.name, coded[row.name])
-                )
-                parts.append(block)
-                lengths[row.name] = len(block)
-        packet = Packet(kind, index, pts_seconds, b"".join(parts), lengths)
+        blocks: dict[FieldName, bytes] = {
+            row.name: packed_block(row.name, state[row.name])
+            if coded is None
+            else coded_block(row.name, coded[row.name])
+            for row in STATE_TABLE
+            if row.name in self._header.dynamic
+        }
+        packet = packet_with(blocks, index=index, pts_seconds=pts_seconds, kind=kind)
         encoded = Encoded(packet, self._decoder.decode(packet))
         self._last_pts_seconds = pts_seconds
         return encoded

@@ -1,30 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The init record: what a receiver knows before the first frame (docs/bitstream.md, section Init record)."""
 
-import json
 import math
-import struct
 from collections.abc import Mapping, Set
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.blocks import blocks_in, coded_block, mixed_blocks, packed_block
+from structgstream.codec.container.blocks import coded_block, mixed_blocks, packed_block
+from structgstream.codec.container.init_record import description_of, first_block, packed_init
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.shapes import check_shapes
-from structgstream.codec.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
+from structgstream.codec.scene.shapes import check_shapes
+from structgstream.codec.scene.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import REQUIRED, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
 
-MAX_JSON_BYTES = 2**20
 MAX_IMAGE_SIDE = 65_535
-LENGTH = struct.Struct("<I")
-_ZSTD_LEVEL = 19
 _LEAST_STEP = 2.0**-64
 
 
@@ -57,13 +52,6 @@ def packed_header(header: StreamHeader) -> bytes:
         **({"steps": dict(header.steps)} if header.steps else {}),
         **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
     }
-    text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
-    if len(text) > MAX_JSON_BYTES:
-        raise StreamError(
-            f"The header's description has {len(text)} bytes, at most {MAX_JSON_BYTES} are allowed; "
-            "leave out metadata or cameras."
-        )
-    packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encoded_fields(fields, header.init_steps) if header.codec == "compact" else {}
     blocks = [
@@ -72,7 +60,7 @@ def packed_header(header: StreamHeader) -> bytes:
         for f in STATE_TABLE
         if f.name in part
     ]
-    return LENGTH.pack(len(packed)) + packed + b"".join(blocks)
+    return packed_init(description, blocks)
 
 
 def unpacked_header(payload: bytes) -> StreamHeader:
@@ -81,16 +69,11 @@ def unpacked_header(payload: bytes) -> StreamHeader:
     Raises:
         StreamError: the payload contradicts the format.
     """
-    if len(payload) < LENGTH.size:
-        raise StreamError("The init record is too short.")
-    (length,) = LENGTH.unpack_from(payload)
-    if LENGTH.size + length > len(payload):
-        raise StreamError("The init record states a longer description than it holds.")
-    values, coded = mixed_blocks(payload, LENGTH.size + length, where="The init record")
+    values, coded = mixed_blocks(payload, first_block(payload), where="The init record")
     try:
-        description = _description(payload[LENGTH.size : LENGTH.size + length])
+        description = description_of(payload)
         header = _header(description, _fields(description, values, coded))
-    except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, ZstdError, CalibrationError) as error:
+    except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
     if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
         raise StreamError("The init record does not hold every field that packets leave out, and only those.")
@@ -103,24 +86,9 @@ def unpacked_header(payload: bytes) -> StreamHeader:
     return header
 
 
-def field_bytes_of(payload: bytes) -> dict[FieldName, int]:
-    """What each field takes in an init record's payload, which must be one that :func:`unpacked_header` reads."""
-    (length,) = LENGTH.unpack_from(payload)
-    blocks = blocks_in(payload, LENGTH.size + length, where="The init record")
-    return {block.name: block.end - block.start for block in blocks}
-
-
 def _complete(names: Set[FieldName]) -> bool:
     optional = names - REQUIRED - {"environment"}
     return names >= REQUIRED and (not optional or optional == {"appearance", "appearance_basis"})
-
-
-def _description(packed: bytes) -> dict[str, Any]:
-    """The JSON text, whose stated size is looked at before anything is unpacked."""
-    size = frame_content_size(packed)
-    if not 0 <= size <= MAX_JSON_BYTES:
-        raise ValueError(f"its description unpacks to {size} bytes, at most {MAX_JSON_BYTES} are allowed")
-    return json.loads(ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES))
 
 
 def _fields(

@@ -22,14 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.codec.blocks import blocks_in
-from structgstream.codec.damage import Damage, Search, next_index
-from structgstream.codec.decoder import FRAME, SceneDecoder, packet_of
-from structgstream.codec.frame_renderer import FrameRenderer
-from structgstream.codec.header import field_bytes_of, unpacked_header
-from structgstream.codec.index import indexed_offsets
-from structgstream.codec.packets import Packet, PacketKind
-from structgstream.codec.records import (
+from structgstream.codec.container.blocks import blocks_in
+from structgstream.codec.container.damage import Damage, Search, next_index
+from structgstream.codec.container.index import indexed_offsets
+from structgstream.codec.container.init_record import field_bytes_of
+from structgstream.codec.container.payload import FRAME, packet_of
+from structgstream.codec.container.records import (
     CHECKSUM,
     PREFIX,
     RECORD,
@@ -42,7 +40,11 @@ from structgstream.codec.records import (
     scanned,
     why_stopped,
 )
-from structgstream.codec.stored import Part, Stored, StoredFile
+from structgstream.codec.container.stored import Part, Stored, StoredFile
+from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.frame_renderer import FrameRenderer
+from structgstream.codec.header import unpacked_header
+from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName
 from structgstream.scene.scene import Scene

@@ -7,12 +7,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from structgstream.codec.container.index import INDEX_ENTRY, packed_index
+from structgstream.codec.container.records import RecordType, packed, prefix
+from structgstream.codec.container.stored import Part, Stored, StoredFile
 from structgstream.codec.header import packed_header
-from structgstream.codec.index import INDEX_ENTRY, packed_index
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import StreamReader, readable_part
-from structgstream.codec.records import RecordType, packed, prefix
-from structgstream.codec.stored import Part, Stored, StoredFile
 from structgstream.errors import StorageError
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}

@@ -16,7 +16,7 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from structgstream.codec.stored import Stored
+from structgstream.codec.container.stored import Stored
 from structgstream.errors import PlayerError
 
 MOST_PAGE_STREAM_BYTES: Final = 256 * 10**6

@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from structgstream.codec.stored import StoredFile
+from structgstream.codec.container.stored import StoredFile
 from structgstream.errors import CaptureError, StreamError
 from structgstream.player.bundle import bundle
 from structgstream.player.byte_range import UnsatisfiableRange, asked_bytes

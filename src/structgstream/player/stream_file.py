@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.codec.records import PREFIX, RecordType, check_prefix, footer_offset, head_at, why_stopped
-from structgstream.codec.stored import Stored, StoredFile
+from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, footer_offset, head_at, why_stopped
+from structgstream.codec.container.stored import Stored, StoredFile
 from structgstream.errors import StreamError
 
 PIECE_BYTES = 256 * 1024

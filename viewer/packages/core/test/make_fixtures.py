@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.bins import FREE_STEPS
-from structgstream.codec.compact import CODABLE, quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene.bins import FREE_STEPS
+from structgstream.codec.scene.compact import CODABLE, quantised
+from structgstream.codec.scene.static_fields import AS_THEY_ARE, on_bins
 from structgstream.codec.sinks import MemorySink
-from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
 from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of

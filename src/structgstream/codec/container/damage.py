@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a stream goes on after damage (docs/bitstream.md, section Damage)."""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from structgstream.codec.container.index import INDEX_ENTRY
+from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.records import CHECKSUM, RECORD, Record, RecordType, head_at, record_at
+from structgstream.codec.container.stored import Stored
+
+LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
+_CHUNK_BYTES = 2**20
+_WORK = 4
+_HEAD = re.compile(rb"[\x02-\x04].\x00\x00", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A record that is not whole although others follow it.
+
+    Args:
+        offset: its first byte.
+        frames: those that cannot be shown for it: its own, and what follows up to the next key packet.
+    """
+
+    offset: int
+    frames: range
+
+
+def next_index(record: Record) -> int:
+    """The frame that a packet is, or that would follow an index."""
+    if record.type == RecordType.INDEX:
+        return len(record.payload) // INDEX_ENTRY.size
+    return int(FRAME.unpack_from(record.payload)[0])
+
+
+class Search:
+    """Finds what follows damage in ``data``.
+
+    One is made for each stream: with all its calls it verifies checksums of no more than four times the stream's
+    bytes, so that a file made for it cannot make a reader work for long.
+    """
+
+    def __init__(self, data: Stored) -> None:
+        self._data = data
+        self._left = _WORK * len(data)
+
+    def next(self, damaged: int, *, expected: int, after_seconds: float) -> Record | None:
+        """The first whole packet or index after byte ``damaged``, where a record is not whole.
+
+        Args:
+            damaged: where that record begins.
+            expected: the frame that would come next.
+            after_seconds: when the last one is presented.
+        """
+        for offset in self._heads(damaged + 1):
+            if not self._fits(offset, damaged, expected, after_seconds):
+                continue
+            head = head_at(self._data, offset)
+            assert head is not None, "it fits"
+            self._left -= head[1]
+            if self._left < 0:
+                return None
+            if (record := record_at(self._data, offset)) is not None:
+                return record
+        return None
+
+    def _heads(self, start: int) -> Iterator[int]:
+        """Every byte from ``start`` on where the head of a packet or an index may begin."""
+        while start + RECORD.size <= len(self._data):
+            chunk = bytes(self._data[start : start + _CHUNK_BYTES])
+            at = 0
+            while (match := _HEAD.search(chunk, at)) is not None:
+                at = match.start() + 1
+                yield start + match.start()
+            start += max(len(chunk) - RECORD.size + 1, 1)
+
+    def _fits(self, offset: int, damaged: int, expected: int, after_seconds: float) -> bool:
+        """Whether what would begin at ``offset`` can come after ``expected`` frames and the damage."""
+        if (head := head_at(self._data, offset)) is None:
+            return False
+        kind, length = head
+        last = expected + (offset - damaged) // LEAST_PACKET_BYTES
+        if kind == RecordType.INDEX:
+            return length % INDEX_ENTRY.size == 0 and expected <= length // INDEX_ENTRY.size <= last
+        if length < FRAME.size:
+            return False
+        start = offset + RECORD.size
+        index, pts_seconds = FRAME.unpack(self._data[start : start + FRAME.size])
+        return expected <= index <= last and math.isfinite(pts_seconds) and pts_seconds > after_seconds

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Index and footer: where packets are without reading them (docs/bitstream.md, section Index record and footer)."""
+
+import struct
+from array import array
+from collections.abc import Iterable
+
+from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.records import (
+    CHECKSUM,
+    FOOTER,
+    FOOTER_MAGIC,
+    RECORD,
+    RecordType,
+    footer_offset,
+    head_at,
+    packed,
+    record_at,
+)
+from structgstream.codec.container.stored import Stored
+
+INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
+
+
+def packed_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
+    """Index record and footer for byte ``offset``, from each packet's frame index, record type and offset."""
+    index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
+    return packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC)
+
+
+def indexed_offsets(data: Stored, start: int) -> "array[int] | None":
+    """Offsets of the packets that follow byte ``start``, by the index; None when the stream must be scanned.
+
+    That is when footer or index is not intact, or they are not what the heads of the records say, one after another.
+    """
+    end = footer_offset(data)
+    if end is None or end < start:
+        return None
+    index = record_at(data, end)
+    if index is None or len(index.payload) % INDEX_ENTRY.size:
+        return None
+    found = _by_heads(data, start, end)
+    if found is None or found != index.payload:
+        return None
+    return array("Q", (offset for _, _, offset in INDEX_ENTRY.iter_unpack(found)))
+
+
+def _by_heads(data: Stored, start: int, end: int) -> bytearray | None:
+    """What the index should say, from the records' heads; None when they do not follow each other as packets must."""
+    entries = bytearray()
+    before_seconds = 0.0
+    while start < end:
+        if (head := head_at(data, start)) is None:
+            return None
+        kind, length = head
+        if kind in (RecordType.KEY, RecordType.DELTA):
+            count = len(entries) // INDEX_ENTRY.size
+            if length < FRAME.size or (kind == RecordType.DELTA and not count):
+                return None
+            number, pts_seconds = FRAME.unpack(data[start + RECORD.size : start + RECORD.size + FRAME.size])
+            if number != count or (count and not pts_seconds > before_seconds):
+                return None
+            before_seconds = pts_seconds
+            entries += INDEX_ENTRY.pack(number, kind, start)
+        elif kind in (RecordType.INIT, RecordType.INDEX):
+            return None
+        start += RECORD.size + length + CHECKSUM.size
+    return entries if start == end else None

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The payload of a packet's record: which frame it is, when it is presented, and its field blocks."""
+
+import math
+import struct
+from collections.abc import Mapping
+
+from structgstream.codec.container.blocks import blocks_in
+from structgstream.codec.packets import Packet, PacketKind
+from structgstream.errors import StreamError
+from structgstream.scene.state import FieldName
+
+FRAME = struct.Struct("<Id")  # index, presentation time in seconds
+
+
+def packet_with(blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind) -> Packet:
+    """The packet of a frame with these field blocks, in their order."""
+    payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())
+    return Packet(kind, index, pts_seconds, payload, {name: len(block) for name, block in blocks.items()})
+
+
+def packet_of(payload: bytes, kind: PacketKind) -> Packet:
+    """The packet in a key or delta record.
+
+    Raises:
+        StreamError: the payload contradicts the format.
+    """
+    if len(payload) < FRAME.size:
+        raise StreamError("A packet is too short to hold its index and time.")
+    index, pts_seconds = FRAME.unpack_from(payload)
+    if not math.isfinite(pts_seconds):
+        raise StreamError(f"Packet {index} has the presentation time {pts_seconds}, which is no time.")
+    blocks = blocks_in(payload, FRAME.size, where=f"Packet {index}")
+    return Packet(kind, index, pts_seconds, payload, {block.name: block.end - block.start for block in blocks})

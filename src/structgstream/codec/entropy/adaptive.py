@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One description of a packet, two directions (``coder.py``, Note [Two directions]), with adaptive decisions."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.codec.arrays import Bins, Flags, Naturals
+from structgstream.codec.entropy.decisions import code_activity, code_numbers, code_residuals
+from structgstream.codec.entropy.models import (
+    ACTIVITY_CONTEXTS,
+    BLOCK_CONTEXTS,
+    LARGEST_NUMBER,
+    NUMBER_NODES,
+    Arithmetic,
+    Models,
+    residual_contexts,
+)
+from structgstream.errors import StreamError
+from structgstream.scene.state import FieldName
+
+Inputs = Sequence[NDArray[np.integer]]
+"""The contexts ``[n]`` of each input."""
+
+
+class AdaptiveCoder(Protocol):
+    """Encodes or decodes arrays; names tell whose models are used, and before the dot in which field."""
+
+    def activity(self, name: str, active: Flags | None, *, history: NDArray[np.uint8], sizes: Bins) -> Flags:
+        """Which of the rows ``[n]`` are active, given their history and the sizes of their last residuals."""
+        ...
+
+    def residuals(self, name: str, values: Bins | None, *, last: Bins, others: Bins) -> Bins:
+        """Residuals ``[n, c]`` of active rows, given their last ones and sizes ``[n]`` of groups before."""
+        ...
+
+    def flags(self, name: str, values: Flags | None, inputs: Inputs, *, counts: Sequence[int]) -> Flags:
+        """Yes or no ``[n]``, each with contexts below ``counts``, one for each input."""
+        ...
+
+    def numbers(self, name: str, values: Naturals | None, inputs: Inputs, *, counts: Sequence[int]) -> Naturals:
+        """Signed numbers ``[n]`` of 32 bits."""
+        ...
+
+
+class _Adaptive(ABC):
+    """What both directions have in common: arrays that are filled in place."""
+
+    def __init__(self, models: Models, *, where: str) -> None:
+        self._models = models
+        self._where = where
+        self._codes: dict[str, Arithmetic] = {}
+
+    @abstractmethod
+    def _code(self, name: str) -> Arithmetic:
+        """The arithmetic code that a name belongs to."""
+
+    def activity(self, name: str, active: Flags | None, *, history: NDArray[np.uint8], sizes: Bins) -> Flags:
+        values = np.zeros(len(history), np.uint8) if active is None else active.astype(np.uint8)
+        if len(values):
+            blocks = self._models.get(f"{name}.blocks", BLOCK_CONTEXTS, nodes=1)
+            rows = self._models.get(f"{name}.rows", ACTIVITY_CONTEXTS, nodes=1)
+            code_activity(self._code(name), (blocks, rows), history=history, sizes=sizes, active=values)
+            self._looked_at(name, True)
+        return values.astype(np.bool_)
+
+    def residuals(self, name: str, values: Bins | None, *, last: Bins, others: Bins) -> Bins:
+        found = np.zeros_like(last, order="C") if values is None else np.array(values, np.int32, order="C")
+        if found.size:
+            model = self._models.get(name, residual_contexts(found.shape[1]), nodes=NUMBER_NODES)
+            last = np.ascontiguousarray(last)
+            self._looked_at(name, code_residuals(self._code(name), model, last=last, others=others, residuals=found))
+        return found
+
+    def flags(self, name: str, values: Flags | None, inputs: Inputs, *, counts: Sequence[int]) -> Flags:
+        given = None if values is None else values.astype(np.int64)
+        return self._numbers(name, given, inputs, counts=counts, nodes=1).astype(np.bool_)
+
+    def numbers(self, name: str, values: Naturals | None, inputs: Inputs, *, counts: Sequence[int]) -> Naturals:
+        return self._numbers(name, values, inputs, counts=counts, nodes=NUMBER_NODES)
+
+    def _numbers(
+        self, name: str, values: Naturals | None, inputs: Inputs, *, counts: Sequence[int], nodes: int
+    ) -> Naturals:
+        contexts = np.stack(inputs, axis=1).astype(np.int32)
+        found = np.zeros(len(contexts), np.int64) if values is None else values.astype(np.int64)
+        if len(found):
+            model = self._models.get(name, counts, nodes=nodes)
+            sound = code_numbers(self._code(name), model, contexts=contexts, values=found, flags=nodes == 1)
+            self._looked_at(name, sound)
+        return found
+
+    @abstractmethod
+    def _looked_at(self, name: str, sound: bool) -> None:
+        """What is to be done once a name has been coded, and whether its numbers made sense."""
+
+
+class AdaptiveEncoder(_Adaptive):
+    """Writes; what a name says before its dot is the field whose bytes grow."""
+
+    def numbers(self, name: str, values: Naturals | None, inputs: Inputs, *, counts: Sequence[int]) -> Naturals:
+        assert values is not None
+        if len(values) and int(np.abs(values).max()) > LARGEST_NUMBER:
+            raise StreamError("A number is beyond 31 bits; the step it was divided by is too small.")
+        return super().numbers(name, values, inputs, counts=counts)
+
+    def fields(self) -> dict[str, bytes]:
+        """The bytes of each field; the encoder is done."""
+        return {name: code.finished() for name, code in self._codes.items()}
+
+    def _code(self, name: str) -> Arithmetic:
+        return self._codes.setdefault(name.partition(".")[0], Arithmetic(None))
+
+    def _looked_at(self, name: str, sound: bool) -> None:
+        if not sound:
+            raise StreamError(f"{self._where} changes more than {name} can; take a larger step.")
+
+
+class AdaptiveDecoder(_Adaptive):
+    """Reads what :class:`AdaptiveEncoder` wrote into the fields."""
+
+    def __init__(self, models: Models, fields: Mapping[FieldName, bytes | memoryview], *, where: str) -> None:
+        super().__init__(models, where=where)
+        self._codes = {name: Arithmetic(data) for name, data in fields.items()}
+
+    def end(self) -> None:
+        """All bytes must have been taken.
+
+        Raises:
+            StreamError: there are more, or fewer.
+        """
+        for name, code in self._codes.items():
+            if not code.is_whole():
+                raise StreamError(f"{self._where} has {code.size} bytes of {name}, which are not all; it is damaged.")
+
+    def _code(self, name: str) -> Arithmetic:
+        field = name.partition(".")[0]
+        if field not in self._codes:
+            raise StreamError(f"{self._where} holds no {field}, which the header announces; it is damaged.")
+        return self._codes[field]
+
+    def _looked_at(self, name: str, sound: bool) -> None:
+        if not sound:
+            raise StreamError(f"{self._where}, {name}, holds a number out of bounds; it is damaged.")
+        if self._code(name).is_over():
+            raise StreamError(f"{self._where} ends too early in {name.partition('.')[0]}; it is damaged.")

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers as bits, the highest first, and Exp-Golomb codes (docs/entropy.md, section Bits)."""
+
+from collections.abc import Iterable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.errors import StreamError
+
+Whole = TypeVar("Whole", int, NDArray[np.int64])
+
+
+def packed_bits(pieces: Iterable[str]) -> bytes:
+    """Texts of ``0`` and ``1`` one after another as bytes, the last filled with zeros."""
+    text = "".join(pieces)
+    size = -(-len(text) // 8)
+    return int(text.ljust(8 * size, "0") or "0", 2).to_bytes(size, "big")
+
+
+def fixed(value: int, width: int) -> str:
+    """A number in ``width`` bits."""
+    return f"{value:0{width}b}"
+
+
+def golomb(value: int, *, order: int) -> str:
+    """Exp-Golomb: of ``value + 2^order`` the binary digits, after one zero for each beyond ``order + 1``."""
+    digits = f"{value + (1 << order):b}"
+    return "0" * (len(digits) - order - 1) + digits
+
+
+def signed_golomb(value: int, *, order: int) -> str:
+    """Exp-Golomb of 0, -1, 1, -2, 2 ... counted in this order."""
+    return golomb(zigzag(value), order=order)
+
+
+def zigzag(values: Whole) -> Whole:
+    """The places of values of 63 bits in 0, -1, 1, -2, 2 ..."""
+    return values << 1 ^ values >> 63
+
+
+def unzigzag(places: Whole) -> Whole:
+    """The values at these places, see :func:`zigzag`."""
+    return places >> 1 ^ -(places & 1)
+
+
+def bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of binary digits, 0 for 0."""
+    return np.frexp(values.astype(np.float64))[1].astype(np.int64)  # exact below 2^53
+
+
+def numbers_of(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
+    """Numbers int64 ``[n]`` of the widths 0 to 56 ``[n]`` that fill ``data``, but for zeros in the last byte.
+
+    Raises:
+        StreamError: there are fewer bytes or more, or something else behind the last number.
+    """
+    ends = np.cumsum(widths)
+    bits = int(ends[-1]) if len(ends) else 0
+    if len(data) != -(-bits // 8) or (bits % 8 and data[-1] & 0xFF >> bits % 8):
+        raise StreamError(f"{where} has {len(data)} bytes for {bits} bits of numbers; it is damaged.")
+    starts = ends - widths
+    # The eight bytes from the one where a number begins hold all of it.
+    stored = np.frombuffer(bytes(data) + bytes(8), np.uint8)
+    words = np.lib.stride_tricks.sliding_window_view(stored, 8)[starts >> 3]
+    found = np.ascontiguousarray(words).view(">u8")[:, 0].astype(np.uint64) << (starts & 7).astype(np.uint64)
+    return np.where(widths > 0, found >> (64 - np.maximum(widths, 1)).astype(np.uint64), 0).astype(np.int64)
+
+
+class BitReader:
+    """Reads what :func:`packed_bits` wrote.
+
+    Args:
+        data: all bytes; the caller bounds their number.
+        where: subject of error messages.
+    """
+
+    def __init__(self, data: bytes | memoryview, *, where: str) -> None:
+        self._text = f"{int.from_bytes(data, 'big'):0{8 * len(data)}b}" if len(data) else ""
+        self._position = 0
+        self._where = where
+
+    def fixed(self, width: int) -> int:
+        """The next ``width`` bits as a number.
+
+        Raises:
+            StreamError: there are fewer.
+        """
+        end = self._position + width
+        if end > len(self._text):
+            raise StreamError(f"{self._where} ends within a number; it is damaged.")
+        value = int(self._text[self._position : end] or "0", 2)
+        self._position = end
+        return value
+
+    def golomb(self, *, order: int, most_zeros: int) -> int:
+        """An Exp-Golomb code with at most ``most_zeros`` zeros in front.
+
+        Raises:
+            StreamError: it has more, or is cut.
+        """
+        first = self._text.find("1", self._position, self._position + most_zeros + 1)
+        if first < 0:
+            raise StreamError(f"{self._where} holds a number that is cut or out of bounds; it is damaged.")
+        zeros, self._position = first - self._position, first
+        return self.fixed(zeros + order + 1) - (1 << order)
+
+    def signed_golomb(self, *, order: int, most_zeros: int) -> int:
+        """A signed Exp-Golomb code, see :func:`signed_golomb`.
+
+        Raises:
+            StreamError: as :meth:`golomb`.
+        """
+        return unzigzag(self.golomb(order=order, most_zeros=most_zeros))
+
+    def end(self) -> None:
+        """Nothing but the zeros that fill the last byte is left.
+
+        Raises:
+            StreamError: something is.
+        """
+        rest = self._text[self._position :]
+        if len(rest) > 7 or "1" in rest:
+            raise StreamError(f"{self._where} goes on after its last number; it is damaged.")

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections of entropy-coded symbols: framing, bounds, and the choice between C++ and NumPy (docs/entropy.md)."""
+
+import ctypes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.codec.entropy.reference_rans import decode_lanes, encode_lanes
+from structgstream.codec.entropy.tables import COST_BITS, TOTAL, FrequencyTables, code_costs
+from structgstream.errors import OutOfMemoryError, StreamError
+from structgstream.kernels._load import native_library, native_reason
+
+MAX_SYMBOLS = 2**31 - 1
+LANES = (1, 4, 32)
+"""By the code in a section's head."""
+
+_NO_MEMORY = 1
+_LANE_BYTES = 3  # what a lane costs: half of its final state, and half of what is left of the other half
+_MOST_SHARE = 512  # a section spends up to a 512th on its lanes
+
+
+def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables) -> int:
+    """How many lanes the encoder takes: as many as cost less than a 512th of what the symbols will."""
+    used = np.bincount(tables.rows[contexts, symbols], minlength=TOTAL + 1)
+    size_bytes = int(used @ code_costs()) >> COST_BITS + 3
+    return max(lanes for lanes in LANES if (lanes - 1) * _LANE_BYTES * _MOST_SHARE <= size_bytes)
+
+
+def has_native() -> bool:
+    """Whether the native library, and with it this coder, is there."""
+    return native_reason() is None
+
+
+def encode(
+    symbols: NDArray[np.uint8],
+    contexts: NDArray[np.uint16],
+    tables: FrequencyTables,
+    *,
+    lanes: int | None = None,
+    native: bool | None = None,
+) -> bytes:
+    """A section: numbers of symbols, words and lanes; states; words.
+
+    Args:
+        symbols: u8 ``[n]``, each below A and with a frequency of 1 or more in its context.
+        contexts: u16 ``[n]``, each below C.
+        tables: what both sides have.
+        lanes: 1, 4 or 32; None takes what :func:`lanes_for` says.
+        native: C++ or NumPy, which give the same bytes; None takes C++ where it is.
+
+    Raises:
+        StreamError: symbols, contexts and tables do not fit each other.
+    """
+    contexts = _checked_contexts(contexts, tables)
+    symbols = np.ascontiguousarray(symbols, np.uint8)
+    if symbols.shape != contexts.shape:
+        raise StreamError(f"{symbols.shape} symbols cannot be coded with {contexts.shape} contexts; give one for each.")
+    if (symbols >= tables.alphabet).any() or not tables.rows[contexts, symbols].all():
+        raise StreamError("A symbol to encode has no frequency in its context; count it before making the tables.")
+    if lanes is not None and lanes not in LANES:
+        raise StreamError(f"Sections have 1, 4 or 32 lanes, not {lanes}.")
+    if not len(symbols):
+        return _varint(0)
+    lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
+    code = _native_encode if takes_native(native) else encode_lanes
+    states, words = code(symbols, contexts, tables, lanes=lanes)
+    head = _varint(len(symbols)) + _varint(len(words) << 2 | LANES.index(lanes))
+    return head + states.astype("<u4").tobytes() + words.astype("<u2").tobytes()
+
+
+def decode(
+    data: bytes | memoryview,
+    contexts: NDArray[np.uint16],
+    tables: FrequencyTables,
+    *,
+    where: str = "A section of symbols",
+    native: bool | None = None,
+) -> NDArray[np.uint8]:
+    """The symbols u8 ``[n]`` of a section that fills ``data``.
+
+    Args:
+        data: what :func:`encode` gave.
+        contexts: u16 ``[n]``, as in encoding; their number is what the section must state.
+        tables: as in encoding.
+        where: subject of error messages.
+        native: as in :func:`encode`.
+
+    Raises:
+        StreamError: the section is damaged, or has not this number of symbols.
+    """
+    contexts = _checked_contexts(contexts, tables)
+    count, word_count, lanes, start = _head(data, where=where)
+    if count != len(contexts):
+        raise StreamError(f"{where} states {count} symbols, {len(contexts)} are expected; it is damaged.")
+    if start + 4 * lanes + 2 * word_count != len(data):
+        raise StreamError(f"{where} has {len(data)} bytes, but states {word_count} words; it is damaged.")
+    if not lanes:
+        return np.empty(0, np.uint8)
+    states = np.frombuffer(data, "<u4", lanes, start).astype(np.uint32)
+    words = np.frombuffer(data, "<u2", word_count, start + 4 * lanes).astype(np.uint16)
+    code = _native_decode if takes_native(native) else decode_lanes
+    if (symbols := code(words, states, contexts, tables)) is None:
+        raise StreamError(f"{where} is damaged: its words and final states contradict each other.")
+    return symbols
+
+
+def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbols") -> int:
+    """How many bytes the section at the beginning of ``data`` takes; it may be followed by anything.
+
+    Raises:
+        StreamError: the section is longer than the data.
+    """
+    _, word_count, lanes, start = _head(data, where=where)
+    end = start + 4 * lanes + 2 * word_count
+    if end > len(data):
+        raise StreamError(f"{where} states {end} bytes, {len(data)} are left; it is damaged.")
+    return end
+
+
+def _head(data: bytes | memoryview, *, where: str) -> tuple[int, int, int, int]:
+    """Numbers of symbols, words and lanes, and where the states begin."""
+    count, start = _read_varint(data, 0, where=where)
+    if count == 0:
+        return 0, 0, 0, start
+    value, start = _read_varint(data, start, where=where)
+    word_count, lane_code = value >> 2, value & 3
+    # A symbol takes one word at most.
+    if count > MAX_SYMBOLS or word_count > count or lane_code >= len(LANES):
+        raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
+    return count, word_count, LANES[lane_code], start
+
+
+def _varint(value: int) -> bytes:
+    """Seven bits a byte, the lowest first; the high bit says that more follow."""
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _read_varint(data: bytes | memoryview, start: int, *, where: str) -> tuple[int, int]:
+    value = 0
+    for place, byte in enumerate(bytes(data[start : start + 5])):
+        value |= (byte & 0x7F) << 7 * place
+        if byte < 0x80:
+            return value, start + place + 1
+    raise StreamError(f"{where} is cut or damaged in its first bytes.")
+
+
+def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> NDArray[np.uint16]:
+    if contexts.ndim != 1 or len(contexts) > MAX_SYMBOLS or contexts.dtype != np.uint16:
+        raise StreamError(f"Contexts must be uint16 [n], got {contexts.dtype} {contexts.shape}.")
+    if len(contexts) and int(contexts.max()) >= tables.contexts:
+        raise StreamError(f"Context {int(contexts.max())} has no table; there are {tables.contexts}.")
+    return np.ascontiguousarray(contexts)
+
+
+def takes_native(native: bool | None) -> bool:
+    """Whether C++ is to be taken; None takes it where it is.
+
+    Raises:
+        StreamError: it is asked for and not there.
+    """
+    if native and not has_native():
+        raise StreamError("The installed native library has no entropy coder; install structgstream again.")
+    return has_native() if native is None else native
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _native_encode(
+    symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables, *, lanes: int
+) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
+    states, words, word_count = np.empty(lanes, np.uint32), np.empty(len(symbols), np.uint16), ctypes.c_int64()
+    result = native_library().sgs_rans_encode(
+        _pointer(symbols),
+        _pointer(contexts),
+        ctypes.c_int64(len(symbols)),
+        *_table_arguments(tables),
+        ctypes.c_int(lanes),
+        _pointer(states),
+        _pointer(words),
+        ctypes.byref(word_count),
+    )
+    if result == _NO_MEMORY:
+        raise OutOfMemoryError("to encode symbols")
+    if result:
+        raise StreamError("Symbols to encode do not fit their tables.")
+    return states, words[: word_count.value]
+
+
+def _native_decode(
+    words: NDArray[np.uint16], states: NDArray[np.uint32], contexts: NDArray[np.uint16], tables: FrequencyTables
+) -> NDArray[np.uint8] | None:
+    symbols = np.empty(len(contexts), np.uint8)
+    result = native_library().sgs_rans_decode(
+        _pointer(words),
+        ctypes.c_int64(len(words)),
+        _pointer(states),
+        ctypes.c_int(len(states)),
+        _pointer(contexts),
+        ctypes.c_int64(len(contexts)),
+        *_table_arguments(tables),
+        _pointer(symbols),
+    )
+    if result == _NO_MEMORY:
+        raise OutOfMemoryError("to decode symbols")
+    return None if result else symbols
+
+
+def _table_arguments(tables: FrequencyTables) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c_int]:
+    return _pointer(tables.rows), ctypes.c_int64(tables.contexts), ctypes.c_int(tables.alphabet)

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signed residuals as symbols of an alphabet of 16, and the rare large ones beside them (docs/entropy.md)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.codec.entropy.bits import BitReader, fixed, golomb, packed_bits, unzigzag, zigzag
+from structgstream.errors import StreamError
+
+ALPHABET = 16
+LARGEST = 7
+ESCAPE = 15
+_ORDER = 2
+_MOST_ZEROS = 28
+
+
+def symbols_of(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
+    """Symbols u8 ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others' values.
+
+    Args:
+        residuals: integers ``[n]`` that int32 can hold.
+
+    Raises:
+        StreamError: one is out of int32's range.
+    """
+    values = residuals.astype(np.int64)
+    if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
+        raise StreamError("A residual is beyond 32 bits; the step it was divided by is too small.")
+    size = np.abs(values)
+    symbols = np.where(size > LARGEST, ESCAPE, zigzag(values)).astype(np.uint8)
+    large = values[size > LARGEST].tolist()
+    return symbols, packed_bits(golomb(abs(v) - LARGEST - 1, order=_ORDER) + fixed(v < 0, 1) for v in large)
+
+
+def residuals_of(
+    symbols: NDArray[np.uint8], escapes: bytes | memoryview, *, where: str = "A section of escapes"
+) -> NDArray[np.int32]:
+    """Residuals int32 ``[n]`` from what :func:`symbols_of` gave.
+
+    Raises:
+        StreamError: a symbol is above 15, the section has more or fewer values than there are escapes, or a value is
+            beyond 32 bits.
+    """
+    if (symbols > ESCAPE).any():
+        raise StreamError(f"{where} belongs to symbols above {ESCAPE}; they are damaged.")
+    values = unzigzag(symbols.astype(np.int64))
+    places = np.flatnonzero(symbols == ESCAPE)
+    # An escape takes 4 bits at least and 61 at most.
+    if not 4 * len(places) <= 8 * len(escapes) <= 61 * len(places) + 7:
+        raise StreamError(f"{where} has {len(escapes)} bytes for {len(places)} values; it is damaged.")
+    reader = BitReader(escapes, where=where)
+    for place in places:
+        magnitude = reader.golomb(order=_ORDER, most_zeros=_MOST_ZEROS) + LARGEST + 1
+        negative = reader.fixed(1)
+        if magnitude > 2**31 - 1 + negative:
+            raise StreamError(f"{where} holds a value beyond 32 bits; it is damaged.")
+        values[place] = -magnitude if negative else magnitude
+    reader.end()
+    return values.astype(np.int32)

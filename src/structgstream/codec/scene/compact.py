@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact).
+
+A key packet follows the header's reference state instead, with models that have seen nothing: it stands alone, and so
+does the group of packets up to the next one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from structgstream.codec.arrays import Bins
+from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
+from structgstream.codec.entropy.models import Models
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene.bins import (
+    ANCHOR_ROWS,
+    FREE_STEPS,
+    LARGEST,
+    WEIGHTS,
+    SceneBins,
+    anchor_columns,
+    anchor_fields,
+    binned,
+    valued,
+)
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.free_rows import coded_free
+from structgstream.codec.scene.rows import coded_change
+from structgstream.errors import StreamError
+from structgstream.scene.state import FieldName
+
+CODABLE: frozenset[FieldName] = frozenset({*ANCHOR_ROWS, *WEIGHTS, "free", "free_births"})
+"""Fields that may be dynamic."""
+
+
+def coded_scene(
+    coder: AdaptiveCoder,
+    after: SceneBins | None,
+    before: SceneBins,
+    *,
+    fields: Sequence[FieldName],
+    has_free: bool,
+    where: str,
+) -> SceneBins:
+    """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
+
+    Raises:
+        StreamError: what is decoded contradicts itself.
+    """
+    groups = anchor_columns(fields, before.anchors.shape[1])
+    given = None if after is None else Change.of(after.anchors - before.anchors)
+    change = coded_change(coder, given, before.change, groups=groups)
+    anchors = before.anchors + change.residuals
+    weights: dict[FieldName, Bins] = {}
+    changes: dict[FieldName, Change] = {}
+    for name, bins in before.weights.items():
+        given = None if after is None else Change.of(after.weights[name] - bins)
+        changes[name] = coded_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
+        weights[name] = bins + changes[name].residuals
+    free = before.free
+    if has_free:
+        free = coded_free(coder, None if after is None else after.free, before.free, where=where)
+    for found in (anchors, *weights.values(), free.bins):
+        if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
+            raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
+    return SceneBins(anchors, change, weights, changes, free)
+
+
+@dataclass(frozen=True)
+class CompactState:
+    """What both sides know after a packet."""
+
+    index: int
+    bins: SceneBins
+    models: Models
+
+
+class _Compact:
+    """What encoder and decoder have in common: where a packet starts from.
+
+    Raises:
+        StreamError: the header has another codec, dynamic fields that cannot be coded, or no step or reference for one.
+    """
+
+    def __init__(self, header: StreamHeader) -> None:
+        if header.codec != "compact":
+            raise StreamError(
+                f"The stream is coded with {header.codec!r}; this version knows 'raw' and 'compact'. "
+                "Install a newer structgstream."
+            )
+        if beyond := header.dynamic - CODABLE:
+            raise StreamError(f"The compact codec has no coding for {', '.join(sorted(beyond))}; keep it static.")
+        if ("free" in header.dynamic) != ("free_births" in header.dynamic):
+            raise StreamError("The header announces free Gaussians without their births, or births without them.")
+        rows = header.dynamic - {"free", "free_births"}
+        needed = {*rows, *(FREE_STEPS if "free" in header.dynamic else ())}
+        if missing := needed - header.steps.keys():
+            raise StreamError(f"The header states no step for {', '.join(sorted(missing))}.")
+        if header.reference.keys() != rows:
+            raise StreamError("The header's reference state does not hold the dynamic fields of anchors and MLPs.")
+        self._header = header
+        known: dict[FieldName, Tensor] = {**header.static, **header.reference}
+        # What is not dynamic is not looked at; free Gaussians begin as none.
+        self._reference = binned(known, rows, header.steps)
+        self.state: CompactState | None = None
+
+    def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Models]:
+        if kind is PacketKind.KEY:
+            return self._reference, Models()
+        if self.state is None or self.state.index != index - 1:
+            raise StreamError(f"Packet {index} needs packet {index - 1}, which was not decoded before it.")
+        return self.state.bins, Models(self.state.models)
+
+    def _coded(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
+        return coded_scene(
+            coder,
+            after,
+            before,
+            fields=anchor_fields(self._header.dynamic),
+            has_free="free" in self._header.dynamic,
+            where=f"Packet {index}",
+        )
+
+    def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
+        # What a key packet changes is everything since the reference, and tells nothing of what comes next.
+        self.state = CompactState(index, bins.unmoved() if kind is PacketKind.KEY else bins, models)
+
+
+class CompactEncoder(_Compact):
+    """Encodes the frames of one stream, in order."""
+
+    def follow(self, state: CompactState | None) -> None:
+        """Go on from what a decoder knows."""
+        self.state = state
+
+    def encode(self, state: Mapping[FieldName, Tensor], *, kind: PacketKind, index: int) -> dict[FieldName, bytes]:
+        """The bytes of each dynamic field.
+
+        Raises:
+            StreamError: a value is out of range, or a delta packet does not follow the packet before it.
+        """
+        before, models = self._start(kind, index)
+        after = binned(state, self._header.dynamic, self._header.steps)
+        if after.anchors.shape != before.anchors.shape:
+            raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
+        for name, bins in after.weights.items():
+            if bins.shape != before.weights[name].shape:
+                raise StreamError(f"Frame {index} has {name} of another size than the header.")
+        encoder = AdaptiveEncoder(models, where=f"Frame {index}")
+        self._keep(kind, index, self._coded(encoder, after, before, index), models)
+        fields = encoder.fields()
+        return {name: fields.get(name, b"") for name in self._header.dynamic}
+
+
+class CompactDecoder(_Compact):
+    """Decodes the frames of one stream, in order, beginning at any key packet."""
+
+    def decode(
+        self, fields: Mapping[FieldName, bytes | memoryview], *, kind: PacketKind, index: int
+    ) -> dict[FieldName, Tensor]:
+        """The dynamic fields of a frame.
+
+        Raises:
+            StreamError: the packet is damaged, or does not follow the one before it.
+        """
+        before, models = self._start(kind, index)
+        decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
+        bins = self._coded(decoder, None, before, index)
+        decoder.end()
+        self._keep(kind, index, bins, models)
+        return valued(bins, self._header.dynamic, self._header.steps)

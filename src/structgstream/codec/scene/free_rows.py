@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Free Gaussians from frame to frame: some die, some change, some are born (docs/bitstream.md, section Free 3DGs)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.codec.arrays import Bins, Flags
+from structgstream.codec.entropy.adaptive import AdaptiveCoder
+from structgstream.codec.entropy.bits import bit_lengths
+from structgstream.codec.scene.bins import FreeBins
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.rows import coded_change
+from structgstream.errors import StreamError
+from structgstream.scene.state import FREE_COLUMNS
+
+GROUPS = (
+    ("free.means", 0, 3),
+    ("free.log_scales", 3, 6),
+    ("free.quats", 6, 10),
+    ("free.logit_opacities", 10, 11),
+    ("free.colors", 11, 14),
+)
+MOST_FREE = 2**18
+"""Free Gaussians that a scene may have: a symbol can take less than a bit, so bytes do not bound their number."""
+_MEANS = range(6, 11)  # quaternions and opacities
+_LED = (12, 13)  # green and blue
+_FRAME_BITS = 32  # a birth is frame * 2^32 + number
+
+
+def coded_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
+    """Codes what becomes of ``before``; of ``after``, births and bins are looked at.
+
+    Raises:
+        StreamError: births do not ascend or are out of range, or there are too many.
+    """
+    alive = None if after is None else np.isin(before.births, after.births)
+    alive = coder.flags("free_births.alive", alive, [before.change.history], counts=[8])
+    old = FreeBins(
+        before.births[alive],
+        before.bins[alive],
+        before.change.select(alive),
+    )
+    change = None
+    new: FreeBins | None = None
+    if after is not None:
+        kept = np.isin(after.births, before.births)
+        change = Change.of(after.bins[kept] - old.bins)
+        new = FreeBins(after.births[~kept], after.bins[~kept], Change.none(0, FREE_COLUMNS))
+    change = coded_change(coder, change, old.change, groups=GROUPS)
+    kept_bins = old.bins + change.residuals
+    born = _coded_births(coder, new, kept_bins, where=where)
+    births = np.concatenate([old.births, born.births])
+    if not (np.diff(births) > 0).all():
+        raise StreamError(f"{where} has births that do not ascend; it is damaged.")
+    return FreeBins(
+        births,
+        np.concatenate([kept_bins, born.bins]),
+        change.grown(len(born.births)),
+    )
+
+
+def _coded_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
+    """What is born, given the bins of what is alive."""
+    given = None if new is None else np.array([len(new.births)])
+    count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
+    if not 0 <= count <= MOST_FREE - len(alive):
+        raise StreamError(
+            f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}, or fewer than none."
+        )
+    if not count:
+        return FreeBins.none()
+    nothing = np.zeros(count, np.int32)
+    frames = numbers = None
+    if new is not None:
+        if int(new.births.min()) < 0:
+            raise StreamError(f"{where} has births below 0.")
+        frames = np.diff(new.births >> _FRAME_BITS, prepend=0)
+        numbers = np.diff(new.births & (1 << _FRAME_BITS) - 1, prepend=0)
+        numbers = np.where(frames != 0, new.births & (1 << _FRAME_BITS) - 1, numbers)
+    frames = coder.numbers("free_births.frame", frames, [nothing], counts=[1])
+    fresh = frames != 0
+    numbers = coder.numbers("free_births.number", numbers, [fresh], counts=[2])
+    frame, number = np.cumsum(frames), _restarted_sums(numbers, fresh)
+    if not (0 <= int(frame.min()) <= int(frame.max()) < 1 << 31 and int(number.min()) >= 0):
+        raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
+    if int(number.max()) >= 1 << _FRAME_BITS:
+        raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
+    births = (frame << _FRAME_BITS) + number
+    bins = _coded_born(coder, None if new is None else new.bins, alive, count=count, where=where)
+    return FreeBins(births, bins, Change.none(count, FREE_COLUMNS))
+
+
+def _coded_born(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
+    """The bins ``[count, 14]`` of what is born, column by column.
+
+    Most are like those of the row before, the last of what is alive before the first. What hardly differs between free
+    Gaussians is told as the difference from the mean of what is alive, and green and blue change as the colour before.
+    """
+    start = alive[-1].astype(np.int64) if len(alive) else np.zeros(FREE_COLUMNS, np.int64)
+    found = np.zeros((count, FREE_COLUMNS), np.int64)
+    one, two = np.zeros((2, count), np.int64)  # errors in the columns before
+    for column in range(FREE_COLUMNS):
+        has_mean = column in _MEANS
+        mean = int(alive[:, column].sum(dtype=np.int64)) // len(alive) if has_mean and len(alive) else 0
+        led = np.diff(found[:, column - 1], prepend=start[column - 1]) if column in _LED else 0
+        errors = None
+        if new is not None:
+            true = new[:, column].astype(np.int64)
+            errors = true - mean if has_mean else np.diff(true, prepend=start[column]) - led
+        length, before = _length(one), _length(two)
+        errors = coder.numbers(
+            "free.born",
+            errors,
+            [
+                np.full(count, column),
+                (column * 13 + length) * 3 + np.sign(one) + 1,
+                column * 13 + np.minimum(length + before, 12),
+            ],
+            counts=[FREE_COLUMNS, FREE_COLUMNS * 39, FREE_COLUMNS * 13],
+        )
+        found[:, column] = errors + mean if has_mean else np.cumsum(errors + led) + start[column]
+        if not -(2**31) <= int(found[:, column].min()) <= int(found[:, column].max()) < 2**31:
+            raise StreamError(f"{where} has a bin beyond 32 bits; it is damaged.")
+        one, two = errors, one
+    return found.astype(np.int32)
+
+
+def _length(errors: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.minimum(bit_lengths(np.abs(errors)), 12)
+
+
+def _restarted_sums(steps: NDArray[np.int64], fresh: Flags) -> NDArray[np.int64]:
+    """Running sums that begin again at every fresh row; the first row is where the first begins."""
+    total = np.cumsum(steps)
+    starts = np.flatnonzero(fresh | (np.arange(len(steps)) == 0))
+    group = np.searchsorted(starts, np.arange(len(steps)), side="right") - 1
+    base = total[starts] - steps[starts]
+    return total - base[group]

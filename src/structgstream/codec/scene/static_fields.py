@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The init record's fields as bins, entropy coded (docs/bitstream.md, section Coded init fields).
+
+Note [Shifts]
+~~~~~~~~~~~~~
+What an anchor's numbers are worth differs by powers of ten: most are behind others, far away or nearly transparent.
+So a row's bins may all be multiples of a power of two, the row's shift, which is coded first: one step a field, and
+coarse rows where that does not show. A decoder needs no more for it than a shift to the left.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Set
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from structgstream.codec.arrays import Bins, Contexts, Naturals
+from structgstream.codec.entropy.bits import bit_lengths, unzigzag, zigzag
+from structgstream.codec.entropy.coder import Coder, Decoder, Encoder, Tables
+from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMBOL
+from structgstream.codec.scene.bins import LARGEST, nearest_bins, values_of
+from structgstream.errors import StreamError
+from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
+from structgstream.scene.state import STATE_TABLE, FieldName
+
+MOST_ANCHORS = 2**22
+MOST_WEIGHTS = 2**20
+FREE_NUMBERS, NUMBERS_A_BYTE = 2**20, 64
+"""Numbers that the coded fields may have together, whatever their bytes, and how many more with each byte: a symbol can
+take next to nothing, so a few bytes could stand for gigabytes. What is fitted has 5 to 9 numbers a byte."""
+MOST_COLUMNS: Mapping[FieldName, int] = {
+    "offset_scales": 3,
+    "base_scales": 3,
+    "anchor_offsets": 3 * 64,
+    "anchor_features": 256,
+    "appearance": 256,
+}
+AS_THEY_ARE: frozenset[FieldName] = frozenset({"free", "free_births", "camera_color"})
+"""Fields that the init record holds as numbers with either codec."""
+SHIFTS = 8
+_SIZES = 5  # classes of what the two columns before hold: 0, 1, 2 to 3, 4 to 7, 8 and more
+_HALF = 30  # bits of a key's lower part
+_WHERE = "The init record"
+
+
+class _Budget:
+    """How many numbers are still allowed."""
+
+    def __init__(self, left: int) -> None:
+        self._left = left
+
+    def take(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            raise StreamError(f"{_WHERE} has more than {NUMBERS_A_BYTE} numbers a byte; it is damaged.")
+
+
+def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
+    return FREE_NUMBERS + NUMBERS_A_BYTE * sum(map(len, coded))
+
+
+def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
+    """The bytes of every field that is coded.
+
+    Args:
+        fields: of the init record, by name.
+        steps: of those that are coded.
+
+    Raises:
+        StreamError: there is no step for one, a value is not that of a bin, or there are more numbers than allowed,
+            also for the bytes that they take.
+    """
+    bins: dict[FieldName, Bins] = {}
+    for name in _coded_names(fields.keys()):
+        if name not in steps:
+            raise StreamError(f"The header states no step for {name} in the init record.")
+        found = nearest_bins(fields[name], steps[name])
+        if values_of(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
+            raise StreamError(f"The header's {name} are no multiples of their step {steps[name]:g}; round them first.")
+        bins[name] = found
+    encoder = Encoder(Tables())
+    numbers = sum(found.size for found in bins.values())
+    _coded(encoder, bins, bins.keys(), _Budget(numbers))
+    if numbers > (most := _most_numbers(encoder.fields.values())):
+        raise StreamError(
+            f"The header has {numbers} numbers that cost nothing; at most {most} are allowed. Take smaller steps."
+        )
+    return {name: encoder.fields[name] for name in bins}
+
+
+def decoded_fields(
+    coded: Mapping[FieldName, bytes | memoryview], steps: Mapping[FieldName, float]
+) -> dict[FieldName, Tensor]:
+    """The fields that :func:`encoded_fields` wrote.
+
+    Raises:
+        StreamError: the bytes are damaged, or there is no step or no coding for a field.
+    """
+    names = _coded_names(coded.keys())
+    if len(names) < len(coded):
+        raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & AS_THEY_ARE))} coded; it has no coding.")
+    if missing := [name for name in names if name not in steps]:
+        raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
+    decoder = Decoder(Tables(), coded, where=_WHERE)
+    bins = _coded(decoder, None, coded.keys(), _Budget(_most_numbers(coded.values())))
+    decoder.end()
+    return {name: values_of(found, steps[name]) for name, found in bins.items()}
+
+
+def _coded_names(names: Set[FieldName]) -> list[FieldName]:
+    return [row.name for row in STATE_TABLE if row.name in names and row.name not in AS_THEY_ARE]
+
+
+def _coded(
+    coder: Coder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], budget: _Budget
+) -> dict[FieldName, Bins]:
+    """Codes the fields ``names``, the anchors' one after another and then the others."""
+    given: Mapping[FieldName, Bins] = bins or {}
+    found: dict[FieldName, Bins] = {}
+    positions = _coded_positions(coder, given.get("anchor_positions"), budget)
+    found["anchor_positions"] = positions
+    shifts = np.zeros(len(positions), np.int32)
+    for name, most in MOST_COLUMNS.items():
+        if name in names:
+            shape = (len(positions), math.prod(given[name].shape[1:])) if name in given else None
+            rows = None if shape is None else given[name].reshape(shape)
+            found[name], shifts = _coded_rows(coder, name, rows, shifts, most=most, budget=budget)
+    for name in _coded_names(names - found.keys()):
+        found[name] = _coded_numbers(coder, name, given[name].ravel() if name in given else None, budget)
+    return _shaped(found)
+
+
+def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
+    """Rows of three an offset and a coefficient of the environment, and of the features' width in the basis."""
+    shapes: dict[FieldName, tuple[int, int, int] | tuple[int, int]] = {}
+    if (offsets := found.get("anchor_offsets")) is not None:
+        shapes["anchor_offsets"] = (len(offsets), offsets.shape[1] // 3, 3)
+    features, appearance = found.get("anchor_features"), found.get("appearance")
+    if "appearance_basis" in found:
+        if features is None or appearance is None:
+            raise StreamError(f"{_WHERE} holds directions of an appearance without the appearance.")
+        shapes["appearance_basis"] = (appearance.shape[1], features.shape[1])
+    if (coefficients := found.get("environment")) is not None:
+        shapes["environment"] = (coefficients.size // 3, 3)
+    for name, shape in shapes.items():
+        if found[name].size != math.prod(shape):
+            raise StreamError(f"{_WHERE} holds {found[name].size} numbers of {name}, which do not fit {shape}.")
+        found[name] = found[name].reshape(shape)
+    return found
+
+
+def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
+    """Cells by how far each is from the one before along a Z-order curve.
+
+    Note that rows need not be in this order; if they are not, signs are told too.
+    """
+    given = None if bins is None else len(bins)
+    count = _bounded(coder.number("anchor_positions.rows", given), MOST_ANCHORS, "anchors")
+    budget.take(3 * count)
+    if not count:
+        return np.zeros((0, 3), np.int32)
+    lowest = None if bins is None else bins.min(0)
+    origin = np.array(
+        [_coded_signed(coder, "anchor_positions.origin", None if lowest is None else lowest[axis]) for axis in range(3)]
+    )
+    steps: Naturals | None = None
+    if bins is not None:
+        cells = bins.astype(np.int64) - origin
+        if int(cells.max()) >= 1 << CELL_BITS:
+            raise StreamError(f"Anchors are {int(cells.max())} steps apart, at most 2^{CELL_BITS}; take a larger step.")
+        steps = np.diff(morton_keys(torch.from_numpy(cells)).numpy(), prepend=0)
+    descends = coder.number("anchor_positions.descends", None if steps is None else int((steps < 0).any()))
+    if steps is not None and descends:
+        steps = zigzag(steps)
+    far = coder.naturals(
+        "anchor_positions.far", None if steps is None else steps >> _HALF, np.zeros(count, np.uint16), count=1
+    )
+    near = coder.naturals(
+        "anchor_positions.near",
+        None if steps is None else steps & (1 << _HALF) - 1,
+        (far > 0).astype(np.uint16),
+        count=2,
+    )
+    if int(near.max()) >= 1 << _HALF:
+        raise StreamError(f"{_WHERE} holds a position beyond {3 * CELL_BITS} bits; it is damaged.")
+    steps = (far << _HALF) + near
+    if descends:
+        steps = unzigzag(steps)
+    # The sums of both halves stay below 2^53, however damaged.
+    low = np.cumsum(steps & (1 << _HALF) - 1)
+    high = np.cumsum(steps >> _HALF) + (low >> _HALF)
+    if not 0 <= int(high.min()) <= int(high.max()) < 1 << 3 * CELL_BITS - _HALF:
+        raise StreamError(f"{_WHERE} holds a position beyond {3 * CELL_BITS} bits; it is damaged.")
+    keys = (high << _HALF) + (low & (1 << _HALF) - 1)
+    return _checked(morton_cells(torch.from_numpy(keys)).numpy() + origin)
+
+
+def _coded_rows(
+    coder: Coder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, most: int, budget: _Budget
+) -> tuple[Bins, NDArray[np.int32]]:
+    """Rows ``[n, C]``, column by column, and their shifts, which are like those of another field."""
+    given = None if bins is None else bins.shape[1]
+    columns = _bounded(coder.number(f"{name}.columns", given), most, f"columns of {name}")
+    budget.take(columns * len(like))
+    shifts = None if bins is None else _common_shifts(bins, like)
+    shifts = coder.residuals(f"{name}.shift", shifts, like.astype(np.uint16), count=SHIFTS)
+    if len(shifts) and not 0 <= int(shifts.min()) <= int(shifts.max()) < SHIFTS:
+        raise StreamError(f"{_WHERE} holds a shift of {name} beyond {SHIFTS - 1}; it is damaged.")
+    found = np.zeros((len(like), columns), np.int32)
+    last = before = np.zeros(len(like), np.int64)
+    for column in range(columns):
+        middle = None if bins is None or not len(bins) else int(np.median(bins[:, column]))
+        middle = _coded_signed(coder, f"{name}.middle", 0 if bins is not None and middle is None else middle)
+        middles = middle + (1 << shifts >> 1) >> shifts
+        values = None if bins is None else (bins[:, column] >> shifts) - middles
+        contexts = shifts * _SIZES + np.minimum(bit_lengths(last + before), _SIZES - 1)
+        values = _coded_values(coder, name, values, contexts.astype(np.uint16))
+        last, before = np.abs(values), last
+        found[:, column] = _checked(values + middles << shifts)
+    return found, shifts
+
+
+def _coded_values(coder: Coder, name: FieldName, values: Naturals | None, contexts: Contexts) -> Naturals:
+    """Signed numbers ``[n]``: those up to 6 as they are, 7 for all above, and what these have more than 7."""
+    clipped = None if values is None else np.clip(values, -LARGEST_SYMBOL, LARGEST_SYMBOL).astype(np.int32)
+    found = coder.residuals(f"{name}.value", clipped, contexts, count=SHIFTS * _SIZES).astype(np.int64)
+    if len(found) and int(np.abs(found).max()) > LARGEST_SYMBOL:
+        raise StreamError(f"{_WHERE} holds {name} beyond {LARGEST_SYMBOL} where the rest follows; it is damaged.")
+    large = np.flatnonzero(np.abs(found) == LARGEST_SYMBOL)
+    more = None if values is None else np.abs(values[large]).astype(np.int64) - LARGEST_SYMBOL
+    more = coder.naturals(f"{name}.more", more, np.zeros(len(large), np.uint16), count=1)
+    found[large] += np.sign(found[large]) * more
+    return found
+
+
+def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The largest power of two that divides each row; what a row of zeros has does not matter."""
+    together = np.bitwise_or.reduce(bins, axis=1) if bins.shape[1] else np.zeros(len(bins), np.int32)
+    lowest = together & -together
+    shifts = np.minimum(bit_lengths(lowest.astype(np.int64)) - 1, SHIFTS - 1)
+    return np.where(together == 0, like, shifts).astype(np.int32)
+
+
+def _coded_numbers(coder: Coder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
+    """Numbers ``[n]`` of any size."""
+    count = _bounded(
+        coder.number(f"{name}.count", None if bins is None else len(bins)), MOST_WEIGHTS, f"numbers of {name}"
+    )
+    budget.take(count)
+    values = None if bins is None else zigzag(bins.astype(np.int64))
+    values = coder.naturals(f"{name}.value", values, np.zeros(count, np.uint16), count=1)
+    return _checked(unzigzag(values))
+
+
+def _coded_signed(coder: Coder, name: str, value: int | None) -> int:
+    found = coder.number(name, None if value is None else zigzag(int(value)))
+    return int(_checked(np.array([unzigzag(found)]))[0])
+
+
+def _bounded(number: int, most: int, what: str) -> int:
+    if number > most:
+        raise StreamError(f"{_WHERE} has {number} {what}; at most {most} are allowed.")
+    return number
+
+
+def _checked(bins: Naturals) -> Bins:
+    if bins.size and not -LARGEST <= int(bins.min()) <= int(bins.max()) <= LARGEST:
+        raise StreamError(f"{_WHERE} has a bin beyond 22 bits, which no value stands for; it is damaged.")
+    return bins.astype(np.int32)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream ablate``."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.options import Folder, parsed_with_rest, resolved_config
+from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, swept
+
+if TYPE_CHECKING:
+    from structgstream_studies.experiments.tasks import Variation
+
+TableName = Literal["structured", "free", "patching", "distance", "readings", "effects", "rates"]
+
+
+@dataclass(frozen=True)
+class Ablate(ExperimentOptions):
+    """Runs the paper's ablations on a capture, and prints ours beside the paper's figures; or what each part of the
+    compact stream is worth (effects), and its quality against its bytes (rates).
+
+    Variants of one seed begin with the same frame 0. FOLDER gets TABLE.md, TABLE-curves.png and TABLE-detail.png for
+    each table (and rates.png), results/ with everything that was measured as JSON, and streams/. Ctrl-C, or a crash,
+    loses no frame: the same command goes on.
+
+    Example: structgstream ablate basketball --table free -o ablations --frames 20
+
+    Example: structgstream ablate basketball --table effects rates -o compact --frames 20 --held-out 0 10 15 30
+
+    Example: structgstream ablate basketball -o ablations --preset fast --scale 0.5 --online.iterations 60
+    """
+
+    scene: tyro.conf.Positional[Folder] = tyro.MISSING
+    """The capture."""
+    table: Annotated[tuple[TableName, ...], tyro.conf.arg(metavar="TABLE [TABLE ...]", help_behavior_hint="")] = (
+        "structured",
+        "free",
+        "patching",
+        "distance",
+    )
+    """structured (what is trained online), free (generation and pruning), patching (inherited or independent),
+    distance (the regularisation of frame 0); readings (what the paper leaves open); effects (of the switches of the
+    compact stream); rates (the compact stream at five qualities). Default: the first four."""
+    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """The full method, of which the variants are edits. Default: rig, and compact for effects and rates."""
+
+
+def main(arguments: list[str]) -> None:
+    """Runs, prints, draws."""
+    options, rest = parsed_with_rest(Ablate, "ablate", arguments=arguments)
+    from structgstream.presets import DEFAULT_PRESET, PAPER_MODE
+
+    full, _ = resolved_config(options.preset or PAPER_MODE, rest, command="ablate", seed=None)
+    compact, _ = resolved_config(options.preset or DEFAULT_PRESET, rest, command="ablate", seed=None)
+    paper, _ = resolved_config(PAPER_MODE, rest, command="ablate", seed=None)
+    capture, frames = capture_part(options.scene, options)
+    from structgstream.kernels.backend import select_backend
+    from structgstream_studies.experiments.studies import COMPACT_TABLES, ablation_runs, needed, write_ablation
+
+    runs: list[Variation] = []
+    of_compact = [name for name in options.table if name in COMPACT_TABLES]
+    others = [name for name in options.table if name not in COMPACT_TABLES]
+    for tables, config in ((others, full), (of_compact, compact)):
+        runs += ablation_runs(
+            tables, config, capture, frames=frames, seeds=options.seeds, folder=options.output, paper=paper
+        )
+    swept(needed(runs), options)
+    console = Console()
+    for table in options.table:
+        for sheet in write_ablation(options.output, table, runs, backend=select_backend(options.device)):
+            print_sheet(sheet, console)
+    console.print(f"Tables and pictures: {options.output}", highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream compare``."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.app import UsageError
+from structgstream.cli.options import Folder, parsed
+from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, swept
+
+
+@dataclass(frozen=True)
+class Compare(ExperimentOptions):
+    """Runs several methods on one capture and scores the files that they write, by the same evaluator.
+
+    FOLDER gets methods.md, methods.png (quality against bytes and seconds) and methods-detail.png, results/ with
+    everything that was measured as JSON, and streams/. The same command goes on after an interruption.
+
+    Example: structgstream compare basketball -o methods --frames 20 --methods rig held 3dgstream
+    """
+
+    scene: tyro.conf.Positional[Folder] = tyro.MISSING
+    """The capture."""
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD [METHOD ...]", help_behavior_hint="")] = (
+        "rig",
+        "held",
+        "3dgstream",
+        "scaffold-gs",
+        "3dgs",
+    )
+    """Presets of ours (rig, motion, fast, ...), held (frame 0 for ever), 3dgstream (cache of transformations for each
+    frame and additions), and scaffold-gs and 3dgs (every frame from scratch)."""
+    scratch_every: int = 5
+    """Methods that fit every frame from scratch do so for every so many-th frame, which takes hours enough."""
+
+
+def main(arguments: list[str]) -> None:
+    """Runs, prints, draws."""
+    options = parsed(Compare, "compare", arguments=arguments)
+    if options.scratch_every < 1:
+        raise UsageError(f"--scratch-every counts frames, from 1; got {options.scratch_every}.")
+    capture, frames = capture_part(options.scene, options)
+    from structgstream.kernels.backend import select_backend
+    from structgstream_studies.experiments.studies import comparison_runs, needed, write_methods
+
+    runs = comparison_runs(
+        options.methods,
+        capture,
+        frames=frames,
+        alone_every=options.scratch_every,
+        seeds=options.seeds,
+        folder=options.output,
+    )
+    swept(needed(runs), options)
+    console = Console()
+    print_sheet(write_methods(options.output, runs, backend=select_backend(options.device)), console)
+    console.print(f"Table and pictures: {options.output}", highlight=False, markup=False, soft_wrap=True)

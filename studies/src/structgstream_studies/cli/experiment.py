@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``ablate`` and ``compare`` share: a sweep with a display, and its tables."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from structgstream.cli.app import Interrupted, UsageError
+from structgstream.cli.options import CaptureOptions, Device, Folder
+from structgstream.cli.tables import columns, plain
+from structgstream.errors import ExperimentError
+
+if TYPE_CHECKING:
+    from structgstream_studies.experiments.captures import CapturePart
+    from structgstream_studies.experiments.sheets import Sheet
+    from structgstream_studies.experiments.sweep import Progress
+    from structgstream_studies.experiments.worker import Task
+
+NARROW = 4  # columns of scores that fit on a terminal of 80 characters beside the names
+
+
+@dataclass(frozen=True)
+class ExperimentOptions:
+    """Options of every experiment."""
+
+    output: Annotated[Path, tyro.conf.arg(metavar="FOLDER", aliases=["-o"])]
+    """Where streams, results, tables and pictures go. What is done there is not done again."""
+    seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N ...]", help_behavior_hint="")] = (0, 1, 2)
+    """Seeds of frame 0 and of all that follows; every result is given with its spread over them."""
+    jobs: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """How many runs at a time, each on its share of the cores. Default: one for each core, or one for each GPU."""
+    device: Device = "auto"
+    """What computes."""
+    scored: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
+        None
+    )
+    """Held-out cameras that count, so that choices are made by some and reported by others. Default: all of them."""
+    capture: CaptureOptions = field(default_factory=CaptureOptions)
+
+
+def capture_part(scene: Folder, asked: ExperimentOptions) -> tuple["CapturePart", int]:
+    """The part of the capture that the options name, and its number of frames.
+
+    Raises:
+        CaptureError: it is not there.
+        UsageError: it holds out no camera, so that nothing could be scored.
+    """
+    from structgstream_studies.experiments.captures import CapturePart
+
+    options = asked.capture
+    part = CapturePart(
+        folder=scene,
+        held_out=options.held_out,
+        scale=options.scale,
+        start=options.start,
+        frames=options.frames,
+        near=options.near,
+        scored=asked.scored,
+    )
+    source = part.open()
+    if not source.rig.testing:
+        raise UsageError(f"{source.name} holds out no camera to score; name one with --held-out.")
+    if unknown := [name for name in asked.scored or () if name not in source.rig.testing]:
+        raise UsageError(f"camera {unknown[0]!r} is not held out; held out are {', '.join(source.rig.testing)}.")
+    return part, len(source)
+
+
+def swept(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
+    """Does what is not done, and says what fails and how to go on.
+
+    Raises:
+        ExperimentError: tasks failed; the others are done.
+        Interrupted: the user pressed Ctrl-C.
+    """
+    from structgstream_studies.experiments.sweep import seats_for, sweep
+
+    seats, logs = seats_for(options.device, jobs=options.jobs), options.output / "logs"
+    console = Console()
+    view = Display(console)
+    try:
+        with view:
+            outcome = sweep(tasks, seats, logs=logs, listener=view.show)
+    except KeyboardInterrupt:
+        raise Interrupted("Whole frames are stored; go on with the same command.") from None
+    if outcome.skipped:
+        console.print(f"{len(outcome.skipped)} of {len(tasks)} steps were done already.", highlight=False)
+    if outcome.failed:
+        names = ", ".join(outcome.failed)
+        waiting = f", and {len(outcome.blocked)} that needed them were not begun" if outcome.blocked else ""
+        raise ExperimentError(
+            f"{len(outcome.failed)} of {len(tasks)} steps failed ({names}){waiting}. Why is in "
+            f"{logs / (outcome.failed[0] + '.txt')}; the same command goes on with what is left."
+        )
+
+
+class Display:
+    """Running steps on a terminal; a line for each that begins or ends elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(Text(), console=console, refresh_per_second=2, transient=True)
+        self._known: set[str] = set()
+
+    def __enter__(self) -> "Display":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def show(self, progress: "Progress") -> None:
+        """Shows how far everything is."""
+        counts = f"{progress.finished} of {progress.total} steps done"
+        failed = f", failed: {', '.join(progress.failed)}" if progress.failed else ""
+        if self._console.is_terminal:
+            lines = [f"  {name}: {done} of {frames} frames" for name, (done, frames) in progress.running.items()]
+            self._live.update(Text("\n".join([counts + failed, *lines])))
+            return
+        for name in sorted(progress.running.keys() - self._known):
+            self._console.print(f"{counts}{failed}; begins {name}", highlight=False, soft_wrap=True)
+        self._known |= progress.running.keys()
+
+
+def print_sheet(sheet: "Sheet", console: Console) -> None:
+    """The sheet as tables that a terminal is wide enough for, each with the names of the rows."""
+    wide = console.width >= 20 * len(sheet.columns)
+    step = len(sheet.columns) if wide else NARROW
+    for start in range(1, len(sheet.columns), step):
+        table = columns()
+        table.title = Text(sheet.title if start == 1 else f"{sheet.title}, continued")
+        shown = [0, *range(start, min(start + step, len(sheet.columns)))]
+        for i in shown:
+            table.add_column(sheet.columns[i], justify="left" if i == 0 else "right")
+        for row in sheet.rows:
+            table.add_row(*plain(*(row[i] for i in shown)))
+        console.print(table)
+        console.print()

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each part of the compact stream is worth: the whole, and the whole with one switch thrown at a time."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from structgstream.errors import ConfigError
+from structgstream.presets import StreamConfig
+from structgstream.scene.state import FieldName
+from structgstream.training.motion import MotionConfig
+from structgstream.training.online import OnlineConfig
+from structgstream.training.rounding import RoundingConfig
+from structgstream_studies.experiments.results import Result
+from structgstream_studies.experiments.sheets import SCORES, Sheet, written
+from structgstream_studies.experiments.summary import Summary, summaries
+from structgstream_studies.experiments.variants import FULL, Variant
+
+EFFECTS_TABLE = "effects"
+WHOLE = "compact"
+"""Key of the compact stream with everything, as ``structgstream compare`` calls it."""
+BETTER_FIRST = "paper-better-first"
+"""Key of paper mode on the frame 0 that the compact stream begins with."""
+DISTURBANCE_FIELDS = ("initial.disturbance.dropped_share", "initial.disturbance.noise_scales")
+OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
+EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
+"""What is tried where the whole has it not."""
+PAPER_ITERATIONS = 100
+REFRESH_FRAMES = 5
+"""MLPs can change only in frames in which everything may move; this often, where one is trained."""
+
+_COLUMNS = (
+    ("psnr_changed", "psnr_changed"),
+    ("psnr_still", "psnr_still"),
+    ("drift_db_per_frame", "drift_db_per_frame"),
+    ("online_bytes", "online_kilobytes"),
+    ("bytes_with_header", "kilobytes_with_header"),
+    ("flicker", "flicker"),
+    ("e_warp", "e_warp"),
+    ("online_cpu_seconds", "online_cpu_seconds"),
+    ("decode_and_render_fps", "decode_and_render_fps"),
+)
+"""Scores beside PSNR, and how each is written."""
+
+
+def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
+    """The rows of the table, by key.
+
+    Args:
+        full: the compact stream with everything.
+        paper: what it is measured against, with its key :data:`~structgstream_studies.experiments.variants.FULL`.
+
+    Raises:
+        ConfigError: ``full`` is no compact stream.
+    """
+    require_compact(full)
+    rows = [Variant(FULL, "paper mode", paper), Variant(WHOLE, "compact, with everything", full)]
+
+    def row(key: str, title: str, config: StreamConfig, *changes: str) -> None:
+        rows.append(Variant(key, title, config, frozenset(changes)))
+
+    def online(key: str, title: str, config: OnlineConfig, *changes: str) -> None:
+        row(f"{WHOLE}-{key}", title, replace(full, online=config), *(f"online.{change}" for change in changes))
+
+    def dynamic(key: str, title: str, fields: frozenset[FieldName]) -> None:
+        online(key, title, replace(whole, dynamic=fields), "dynamic")
+
+    def priced(key: str, title: str, rounding: RoundingConfig, change: str) -> None:
+        online(key, title, replace(whole, rounding=rounding), f"rounding.{change}")
+
+    def gated(key: str, title: str, motion: MotionConfig, change: str) -> None:
+        online(key, title, replace(whole, motion=motion), f"motion.{change}")
+
+    whole = full.online
+    motion, rounding, patching = whole.motion, whole.rounding, whole.patching
+    rows.append(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
+    undisturbed = replace(full.initial.disturbance, dropped_share=0.0, noise_scales=0.0)
+    calm = replace(full.initial, disturbance=undisturbed)
+    row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
+    lively = replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False)
+    title = f"{PAPER_OFFSETS} Gaussians an anchor, of which half begin undrawn"
+    row(f"{WHOLE}-offsets", title, replace(full, initial=lively), *OFFSET_FIELDS)
+    gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
+    share = 0.0 if motion.least_views_share else VIEWS_SHARE
+    title = (
+        f"what moves changes in {share:.0%} of the views that show it" if share else "what moves changes in two views"
+    )
+    gated("views-share", title, replace(motion, least_views_share=share), "least_views_share")
+    eased = EASED if motion.moved_ease == 1.0 else 1.0
+    title = "the gate remembers what moved" if eased != 1.0 else "the gate remembers nothing"
+    gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
+    priced("without-rate", "w/o rate penalty", replace(rounding, rate_weight=0.0), "rate_weight")
+    dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
+    rank = OTHER_RANK
+    online(f"rank-{rank}", f"appearance in {rank} directions", replace(whole, appearance_rank=rank), "appearance_rank")
+    dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
+    prior = 0.0 if whole.motion_prior else 1.0
+    title = "motion prior: the last step again" if prior else "w/o motion prior"
+    online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
+    gain = 0.0 if whole.least_gain else LEAST_GAIN
+    title = "a frame ends when it has settled" if gain else "all iterations in every frame"
+    online("settling", title, replace(whole, least_gain=gain), "least_gain")
+    paced = replace(whole, iterations=PAPER_ITERATIONS, patching=replace(patching, iteration=PAPER_ITERATIONS // 2))
+    online("more-iterations", f"{PAPER_ITERATIONS} iterations in a frame", paced, "iterations", "patching.iteration")
+    start, births = whole.start, whole.births
+    online("without-start", "w/o motion start", replace(whole, start=replace(start, enabled=False)), "start.enabled")
+    online("one-round", "motion start in one round", replace(whole, start=replace(start, rounds=1)), "start.rounds")
+    alike = replace(start, lift=replace(start.lift, color_bandwidth=0.0))
+    online("colors-alike", "neighbours of any colour", replace(whole, start=alike), "start.lift.color_bandwidth")
+    gated(
+        "without-residuals", "the gate sees no residuals", replace(motion, residual_threshold=0.0), "residual_threshold"
+    )
+    spawn = "gradient" if patching.spawn == "off" else "off"
+    title = "births by gradients too" if spawn == "gradient" else "w/o births by gradients"
+    online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
+    spawnless = replace(whole, births=replace(births, enabled=False), patching=replace(patching, spawn="off"))
+    online("without-free", "w/o free 3DGs", spawnless, "births.enabled", "patching.spawn")
+    priced("free-unpriced", "bits of free 3DGs cost nothing", replace(rounding, free_priced=False), "free_priced")
+    gated("unseen-kept", "unseen free 3DGs are kept", replace(motion, unseen_pixels=0.0), "unseen_pixels")
+    refreshed = replace(
+        whole,
+        dynamic=whole.dynamic.union(["covariance_mlp"]),
+        motion=replace(motion, full_every_frames=REFRESH_FRAMES),
+    )
+    title = f"F_Sigma trained in every {REFRESH_FRAMES}th frame, ungated"
+    online("with-covariance-mlp", title, refreshed, "dynamic", "motion.full_every_frames")
+    return {row.key: row for row in rows}
+
+
+def require_compact(config: StreamConfig) -> None:
+    """Refuses a configuration whose streams are not compact.
+
+    Raises:
+        ConfigError: it says so.
+    """
+    if config.codec != "compact":
+        raise ConfigError(
+            f"The tables of the compact stream need codec 'compact', got {config.codec!r}; take --preset compact."
+        )
+
+
+def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str]) -> Sheet:
+    """Every row with its difference to the whole, seed by seed; rows without a result have dashes.
+
+    Args:
+        results: of one capture.
+        titles: of the rows, in their order.
+    """
+    found = summaries(result for result in results if result.key in titles)
+    whole = found.get(WHOLE)
+    heads = ["variant", "seeds", SCORES["psnr"].title, SCORES["psnr_camera_color"].title, "to compact, dB"]
+    columns = [*heads, *(SCORES[name].title for _, name in _COLUMNS)]
+    return Sheet("Effects", columns, [[title, *_cells(found.get(key), whole)] for key, title in titles.items()])
+
+
+def _cells(summary: Summary | None, whole: Summary | None) -> list[str]:
+    if summary is None:
+        return ["-"] * (4 + len(_COLUMNS))
+    difference = None if whole is None or summary.key == WHOLE else summary.difference(whole, "psnr")
+    cells = [
+        str(len(summary.results)),
+        written(summary.score("psnr"), "psnr"),
+        written(summary.score("psnr_camera_color"), "psnr_camera_color"),
+        written(difference, "psnr", signed=True),
+    ]
+    return cells + [written(summary.score(score), name) for score, name in _COLUMNS]

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results as pictures: curves over the frames, methods against bytes and seconds, variants side by side."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.evaluation.figure import COLOURS, INK, figure_of, save_figure, without_frame
+from structgstream_studies.experiments.results import Result
+from structgstream_studies.experiments.sheets import SCORES
+from structgstream_studies.experiments.summary import Summary, summaries
+from structgstream_studies.experiments.variants import FULL
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Picture = NDArray[np.uint8]
+CROP_SHARE = 4  # a detail is a quarter of the picture across
+CURVES = ("psnr", "psnr_camera_color", "psnr_changed", "e_warp", "flicker")
+
+
+def write_curves(path: Path, results: Iterable[Result], *, keys: Sequence[str], titles: Mapping[str, str]) -> None:
+    """Scores over the frames, a line for each variant, with the spread over seeds as a band.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    found = summaries(results)
+    shown = [name for name in CURVES if any(_known(found[key], name) for key in keys if key in found)]
+    figure = figure_of(9.0, 2.4 * len(shown) + 0.4)
+    axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, name in zip(axes, shown):
+        for number, key in enumerate(key for key in keys if key in found):
+            colour = INK if key == FULL else COLOURS[number % len(COLOURS)]
+            _curve(axis, found[key], name, label=titles[key], colour=colour, width=2.0 if key == FULL else 1.2)
+        axis.set_ylabel(SCORES[name].title, fontsize=9)
+        without_frame(axis)
+    axes[0].legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
+    axes[-1].set_xlabel("frame", fontsize=9)
+    axes[-1].xaxis.get_major_locator().set_params(integer=True)
+    save_figure(figure, path)
+
+
+def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[str, str]) -> None:
+    """Quality against bytes and against seconds, a point for each method, bars for the spread over seeds.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    found = summaries(results)
+    figure = figure_of(10.0, 4.2)
+    axes = figure.subplots(1, 2, sharey=True)
+    panels = (("online_bytes", "MB a frame after the first"), ("online_cpu_seconds", "core-seconds a frame"))
+    for axis, (name, caption) in zip(axes, panels):
+        for number, key in enumerate(key for key in titles if key in found):
+            cost, quality = found[key].score(name), found[key].score("psnr")
+            if cost is None or quality is None:
+                continue
+            x = max(cost.mean * SCORES[name].factor, 1e-4)
+            colour = INK if key == FULL else COLOURS[number % len(COLOURS)]
+            axis.errorbar(x, quality.mean, yerr=quality.deviation, fmt="o", color=colour, capsize=3)
+            axis.annotate(titles[key], (x, quality.mean), xytext=(6, 4), textcoords="offset points", fontsize=8)
+        axis.set_xscale("log")
+        axis.margins(x=0.25, y=0.12)
+        axis.set_xlabel(caption, fontsize=9)
+        without_frame(axis)
+    axes[0].set_ylabel("PSNR of held-out cameras, dB", fontsize=9)
+    save_figure(figure, path)
+
+
+def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *, title: str) -> None:
+    """The part of a picture in which the variants differ most, as each shows it and as it was, magnified.
+
+    Args:
+        path: the PNG.
+        pictures: rendering ``[H, W, 3]`` by title.
+        truth: what the camera took.
+        title: a line above.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    top, left, height, width = busiest(disagreement([*pictures.values(), truth]))
+    cells = {**pictures, "ground truth": truth}
+    columns = min(len(cells), 4)
+    rows = -(-len(cells) // columns)
+    figure = figure_of(3.2 * columns, 3.2 * rows * height / width + 0.35 * rows + 0.4)
+    figure.suptitle(title, fontsize=10, fontweight="bold", color=INK)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, (name, picture) in zip(axes, cells.items()):
+        axis.imshow(picture[top : top + height, left : left + width], interpolation="nearest")
+        axis.set_title(name, fontsize=8)
+    save_figure(figure, path)
+
+
+def disagreement(pictures: Sequence[Picture]) -> NDArray[np.int64]:
+    """How far the pictures ``[H, W, 3]`` are apart in each pixel, ``[H, W]``: the range, summed over channels."""
+    stack = np.stack(pictures).astype(np.int64)
+    return (stack.max(0) - stack.min(0)).sum(-1)
+
+
+def busiest(weights: NDArray[np.int64]) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the detail of ``weights`` ``[H, W]`` with the largest sum."""
+    height, width = weights.shape[0] // CROP_SHARE, weights.shape[1] // CROP_SHARE
+    total = np.pad(weights.cumsum(0, dtype=np.int64).cumsum(1), ((1, 0), (1, 0)))
+    inside = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    top, left = np.unravel_index(int(inside.argmax()), inside.shape)
+    return int(top), int(left), height, width
+
+
+def _known(summary: Summary, name: str) -> bool:
+    return any(value is not None for value in summary.curve(name))
+
+
+def _curve(axis: "Axes", summary: Summary, name: str, *, label: str, colour: str, width: float) -> None:
+    points = [(i, value) for i, value in enumerate(summary.curve(name)) if value is not None]
+    if not points:
+        return
+    factor = SCORES[name].factor
+    index = [i for i, _ in points]
+    mean = np.array([value.mean for _, value in points]) * factor
+    deviation = np.array([value.deviation for _, value in points]) * factor
+    axis.plot(index, mean, color=colour, linewidth=width, label=label)
+    if deviation.any():
+        axis.fill_between(index, mean - deviation, mean + deviation, color=colour, alpha=0.12, linewidth=0)

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results over seeds: means, spreads, and differences to the full method seed by seed.
+
+Note [Paired differences]
+~~~~~~~~~~~~~~~~~~~~~~~~~
+What frame 0 becomes differs more from seed to seed than variants differ from each other, but variants of one seed begin
+with the same frame 0. So a variant is compared with the full method seed by seed, and the differences are averaged.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from structgstream_studies.experiments.results import Result
+
+STANDARD_ERRORS = 2.0
+"""A difference is told when it has the same sign in all seeds and is this many standard errors from nothing."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A mean over seeds with its sample standard deviation (0 for a single one)."""
+
+    mean: float
+    deviation: float
+    count: int
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean."""
+        return self.deviation / math.sqrt(self.count)
+
+
+def spread_of(values: Sequence[float]) -> Spread | None:
+    """Mean and spread; None of nothing."""
+    if not values:
+        return None
+    mean = sum(values) / len(values)
+    squares = sum((value - mean) ** 2 for value in values)
+    return Spread(mean, math.sqrt(squares / (len(values) - 1)) if len(values) > 1 else 0.0, len(values))
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Results of one method on one capture.
+
+    Args:
+        key: the variant or method.
+        results: by seed.
+    """
+
+    key: str
+    results: Mapping[int, Result]
+
+    def score(self, name: str) -> Spread | None:
+        """Mean and spread of a score's mean over each stream; None where no result has it."""
+        return spread_of([value for result in self.results.values() if (value := score_of(result, name)) is not None])
+
+    def difference(self, other: "Summary", name: str) -> Spread | None:
+        """Mean and spread of this method's score minus ``other``'s, over the seeds that both have."""
+        found = []
+        for seed in sorted(self.results.keys() & other.results.keys()):
+            ours, theirs = score_of(self.results[seed], name), score_of(other.results[seed], name)
+            if ours is not None and theirs is not None:
+                found.append(ours - theirs)
+        return spread_of(found)
+
+    def agrees_in_sign(self, other: "Summary", name: str) -> bool:
+        """Whether the differences to ``other`` have one sign in all seeds that both have, of which there are three."""
+        signs = set()
+        seeds = self.results.keys() & other.results.keys()
+        for seed in seeds:
+            ours, theirs = score_of(self.results[seed], name), score_of(other.results[seed], name)
+            signs.add(None if ours is None or theirs is None else math.copysign(1.0, ours - theirs))
+        return len(seeds) >= 3 and len(signs) == 1 and None not in signs
+
+    def curve(self, name: str) -> list[Spread | None]:
+        """A score for each frame: mean and spread over seeds."""
+        frames = min(len(result.frames) for result in self.results.values())
+        values = [[result.frames[i].get(name) for result in self.results.values()] for i in range(frames)]
+        return [spread_of([value for value in row if value is not None]) for row in values]
+
+
+def score_of(result: Result, name: str) -> float | None:
+    """A score of a result by its name: a mean over the stream, a fact of the file, or what follows from its facts."""
+    value: Any = result.mean.get(name, result.stream.get(name))
+    if value is None and name == "bytes_with_header" and result.stream.get("total_bytes"):
+        value = result.stream["total_bytes"] / len(result.frames)  # Results from before the score was written down.
+    return None if value is None or isinstance(value, str | Mapping) else float(value)
+
+
+def summaries(results: Iterable[Result]) -> dict[str, Summary]:
+    """By key; the results must be of one capture and of one question each."""
+    grouped: dict[str, dict[int, Result]] = {}
+    for result in results:
+        grouped.setdefault(result.key, {})[result.seed] = result
+    return {key: Summary(key, dict(sorted(by_seed.items()))) for key, by_seed in grouped.items()}
+
+
+def verdict(variant: Summary, full: Summary, name: str, *, expected_sign: float) -> str:
+    """What three seeds say of a claim that ``variant`` minus ``full`` has ``expected_sign``."""
+    difference = variant.difference(full, name)
+    if difference is None or not variant.agrees_in_sign(full, name):
+        return "cannot be told"
+    if abs(difference.mean) <= STANDARD_ERRORS * difference.standard_error:
+        return "cannot be told"
+    return "reproduced" if difference.mean * expected_sign > 0 else "not reproduced"

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The file of a peer method: this project's records (CRC, cut anywhere) with named arrays in them.
+
+::
+
+    "\\x89SGP\\r\\n\\x1a\\n"  version u16 u16 | INIT record: a stream header, codec = the method's name
+                                         | KEY or DELTA record: index u32, pts f64, array, array, ...
+                                         | INDEX record: number of frames u32 -- the run came to its end
+    array = name length u8, type u8, dimensions u8, 0 u8, name, sizes u32 ..., numbers (little-endian, not compressed)
+"""
+
+import math
+import os
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from io import FileIO
+from pathlib import Path
+from typing import Any, Generic, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.records import PREFIX, RecordType, packed, record_at, scanned, why_stopped
+from structgstream.codec.container.stored import Stored, StoredFile
+from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.reader import PacketInfo
+from structgstream.errors import StorageError, StreamError
+from structgstream.scene.state import FieldName
+from structgstream_studies.peers.method import Arrays, PeerMethod, State
+
+MAGIC = b"\x89SGP\r\n\x1a\n"
+MAJOR, MINOR = 1, 0
+ARRAY = struct.Struct("<BBBB")
+COUNT = struct.Struct("<I")
+MAX_DIMENSIONS = 4
+MAX_ELEMENTS = 2**31 - 1
+_DTYPES = {0: np.dtype("<f4"), 1: np.dtype("<f2"), 2: np.dtype("<u1"), 3: np.dtype("<i8")}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+_KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
+_TYPES = {kind: record for record, kind in _KINDS.items()}
+
+
+MethodOf = Callable[[StreamHeader], PeerMethod[State, Any]]
+"""Gives the method that decodes a file with this header."""
+
+
+def packed_array(name: str, value: NDArray[Any]) -> bytes:
+    """One named array as bytes.
+
+    Raises:
+        StreamError: a type, a name or a number of dimensions that the format does not hold.
+    """
+    code = _CODES.get(value.dtype.newbyteorder("<") if value.dtype.itemsize > 1 else value.dtype)
+    text = name.encode("ascii", errors="replace")
+    if code is None or not 0 < len(text) < 256 or value.ndim > MAX_DIMENSIONS:
+        raise StreamError(f"Array {name!r} ({value.dtype}, {value.ndim} dimensions) has no place in a peer's file.")
+    head = ARRAY.pack(len(text), code, value.ndim, 0) + text + struct.pack(f"<{value.ndim}I", *value.shape)
+    return head + np.ascontiguousarray(value, dtype=_DTYPES[code]).tobytes()
+
+
+def unpacked_arrays(payload: bytes, start: int, *, where: str) -> tuple[Arrays, dict[str, int]]:
+    """The arrays from byte ``start`` on, and the bytes that each takes. Nothing is allocated before it is known to fit.
+
+    Raises:
+        StreamError: the payload contradicts the format.
+    """
+    arrays: Arrays = {}
+    sizes: dict[str, int] = {}
+    while start < len(payload):
+        if start + ARRAY.size > len(payload):
+            raise StreamError(f"{where} ends within the head of an array.")
+        length, code, dimensions, _ = ARRAY.unpack_from(payload, start)
+        shape_at = start + ARRAY.size + length
+        data = shape_at + 4 * dimensions
+        if code not in _DTYPES or dimensions > MAX_DIMENSIONS or not length or data > len(payload):
+            raise StreamError(f"{where} holds an array (type {code}, {dimensions} dimensions) of no known form.")
+        name = payload[start + ARRAY.size : shape_at].decode("ascii", errors="replace")
+        shape = struct.unpack_from(f"<{dimensions}I", payload, shape_at)
+        end = data + math.prod(shape) * _DTYPES[code].itemsize
+        if end > len(payload) or math.prod(max(size, 1) for size in shape) > MAX_ELEMENTS:
+            raise StreamError(f"{where} states {shape} numbers for array {name!r}, more than it holds.")
+        if name in arrays:
+            raise StreamError(f"{where} holds array {name!r} twice.")
+        found = np.frombuffer(payload, dtype=_DTYPES[code], count=math.prod(shape), offset=data)
+        arrays[name] = found.reshape(shape).astype(found.dtype.newbyteorder("="))
+        sizes[name] = end - start
+        start = end
+    return arrays, sizes
+
+
+def is_peer_file(path: Path | str) -> bool:
+    """Whether the file begins as a peer's does."""
+    with suppress(StreamError):
+        return StoredFile(path)[: len(MAGIC)] == MAGIC
+    return False
+
+
+class PeerReader(Generic[State]):
+    """A peer's file, whole or cut anywhere.
+
+    Args:
+        data: its bytes.
+        method: gives the method that decodes, from the header.
+        name: what messages call it.
+
+    Attributes:
+        header: the init record; ``codec`` is the method's name, ``config`` its configuration.
+        packets: every whole frame before the first cut or damage.
+        complete: whether the run that wrote the file came to its end.
+        cut_reason: what stopped reading otherwise.
+        header_bytes: length of everything before the first frame.
+        total_bytes: length of the file.
+        end: offset of the byte after the last whole frame.
+
+    Raises:
+        StreamError: not a peer's file, another major version, or records that contradict each other.
+    """
+
+    def __init__(
+        self, data: Stored, method: Callable[[StreamHeader], PeerMethod[State, Any]], *, name: str = "The file"
+    ) -> None:
+        self._data, self._name = data, name
+        check_prefix(data, name)
+        init = record_at(data, PREFIX.size)
+        if init is None or init.type != RecordType.INIT:
+            raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
+        self.header = unpacked_header(init.payload)
+        self.method = method(self.header)
+        self.header_bytes = self.end = init.end
+        self.total_bytes = len(data)
+        self.complete = False
+        self.packets: list[PacketInfo] = []
+        end = init.end
+        for record in scanned(data, init.end):
+            end = record.end
+            if record.type == RecordType.INDEX:
+                self.complete = True
+                break
+            if record.type in _KINDS:
+                self.packets.append(self._info(record.payload, record.type, record.offset, record.end))
+                self.end = record.end
+        self.cut_reason = None if self.complete else why_stopped(data, end)
+
+    def _info(self, payload: bytes, kind: int, offset: int, end: int) -> PacketInfo:
+        index = len(self.packets)
+        if len(payload) < FRAME.size:
+            raise StreamError(f"Frame {index} of {self._name} is too short.")
+        number, pts_seconds = FRAME.unpack_from(payload)
+        if number != index:
+            raise StreamError(f"{self._name} has frame {number} where frame {index} belongs.")
+        if not math.isfinite(pts_seconds) or (index and pts_seconds <= self.packets[-1].pts_seconds):
+            raise StreamError(f"In {self._name} frame {index} is not presented after the one before it.")
+        _, sizes = unpacked_arrays(payload, FRAME.size, where=f"Frame {index} of {self._name}")
+        packet_kind = _KINDS[RecordType(kind)]
+        if index == 0 and packet_kind is not PacketKind.KEY:
+            raise StreamError(f"{self._name} begins with a delta frame; the first must be a key frame.")
+        # Other methods have other fields; who reports them only passes the names on.
+        return PacketInfo(packet_kind, index, pts_seconds, offset, end - offset, cast("Mapping[FieldName, int]", sizes))
+
+    def __len__(self) -> int:
+        return len(self.packets)
+
+    def arrays(self, index: int) -> Arrays:
+        """What frame ``index`` carries.
+
+        Raises:
+            StreamError: it was damaged after the file was opened.
+        """
+        record = record_at(self._data, self.packets[index].offset)
+        if record is None:
+            raise StreamError(f"Frame {index} of {self._name} is damaged.")
+        return unpacked_arrays(record.payload, FRAME.size, where=f"Frame {index} of {self._name}")[0]
+
+    def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, State]]:
+        """Every frame from ``start`` on as the method's state, on the CPU, in normalised units."""
+        state: State | None = None
+        cpu = torch.device("cpu")
+        keys = [info.index for info in self.packets[: start + 1] if info.kind is PacketKind.KEY]
+        for info in self.packets[keys[-1] if keys else 0 :]:
+            previous = None if info.kind is PacketKind.KEY else state
+            state = self.method.restored(self.arrays(info.index), previous, device=cpu)
+            if info.index >= start:
+                yield info, state
+
+
+class PeerWriter:
+    """Appends frames to a file; each is on the disk when :meth:`write` returns.
+
+    Args:
+        path: the file; it is created, unless ``resumed`` holds what is there already.
+        header: of a new file.
+        resumed: the reader of the file to go on with, after its last whole frame.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+
+    def __init__(self, path: Path | str, header: StreamHeader, *, resumed: "PeerReader[Any] | None" = None) -> None:
+        self._path = Path(path)
+        self._count = 0 if resumed is None else len(resumed)
+        try:
+            self._file = FileIO(self._path, "w" if resumed is None else "r+")
+        except OSError as error:
+            raise StorageError(f"Cannot open {path} for writing ({error.strerror}); choose another place.") from error
+        self._end = 0 if resumed is None else resumed.end
+        if resumed is None:
+            self._append(PREFIX.pack(MAGIC, MAJOR, MINOR) + packed(RecordType.INIT, packed_header(header)))
+        else:
+            self._file.truncate(self._end)
+
+    def write(self, kind: PacketKind, index: int, pts_seconds: float, arrays: Arrays) -> tuple[int, dict[str, int]]:
+        """Append one frame; returns the bytes that it and each of its arrays take.
+
+        Raises:
+            StorageError: the disk is full or gone; what was written before stays.
+        """
+        blocks = {name: packed_array(name, value) for name, value in arrays.items()}
+        size = self._append(packed(_TYPES[kind], FRAME.pack(index, pts_seconds) + b"".join(blocks.values())))
+        self._count += 1
+        return size, {name: len(block) for name, block in blocks.items()}
+
+    def close(self, *, complete: bool) -> None:
+        """Close the file, marked as complete or to be continued. A second call does nothing."""
+        if self._file.closed:
+            return
+        with self._file:
+            if complete:
+                self._append(packed(RecordType.INDEX, COUNT.pack(self._count)))
+
+    def _append(self, data: bytes) -> int:
+        try:
+            self._file.seek(self._end)
+            rest = memoryview(data)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            with suppress(OSError):  # If even this fails, readers stop at the record that is not whole.
+                self._file.truncate(self._end)
+            raise StorageError(
+                f"Cannot write {len(data)} bytes to {self._path} ({error.strerror}); the {self._count} frames before "
+                "are safe in it. Make room and resume."
+            ) from error
+        self._end += len(data)
+        return len(data)
+
+
+def check_prefix(data: Stored, name: str) -> None:
+    """Refuse what is not a peer's file of this major version.
+
+    Raises:
+        StreamError: with what was found.
+    """
+    if bytes(data[: len(MAGIC)]) != MAGIC or len(data) < PREFIX.size:
+        raise StreamError(f"{name} is not a file of a peer method: its first bytes are not the format's signature.")
+    _, major, minor = PREFIX.unpack(bytes(data[: PREFIX.size]))
+    if major != MAJOR:
+        raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x.")

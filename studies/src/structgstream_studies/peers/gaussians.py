@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""3D Gaussian splatting (Kerbl et al. 2023): one frame from scratch, every Gaussian on its own."""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import CameraRig
+from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.scene.color import CameraColor
+from structgstream.training.initial import rig_extent
+from structgstream.training.optim import EPS, Rate, constant
+from structgstream.training.result import Step, StepListener
+from structgstream.training.seeding import neighbour_distances, voxel_centers
+from structgstream.training.statistics import GradientStatistics
+from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.views import View, reduced, shuffled_views, training_views
+from structgstream_studies.peers.densify import DensifyConfig, densified, reset_opacities
+from structgstream_studies.peers.fitting import LastPsnr, Leaves, gradients_of, picture_loss
+from structgstream_studies.peers.plain import Y0, PlainGaussians
+
+COLORS = ("base_colors", "sh")
+CAMERA = ("camera_gains", "camera_biases")
+
+
+@dataclass(frozen=True)
+class GaussiansRates:
+    """Adam's rates of 3DGS, scheduled over the iterations of the fit."""
+
+    means: Rate = Rate(1.6e-4, 1.6e-6)
+    """Times 1.1 rig radii."""
+    log_scales: Rate = constant(5e-3)
+    quats: Rate = constant(1e-3)
+    logit_opacities: Rate = constant(5e-2)
+    base_colors: Rate = constant(2.5e-3)
+    sh: Rate = constant(2.5e-3 / 20)
+    camera_color: Rate = Rate(2e-3, 1e-4)
+    """As this project's frame 0; unused when ``camera_color`` is off."""
+
+
+@dataclass(frozen=True)
+class GaussiansConfig:
+    """How a frame is fitted from scratch with plain Gaussians.
+
+    3DGS runs 30,000 iterations; the schedule here has the length of this project's frame 0, and begins on small
+    pictures as that does.
+    """
+
+    iterations: int = 4000
+    coarse_iterations: int = 2500
+    """The first iterations look at pictures reduced by ``coarse_scale``."""
+    coarse_scale: float = 0.5
+    sh_degree: int = 1
+    """3DGStream's frame 0 (3DGS: 3)."""
+    sh_from: int = 1000
+    """Colours do not depend on direction before (3DGS raises the degree by one every 1,000 iterations)."""
+    voxel_size: float = 0.0067
+    """Initial points are thinned to one in each voxel, as in this project's frame 0; 0 takes all."""
+    initial_opacity: float = 0.1
+    camera_color: bool = True
+    """Learn a gain and a bias for each training camera, as the preset ``rig`` (scene.color, Note [Colour gauge])."""
+    rates: GaussiansRates = field(default_factory=GaussiansRates)
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+
+
+@dataclass(frozen=True)
+class GaussiansFit:
+    """A fitted frame: see ``peers.method.PeerFit``."""
+
+    gaussians: PlainGaussians
+    camera_color: CameraColor
+    train_psnr: float
+    seconds: dict[str, float]
+    spawned: int
+    pruned: int
+
+
+def point_colors(points: Tensor, views: list[View]) -> Tensor:
+    """The median over the views of what each shows where a point ``[P, 3]`` projects: ``[P, 3]`` in [0, 1].
+
+    Nothing hides a point here, so a colour may be that of what stands before it; the fit starts there, no more. A point
+    that no view shows is grey.
+    """
+    seen = points.new_full((len(views), points.shape[0], 3), float("nan"))
+    for row, view in enumerate(views):
+        camera = view.camera
+        matrices = camera.beside(points)
+        local = points @ matrices.viewmat[:3, :3].T + matrices.viewmat[:3, 3]
+        pixels = (local @ matrices.K.T)[:, :2] / local[:, 2:].clamp(min=camera.near)
+        size = pixels.new_tensor([camera.width, camera.height])
+        shown = (local[:, 2] > camera.near) & (pixels >= 0).all(1) & (pixels < size).all(1)
+        columns, rows = pixels[shown].long().unbind(1)
+        seen[row, shown] = view.image[rows, columns].to(points) / 255.0
+    return seen.nanmedian(dim=0).values.nan_to_num(0.5)
+
+
+def initial_gaussians(points: Tensor, views: list[View], config: GaussiansConfig) -> PlainGaussians:
+    """Round Gaussians at ``points`` ``[P, 3]``, as wide as the neighbours are far (3DGS).
+
+    Raises:
+        CaptureError: fewer than four distinct points.
+    """
+    device = views[0].image.device
+    points = points.float() if config.voxel_size <= 0 else voxel_centers(points.float(), config.voxel_size)
+    count = points.shape[0]
+    if count < 4:
+        raise CaptureError(
+            f"Only {count} initial points remain at a voxel size of {config.voxel_size:g}; at least 4 are needed. "
+            "Check the poses, or give a capture with more overlap between cameras."
+        )
+    log_scales = neighbour_distances(points).log()[:, None].expand(count, 3).contiguous()
+    means = points.to(device)
+    quats = means.new_zeros(count, 4)
+    quats[:, 0] = 1.0
+    return PlainGaussians(
+        means=means,
+        log_scales=log_scales.to(device),
+        quats=quats,
+        logit_opacities=torch.logit(means.new_full((count,), config.initial_opacity)),
+        base_colors=(point_colors(means, views) - 0.5) / Y0,
+        sh=means.new_zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
+    )
+
+
+def rates_at(iteration: int, config: GaussiansConfig, *, extent: float) -> dict[str, float]:
+    """Rate of every leaf after ``iteration`` steps; ``extent`` is 1.1 rig radii in scene units."""
+    share, r = iteration / config.iterations, config.rates
+    return {
+        "means": r.means.at(share) * extent,
+        "log_scales": r.log_scales.at(share),
+        "quats": r.quats.at(share),
+        "logit_opacities": r.logit_opacities.at(share),
+        "base_colors": r.base_colors.at(share),
+        "sh": r.sh.at(share) if iteration >= config.sh_from else 0.0,
+        "camera_gains": r.camera_color.at(share),
+        "camera_biases": r.camera_color.at(share),
+    }
+
+
+def fit_gaussians(
+    frame: MultiViewFrame,
+    rig: CameraRig,
+    points: Tensor,
+    *,
+    config: GaussiansConfig,
+    backend: Backend,
+    seed: int,
+    on_step: StepListener | None = None,
+) -> GaussiansFit:
+    """Reconstruct one frame from its training views.
+
+    Args:
+        frame: the pictures; only those of ``rig.training`` are read.
+        rig: cameras in normalised units.
+        points: ``[P, 3]`` initial points in normalised units.
+        config: the schedule.
+        backend: what computes.
+        seed: all randomness comes from it.
+        on_step: called after every iteration.
+
+    Raises:
+        CaptureError: fewer than four distinct points.
+    """
+    generator, watch, extent = torch.Generator().manual_seed(seed), Stopwatch(backend.device), rig_extent(rig)
+    views = training_views(frame, rig, backend.device)
+    with watch.stage("initialise"):
+        start = initial_gaussians(points, views, config)
+        identity = CameraColor.identity(len(views), start.means)
+        camera = {"camera_gains": identity.gains, "camera_biases": identity.biases} if config.camera_color else {}
+        small = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
+    leaves = Leaves.of(start.tensors() | camera, backend=backend, eps=EPS)
+    statistics = GradientStatistics(len(start), backend.device)
+    last = LastPsnr(config.iterations, len(views))
+    order = shuffled_views(small, generator)
+    spawned = pruned = 0
+    for iteration in range(1, config.iterations + 1):
+        if iteration == config.coarse_iterations + 1:
+            order = shuffled_views(views, generator)
+        view = next(order)
+        gaussians, color = parts(leaves, identity)
+        with watch.stage("generate"):
+            drawn = gaussians.gaussians(view.camera, backend, degree=None if iteration > config.sh_from else 0)
+        collects = iteration <= config.densify.stop
+        loss = picture_loss(drawn, view, color, backend=backend, track_screen=collects, watch=watch)
+        gradients, screen = gradients_of(loss, leaves.values, watch)
+        last.add(iteration, loss, view)
+        with watch.stage("optimise"):
+            leaves.step(gradients, rates_at(iteration, config, extent=extent))
+        if screen is not None:
+            with watch.stage("densify"), torch.no_grad():
+                statistics.add(loss.rendering, screen)
+                if config.densify.due(iteration):
+                    gaussians, _ = parts(leaves, identity)
+                    change = densified(
+                        gaussians,
+                        statistics.mean(),
+                        config=config.densify,
+                        extent=extent,
+                        prune_large=config.densify.has_reset(iteration),
+                        generator=generator,
+                    )
+                    leaves.replace_rows(change.added.tensors(), keep=change.keep)
+                    spawned, pruned = spawned + len(change.added), pruned + change.removed
+                    statistics = GradientStatistics(len(parts(leaves, identity)[0]), backend.device)
+                if iteration == config.densify.reset_at:
+                    leaves.replace_values("logit_opacities", reset_opacities(leaves.values["logit_opacities"]))
+        if on_step is not None:
+            on_step(Step(iteration, config.iterations, float(loss.total.detach()), 0, len(drawn)))
+    gaussians, color = parts(leaves, identity)
+    color = CameraColor(color.gains.detach(), color.biases.detach())
+    return GaussiansFit(gaussians.detached(), color, last.mean, watch.seconds, spawned, pruned)
+
+
+def parts(leaves: Leaves, identity: CameraColor) -> tuple[PlainGaussians, CameraColor]:
+    """What the leaves stand for; ``identity`` where no camera colour is learned."""
+    values = leaves.values
+    gaussians = PlainGaussians(**{name: value for name, value in values.items() if name not in CAMERA})
+    if "camera_gains" not in values:
+        return gaussians, identity
+    return gaussians, CameraColor(values["camera_gains"], values["camera_biases"]).gauged()

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every frame from scratch with Scaffold-GS (Lu et al. 2024): this project's frame 0 without what the paper adds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from structgstream.cameras import CameraRig
+from structgstream.codec.scene.shapes import check_shapes
+from structgstream.errors import StreamError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.presets import RIG
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_of, state_of
+from structgstream.training.initial import InitialConfig, fit_first_frame
+from structgstream.training.losses import LossWeights
+from structgstream.training.result import StepListener
+from structgstream_studies.peers.method import Arrays, PeerFit, PointsMaker, stored
+
+SCAFFOLD = replace(RIG.initial, distance_input=False, losses=LossWeights(l1=0.8, ssim=0.2, volume=0.01))
+"""The preset ``rig`` with Scaffold-GS's inputs and loss: no distance, no term that keeps offsets short."""
+
+
+@dataclass(frozen=True)
+class ScaffoldGS:
+    """The method behind the loop. No frame knows of another, and nothing is remembered."""
+
+    config: InitialConfig = field(default_factory=lambda: SCAFFOLD)
+    name: str = "scaffold-gs"
+    stands_alone: bool = True
+
+    def first(
+        self,
+        frame: MultiViewFrame,
+        rig: CameraRig,
+        points: PointsMaker,
+        *,
+        backend: Backend,
+        seed: int,
+        on_step: StepListener | None = None,
+    ) -> PeerFit[Scene]:
+        """Any frame: see ``training.initial.fit_first_frame``."""
+        fit = fit_first_frame(frame, rig, points(), config=self.config, backend=backend, seed=seed, on_step=on_step)
+        return PeerFit(fit.scene, fit.train_psnr, fit.seconds, fit.spawned, fit.pruned)
+
+    def prepared(self, state: Scene, *, backend: Backend, seed: int) -> None:
+        """Nothing."""
+
+    def next(
+        self,
+        state: Scene,
+        memory: None,
+        frame: MultiViewFrame,
+        rig: CameraRig,
+        points: PointsMaker,
+        *,
+        backend: Backend,
+        seed: int,
+        on_step: StepListener | None = None,
+    ) -> PeerFit[Scene]:
+        """As :meth:`first`."""
+        return self.first(frame, rig, points, backend=backend, seed=seed, on_step=on_step)
+
+    def arrays(self, state: Scene) -> Arrays:
+        """Every tensor of the scene."""
+        return {name: stored(value, value.dtype) for name, value in state_of(state).items()}
+
+    def restored(self, arrays: Mapping[str, NDArray[Any]], previous: Scene | None, *, device: torch.device) -> Scene:
+        """The decoder.
+
+        Raises:
+            StreamError: the arrays are not those of this method.
+        """
+        names: list[FieldName] = [f.name for f in STATE_TABLE if not f.optional]
+        if set(arrays) != set(names):
+            raise StreamError(f"The frame has the arrays {', '.join(sorted(arrays))}; expected {', '.join(names)}.")
+        fields: dict[FieldName, Tensor] = {name: torch.from_numpy(arrays[name].copy()) for name in names}
+        color = arrays["camera_color"]
+        cameras = color.shape[0] if color.ndim else 0
+        check_shapes(fields, distance_input=False, training_cameras=cameras, where="The frame")
+        return on_device(scene_of(fields, distance_input=False), device)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A flipped bit is reported with its record and costs at most its group (docs/bitstream.md, section Damage)."""
+
+import struct
+import zlib
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from streams import compact_header, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.container import damage as damage_module
+from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, Search
+from structgstream.codec.container.records import RECORD, RecordType, scanned
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.errors import StreamError
+from structgstream.scene.scene import Scene
+
+FRAMES = 8
+"""Three groups: key packets are 0, 3 and 6."""
+
+
+@cache
+def whole() -> tuple[bytes, list[Scene], list[int]]:
+    """A stream with codec ``compact``, its scenes, and where its records begin: init, packets, index."""
+    first = small_scene(3)
+    sink = MemorySink()
+    seen = write_stream(sink, [moved(first, i) for i in range(FRAMES)], header=compact_header(first))
+    return sink.data, seen, [record.offset for record in scanned(sink.data)]
+
+
+def group(frame: int) -> range:
+    return range(frame, min(frame // 3 * 3 + 3, FRAMES))
+
+
+def flipped(data: bytes, *bits: int) -> bytes:
+    mangled = bytearray(data)
+    for bit in bits:
+        mangled[bit // 8] ^= 1 << bit % 8
+    return bytes(mangled)
+
+
+def check(reader: StreamReader, lost: set[int]) -> None:
+    _, seen, _ = whole()
+    for index in range(FRAMES):
+        if index in lost:
+            with pytest.raises(StreamError, match=f"Frame {index} of The stream is lost: the record at byte "):
+                reader.scene(index)
+        else:
+            assert same(reader.scene(index), seen[index]), index
+
+
+@pytest.mark.parametrize("frame", range(FRAMES))
+def test_any_bit_of_a_packet_costs_what_is_left_of_its_group(frame: int) -> None:
+    """Of heads every fifth bit, so that types, lengths, frames and times are wrong, and some of the rest."""
+    data, _, offsets = whole()
+    start, end = offsets[frame + 1 : frame + 3]
+    for bit in (*range(8 * start + frame % 5, 8 * (start + 20), 5), *range(8 * (start + 20), 8 * end, 119)):
+        reader = StreamReader(flipped(data, bit))
+        assert reader.damage == [Damage(start, group(frame))], bit
+        assert len(reader) == frame
+        assert not reader.complete
+        if bit % 20 == 0:
+            assert len([*reader.scenes()]) == frame
+            check(reader, {*group(frame)})
+
+
+def test_what_is_said_of_damage() -> None:
+    data, _, offsets = whole()
+    reader = StreamReader(flipped(data, 8 * offsets[2] + 70))
+    assert reader.runs == [range(1), range(3, FRAMES)]
+    assert reader.cut_reason == (
+        f"the record at byte {offsets[2]} of {len(data)} is damaged; 2 of 8 frames are lost, the first is 1, "
+        "frame 3 can be shown again"
+    )
+    with pytest.raises(StreamError, match=f"Frame 2 .* at byte {offsets[2]}, where frame 1 should be, is damaged"):
+        reader.scene(2)
+    with pytest.raises(StreamError, match="has frames 0 to 7; there is no frame 8"):
+        reader.scene(8)
+
+
+def test_several_damages() -> None:
+    data, _, offsets = whole()
+    two, five = 8 * offsets[3] + 32, 8 * offsets[6] + 100
+    reader = StreamReader(flipped(data, two, five))
+    assert reader.runs == [range(2), range(3, 5), range(6, 8)]
+    assert [damage.frames for damage in reader.damage] == [range(2, 3), range(5, 6)]
+    check(reader, {2, 5})
+    assert "is damaged, and 1 more; 2 of 8 frames are lost, the first is 2, frame 3 can" in (reader.cut_reason or "")
+    # Two records side by side are one damage, for nothing tells where the second begins.
+    reader = StreamReader(flipped(data, two, 8 * offsets[4] + 32))
+    assert [damage.frames for damage in reader.damage] == [range(2, 6)]
+    check(reader, {2, 3, 4, 5})
+
+
+def test_damage_of_the_index_costs_nothing_and_of_the_last_packet_one_frame() -> None:
+    data, _, offsets = whole()
+    for bit in range(8 * offsets[-1], 8 * len(data), 23):
+        reader = StreamReader(flipped(data, bit))
+        assert (len(reader), reader.damage, reader.runs) == (FRAMES, [], [range(FRAMES)])
+    without_index = flipped(data, 8 * offsets[-2] + 90)[: offsets[-1]]
+    reader = StreamReader(without_index)
+    assert (len(reader), reader.damage) == (FRAMES - 1, [])
+    assert reader.cut_reason == f"the record at byte {offsets[-2]} of {offsets[-1]} is damaged"
+
+
+def test_damage_of_what_is_no_packet_costs_no_frame() -> None:
+    data, _, offsets = whole()
+    foreign = RECORD.pack(77, 0, 0, 30) + bytes(30)
+    foreign += struct.pack("<I", zlib.crc32(foreign) ^ 1)
+    reader = StreamReader(data[: offsets[3]] + foreign + data[offsets[3] :])
+    assert (len(reader), reader.damage) == (FRAMES, [Damage(offsets[3], range(2, 2))])
+    assert reader.cut_reason is not None
+    assert reader.cut_reason.endswith("; no frame is lost")
+    check(reader, set())
+
+
+def test_raw_packets_stand_alone() -> None:
+    data = small_stream(5)
+    clean, offsets = StreamReader(data), [record.offset for record in scanned(data)]
+    reader = StreamReader(flipped(data, 8 * offsets[2] + 45))
+    assert reader.runs == [range(1), range(2, 5)]
+    assert all(same(reader.scene(i), clean.scene(i)) for i in (4, 0, 2, 3))
+
+
+def test_a_stream_cut_after_damage() -> None:
+    data, _, offsets = whole()
+    mangled = flipped(data, 8 * offsets[2] + 32)
+    for cut in range(offsets[2], len(data), 29):
+        reader = StreamReader(mangled[:cut])
+        arrived = sum(end <= cut for end in offsets[2:])
+        runs = [range(1), *([range(3, arrived)] if arrived > 3 else [])]
+        assert reader.runs == runs, cut
+
+
+def test_frames_that_cannot_have_been_there_are_not_believed() -> None:
+    """A packet far ahead would make room for all frames before it."""
+    data, _, offsets = whole()
+    start, end = offsets[4], offsets[5]
+    far = bytearray(data[start:end])
+    room = (start - offsets[3]) // LEAST_PACKET_BYTES
+    for index, believed in ((2**32 - 1, False), (2 + room + 1, False), (2 + room, True)):
+        struct.pack_into("<I", far, RECORD.size, index)
+        struct.pack_into("<I", far, len(far) - 4, zlib.crc32(far[:-4]))
+        reader = StreamReader(flipped(data[:start], 8 * offsets[3] + 70) + bytes(far))
+        assert (len(reader.packets.offsets) == 2 + room + 1) == believed
+        assert len(reader.packets.offsets) < 20
+
+
+def test_a_file_full_of_heads_does_not_keep_a_reader_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every head of the file promises all the rest of it."""
+    data, _, offsets = whole()
+    rows = 20_000
+    head = struct.pack("<BBHIId", RecordType.KEY, 0, 0, 10_000, 1, 9.0)
+    hostile = data[: offsets[2]] + head * rows + bytes(10_000)
+    read, record_at = [], damage_module.record_at
+    monkeypatch.setattr(damage_module, "record_at", lambda *given: read.append(1) or record_at(*given))
+    assert len(StreamReader(hostile)) == 1
+    assert 0 < 10_000 * len(read) <= 4 * len(hostile)
+
+
+def test_heads_across_pieces_of_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, _, offsets = whole()
+    for size in (8, 9, 64, 1000):
+        monkeypatch.setattr(damage_module, "_CHUNK_BYTES", size)
+        found = Search(data).next(offsets[1], expected=0, after_seconds=0.0)
+        assert found is not None
+        assert found.offset == offsets[2]
+
+
+def test_a_stream_whose_lengths_are_wrong_is_not_cut_by_resuming(tmp_path: Path) -> None:
+    data, _, offsets = whole()
+    path = tmp_path / "damaged.sgs"
+    path.write_bytes(flipped(data, 8 * offsets[2] + 8 * 7))  # the highest byte of the length
+    with pytest.raises(StreamError, match="it is cut at byte .*, and whole frames follow it"):
+        FileSink.resume(path)

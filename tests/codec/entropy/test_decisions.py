@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive decisions: C++ against Python, and what the arithmetic code promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from structgstream.codec.entropy import reference_decisions as reference
+from structgstream.codec.entropy.decisions import code_activity, code_numbers, code_residuals
+from structgstream.codec.entropy.models import (
+    ACTIVITY_CONTEXTS,
+    BLOCK_CONTEXTS,
+    NUMBER_NODES,
+    Arithmetic,
+    Model,
+    Models,
+    residual_contexts,
+)
+from structgstream.codec.entropy.rans import has_native
+from structgstream.errors import StreamError
+
+NATIVE = [False, *([True] if has_native() else [])]
+both = pytest.mark.parametrize("native", NATIVE)
+NUMBER = st.one_of(st.integers(-9, 9), st.integers(-(2**31) + 1, 2**31 - 1))
+
+
+def coded_numbers(values: list[int], *, native: bool, flags: bool = False) -> tuple[bytes, Model]:
+    model, code = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES), Arithmetic(None)
+    given = np.array(values, np.int64)
+    assert code_numbers(code, model, contexts=contexts_for(values), values=given, flags=flags, native=native)
+    return code.finished(), model
+
+
+def contexts_for(values: list[int]) -> np.ndarray:
+    places = np.arange(len(values), dtype=np.int32)
+    return np.stack([places % 2, places % 3, 0 * places], axis=1)
+
+
+@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@settings(max_examples=60, deadline=None)
+@given(st.lists(NUMBER, max_size=40), st.booleans())
+def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> None:
+    values = [value & 1 for value in values] if flags else values
+    (one, mine), (two, its) = (coded_numbers(values, native=native, flags=flags) for native in (False, True))
+    assert one == two
+    for name in ("chances", "seen", "weights"):
+        assert (getattr(mine, name) == getattr(its, name)).all()
+    for native in NATIVE:
+        code, found = Arithmetic(one), np.zeros(len(values), np.int64)
+        model = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES)
+        assert code_numbers(code, model, contexts=contexts_for(values), values=found, flags=flags, native=native)
+        assert found.tolist() == values
+        assert code.is_whole() or not values
+        assert not code.is_over()
+
+
+@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 150))
+def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
+    g = np.random.default_rng(seed)
+    active = (g.random(rows) < g.choice([0.02, 0.3, 0.9])).astype(np.uint8)
+    history = g.integers(0, 8, rows).astype(np.uint8)
+    sizes = g.integers(0, 40, rows).astype(np.int32)
+    values, last = (np.rint(g.laplace(0, g.choice([0.5, 9, 1e5]), (rows, 3))).astype(np.int32) for _ in range(2))
+    found = []
+    for native in NATIVE:
+        blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
+        model, code = Model.new(residual_contexts(3), nodes=NUMBER_NODES), Arithmetic(None)
+        code_activity(code, (blocks, its_rows), history=history, sizes=sizes, active=active.copy(), native=native)
+        assert code_residuals(code, model, last=last, others=sizes, residuals=values.copy(), native=native)
+        data = code.finished()
+        found.append([data, blocks.chances.tolist(), its_rows.weights.tolist(), model.chances.tolist()])
+        again = Arithmetic(data)
+        blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
+        model, back, residuals = Model.new(residual_contexts(3), nodes=NUMBER_NODES), 0 * active, 0 * values
+        code_activity(again, (blocks, its_rows), history=history, sizes=sizes, active=back, native=native)
+        assert code_residuals(again, model, last=last, others=sizes, residuals=residuals, native=native)
+        assert again.is_whole() or not rows
+        assert (back == active).all()
+        assert (residuals == values).all()
+    assert found[0] == found[-1]
+
+
+@both
+def test_the_example_of_the_document(native: bool) -> None:
+    model, code = Model.new([2], nodes=NUMBER_NODES), Arithmetic(None)
+    values, contexts = np.array([0, 3, -1, 20, 0]), np.array([[0], [0], [1], [1], [0]], np.int32)
+    code_numbers(code, model, contexts=contexts, values=values, native=native)
+    assert code.finished().hex(" ") == "92 a5 ec 05"
+
+
+@both
+def test_what_is_certain_takes_next_to_nothing_and_what_is_not_a_bit(native: bool) -> None:
+    assert len(coded_numbers([0] * 10_000, native=native, flags=True)[0]) < 8
+    coins = np.random.default_rng(2).integers(0, 2, 8000).tolist()
+    assert 1000 < len(coded_numbers(coins, native=native, flags=True)[0]) < 1030
+
+
+@both
+def test_carries_run_through_many_bytes(native: bool) -> None:
+    """Likely decisions first and unlikely ones then push the code to the upper end of its range."""
+    for seed in range(30):
+        g = np.random.default_rng(seed)
+        values = [*([1] * 400), *g.integers(0, 2, 5).tolist(), *([0] * int(g.integers(1, 60)))]
+        data, _ = coded_numbers(values, native=native, flags=True)
+        code, found = Arithmetic(data), np.zeros(len(values), np.int64)
+        model = Model.new([2, 3, 1], nodes=1)
+        code_numbers(code, model, contexts=contexts_for(values), values=found, flags=True, native=native)
+        assert found.tolist() == values
+
+
+@both
+def test_a_code_that_is_cut_or_goes_on_is_not_whole(native: bool) -> None:
+    values = np.random.default_rng(3).integers(-5, 6, 60).tolist()
+    data, _ = coded_numbers(values, native=native)
+    for other in (data + b"\0", data[:-2], b""):
+        code, found = Arithmetic(other), np.zeros(60, np.int64)
+        model = Model.new([2, 3, 1], nodes=NUMBER_NODES)
+        code_numbers(code, model, contexts=contexts_for(values), values=found, native=native)
+        assert not code.is_whole() or found.tolist() != values
+    assert Arithmetic(b"").is_whole()
+    assert not Arithmetic(b"\0").is_whole()
+
+
+@both
+def test_any_bytes_are_numbers_or_damage(native: bool) -> None:
+    """Bits that always say yes make the largest number there is, which is refused."""
+    g = np.random.default_rng(4)
+    for data in (b"", bytes(40), b"\xff" * 40, *(g.bytes(30) for _ in range(50))):
+        code, found = Arithmetic(data), np.zeros(50, np.int64)
+        model = Model.new([2, 3, 1], nodes=NUMBER_NODES)
+        if code_numbers(code, model, contexts=contexts_for([0] * 50), values=found, native=native):
+            assert (np.abs(found) < 2**31).all()
+
+
+def test_squash_and_stretch_belong_together() -> None:
+    chances = [reference.squashed(logit) for logit in range(-reference.FAR, reference.FAR + 1)]
+    assert chances == sorted(chances)
+    assert (chances[0], chances[reference.FAR], chances[-1]) == (32, 32768, 65504)
+    logits = reference.stretched()
+    assert logits == sorted(logits)
+    for i in range(4096):
+        assert abs(reference.squashed(logits[i]) - 16 * i - 8) <= 70 or i in (0, 1, 4094, 4095)
+
+
+def test_a_model_of_others_is_a_copy() -> None:
+    first = Models()
+    first.get("a.b", [2], nodes=1).chances[:] = 5
+    second = Models(first)
+    second.get("a.b", [2], nodes=1).chances[:] = 7
+    assert first.get("a.b", [2], nodes=1).chances.tolist() == [[5], [5]]
+    assert second.all()["a.b"].chances.tolist() == [[7], [7]]
+
+
+@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+def test_a_model_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(StreamError, match="do not fit their models"):
+        code_numbers(
+            Arithmetic(None),
+            Model.new([1, 1], nodes=NUMBER_NODES),
+            contexts=np.zeros((1, 2), np.int32),
+            values=np.zeros(1, np.int64),
+            native=True,
+        )

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+import importlib
+import struct
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from structgstream.codec.entropy import rans
+from structgstream.codec.entropy.rans import LANES, decode, encode, has_native, lanes_for, section_bytes
+from structgstream.codec.entropy.tables import FrequencyTables, normalised
+from structgstream.errors import StreamError
+
+NATIVE = [False, *([True] if has_native() else [])]
+both = pytest.mark.parametrize("native", NATIVE, ids=lambda native: "C++" if native else "NumPy")
+
+
+def drawn(seed: int, *, count: int, contexts: int = 5, alphabet: int = 16, even: bool = False):
+    """Symbols, contexts and tables in which all of the symbols that occur can be coded."""
+    g = np.random.default_rng(seed)
+    context = g.integers(0, contexts, count).astype(np.uint16)
+    spread = np.linspace(0.3, 3.0, contexts)[context]
+    symbol = g.integers(0, alphabet, count) if even else np.minimum(g.geometric(1 / (1 + spread)) - 1, alphabet - 1)
+    return symbol.astype(np.uint8), context, normalised(counted(symbol, context, contexts=contexts, alphabet=alphabet))
+
+
+def counted(symbols: np.ndarray, context: np.ndarray, *, contexts: int, alphabet: int) -> np.ndarray:
+    counts = np.zeros((contexts, alphabet), np.int64)
+    np.add.at(counts, (context, symbols), 1)
+    return counts
+
+
+def entropy_bytes(counts: np.ndarray) -> float:
+    p = counts / np.maximum(counts.sum(1, keepdims=True), 1)
+    return float(-(counts * np.log2(np.where(p > 0, p, 1))).sum()) / 8
+
+
+@both
+@settings(deadline=None, max_examples=60)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 200),
+    contexts=st.integers(1, 40),
+    alphabet=st.integers(1, 32),
+    lanes=st.sampled_from(LANES),
+    even=st.booleans(),
+)
+def test_symbols_come_back(native, seed, count, contexts, alphabet, lanes, even) -> None:
+    symbols, context, tables = drawn(seed, count=count, contexts=contexts, alphabet=alphabet, even=even)
+    data = encode(symbols, context, tables, lanes=lanes, native=native)
+    assert (decode(data, context, tables, native=native) == symbols).all()
+    assert section_bytes(data + b"more") == len(data)
+
+
+@both
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_any_table_codes_what_it_has_a_frequency_for(native, data: st.DataObject) -> None:
+    weights = data.draw(st.lists(st.integers(0, 2**20), min_size=1, max_size=32).filter(any))
+    tables = normalised(np.array([weights]))
+    possible = np.flatnonzero(tables.rows[0]).tolist()
+    symbols = np.array(data.draw(st.lists(st.sampled_from(possible), max_size=80)), np.uint8)
+    context = np.zeros(len(symbols), np.uint16)
+    assert (decode(encode(symbols, context, tables, native=native), context, tables, native=native) == symbols).all()
+
+
+@pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
+@pytest.mark.parametrize("count", [1, 31, 33, 999, 5000])
+@pytest.mark.parametrize("lanes", LANES)
+def test_both_coders_write_the_same_bytes_and_read_each_other(count: int, lanes: int) -> None:
+    symbols, context, tables = drawn(count, count=count, contexts=50)
+    data = encode(symbols, context, tables, lanes=lanes, native=True)
+    assert data == encode(symbols, context, tables, lanes=lanes, native=False)
+    assert (decode(data, context, tables, native=True) == decode(data, context, tables, native=False)).all()
+
+
+def plain_decode(data: bytes, context: np.ndarray, tables: FrequencyTables) -> list[int]:
+    """One symbol at a time, written from docs/entropy.md alone."""
+    place = 0
+
+    def varint() -> int:
+        nonlocal place
+        value = shift = 0
+        while True:
+            byte, place = data[place], place + 1
+            value, shift = value | (byte & 127) << shift, shift + 7
+            if byte < 128:
+                return value
+
+    count = varint()
+    word_count, code = divmod(varint(), 4)
+    lanes = {0: 1, 1: 4, 2: 32}[code]
+    states = list(struct.unpack_from(f"<{lanes}I", data, place))
+    words = iter(struct.unpack_from(f"<{word_count}H", data, place + 4 * lanes))
+    found = []
+    for i in range(count):
+        x, row = states[i % lanes], tables.rows[context[i]].tolist()
+        slot, symbol, start = x % 4096, 0, 0
+        while slot >= start + row[symbol]:
+            start, symbol = start + row[symbol], symbol + 1
+        x = row[symbol] * (x >> 12) + slot - start
+        states[i % lanes] = x if x >= 2**16 else x * 2**16 + next(words)
+        found.append(symbol)
+    assert set(states) == {2**16}
+    assert next(words, None) is None
+    return found
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_a_decoder_written_from_the_document_agrees(lanes: int) -> None:
+    for seed in range(5):
+        symbols, context, tables = drawn(seed, count=700, contexts=7, even=seed == 0)
+        assert plain_decode(encode(symbols, context, tables, lanes=lanes), context, tables) == symbols.tolist()
+
+
+@both
+def test_the_bytes_are_those_of_the_document(native) -> None:
+    """The example of docs/entropy.md, worked by hand there."""
+    tables = FrequencyTables(np.array([[3072, 1024], [3, 4093]], np.uint16))
+    symbols, context = np.array([0, 1, 0, 0], np.uint8), np.array([0, 0, 1, 1], np.uint16)
+    data = encode(symbols, context, tables, native=native)
+    assert data == bytes.fromhex("04 04  00 B8 97 00  01 50")
+    assert decode(data, context, tables, native=native).tolist() == [0, 1, 0, 0]
+
+
+def test_a_certain_symbol_costs_nothing() -> None:
+    tables = FrequencyTables(np.array([[0, 4096]], np.uint16))
+    assert len(encode(np.ones(5000, np.uint8), np.zeros(5000, np.uint16), tables)) == 2 + 1 + 4
+
+
+def test_no_symbols_are_one_byte() -> None:
+    nothing = np.empty(0, np.uint8), np.empty(0, np.uint16), FrequencyTables(np.array([[4096]], np.uint16))
+    assert encode(*nothing) == b"\0"
+    assert len(decode(b"\0", *nothing[1:])) == 0
+
+
+def test_a_section_takes_more_lanes_as_it_grows() -> None:
+    sizes = {count: lanes_for(*drawn(0, count=count, even=True)) for count in (100, 9000, 9500, 94_000, 96_000)}
+    assert sizes == {100: 1, 9000: 1, 9500: 4, 94_000: 4, 96_000: 32}
+
+
+@pytest.mark.parametrize("lanes", LANES)
+def test_lanes_cost_three_bytes_each(lanes: int) -> None:
+    """The number from which the encoder chooses."""
+    cost = [
+        len(encode(*arguments, lanes=lanes)) - len(encode(*arguments, lanes=1))
+        for arguments in (drawn(seed, count=1500) for seed in range(20))
+    ]
+    assert abs(np.mean(cost) - 3 * (lanes - 1)) < 1 + 0.1 * lanes
+
+
+def test_peaked_symbols_are_within_a_hundredth_of_their_entropy_and_of_constriction() -> None:
+    symbols, context, tables = drawn(3, count=30_000, contexts=50)
+    size = len(encode(symbols, context, tables))
+    bound = entropy_bytes(counted(symbols, context, contexts=50, alphabet=16))
+    assert bound <= size <= 1.01 * bound
+    stream: Any = importlib.import_module("constriction").stream  # its type stubs leave this out
+    coder = stream.stack.AnsCoder()
+    probabilities = (tables.rows[context] / 4096).astype(np.float32)
+    coder.encode_reverse(symbols.astype(np.int32), stream.model.Categorical(perfect=False), probabilities)
+    assert size <= 1.005 * coder.num_valid_bits() / 8
+
+
+# What is damaged.
+
+
+@both
+@pytest.mark.parametrize("lanes", LANES)
+def test_every_damaged_byte_is_refused_or_gives_as_many_symbols(native, lanes: int) -> None:
+    symbols, context, tables = drawn(4, count=150)
+    data = encode(symbols, context, tables, lanes=lanes)
+    refused = 0
+    for place in range(len(data)):
+        for change in (0x01, 0x80, 0xFF, 0x5A):
+            damaged = bytearray(data)
+            damaged[place] ^= change
+            try:
+                found = decode(bytes(damaged), context, tables, native=native)
+                assert found.shape == symbols.shape
+                assert (tables.rows[context, found] > 0).all()
+            except StreamError:
+                refused += 1
+    assert refused > 0.95 * 4 * len(data)
+
+
+@both
+def test_every_cut_and_everything_behind_it_is_refused(native) -> None:
+    symbols, context, tables = drawn(5, count=100)
+    data = encode(symbols, context, tables)
+    for end in range(len(data)):
+        with pytest.raises(StreamError, match=r"damaged|cut"):
+            decode(data[:end], context, tables, native=native)
+        with pytest.raises(StreamError, match=r"damaged|cut"):
+            section_bytes(data[:end])
+    with pytest.raises(StreamError, match="but states"):
+        decode(data + b"\0", context, tables, native=native)
+
+
+@both
+@settings(deadline=None, max_examples=150)
+@given(
+    count=st.integers(1, 80),
+    lanes=st.sampled_from(range(3)),
+    states=st.binary(min_size=128, max_size=128),
+    data=st.data(),
+)
+def test_arbitrary_states_and_words_never_do_harm(native, count: int, lanes: int, states: bytes, data) -> None:
+    word_count = data.draw(st.integers(0, min(count, 31)))
+    words = data.draw(st.binary(min_size=2 * word_count, max_size=2 * word_count))
+    _, context, tables = drawn(count, count=count)
+    section = bytes([count, word_count << 2 | lanes]) + states[: 4 * LANES[lanes]] + words
+    assert section_bytes(section) == len(section)
+    with suppress(StreamError):
+        assert decode(section, context, tables, native=native).shape == (count,)
+
+
+@both
+@settings(deadline=None, max_examples=150)
+@given(st.binary(max_size=60))
+def test_arbitrary_bytes_are_refused_or_decode(native, data: bytes) -> None:
+    _, context, tables = drawn(6, count=20)
+    for count in {0, 1, 20, min(data[0], 20) if data else 0}:
+        with suppress(StreamError):
+            assert len(decode(data, context[:count], tables, native=native)) == count
+
+
+@pytest.mark.parametrize(
+    ("head", "problem"),
+    [
+        (b"\xff\xff\xff\xff\xff", "first bytes"),
+        (b"\xff\xff\xff\xff\x0f\x00", "damaged"),  # 2^32 - 1 symbols
+        (b"\x14\xfc\xff\xff\xff\x0f", "damaged"),  # more words than symbols
+        (b"\x14\x03", "damaged"),  # the lane code that means nothing
+        (b"\x15\x00", "states 21 symbols, 20 are expected"),
+        (b"\x00", "states 0 symbols"),
+        (b"\x14\x00" + struct.pack("<I", 0xFFFF), "contradict"),  # a state below 2^16
+    ],
+)
+def test_what_a_head_states_is_checked_first(head: bytes, problem: str) -> None:
+    _, context, tables = drawn(6, count=20)
+    with pytest.raises(StreamError, match=problem):
+        decode(head, context, tables)
+
+
+@both
+def test_states_that_do_not_come_home_are_refused(native) -> None:
+    tables = FrequencyTables(np.array([[4096]], np.uint16))
+    context = np.zeros(20, np.uint16)
+    assert decode(b"\x14\x00" + struct.pack("<I", 1 << 16), context, tables, native=native).tolist() == [0] * 20
+    with pytest.raises(StreamError, match="contradict"):
+        decode(b"\x14\x00" + struct.pack("<I", (1 << 16) + 1), context, tables, native=native)
+
+
+def test_an_encoder_is_told_what_does_not_fit() -> None:
+    tables = FrequencyTables(np.array([[4095, 1, 0]], np.uint16))
+    zero = np.zeros(2, np.uint16)
+    cases: list[tuple[list[int], np.ndarray, str]] = [
+        ([0, 2], zero, "no frequency"),
+        ([0, 3], zero, "no frequency"),
+        ([0], zero, "one for each"),
+        ([0, 0], zero + 1, "Context 1 has no table"),
+        ([0, 0], zero.astype(np.int64), "must be uint16"),
+    ]
+    for symbols, context, problem in cases:
+        with pytest.raises(StreamError, match=problem):
+            encode(np.array(symbols, np.uint8), context, tables)
+    with pytest.raises(StreamError, match="Context 1 has no table"):
+        decode(b"\x02\x00", np.ones(2, np.uint16), tables)
+
+
+def test_lanes_other_than_the_formats_are_refused() -> None:
+    symbols, context, tables = drawn(1, count=20)
+    with pytest.raises(StreamError, match="1, 4 or 32 lanes"):
+        encode(symbols, context, tables, lanes=2)
+
+
+def test_without_the_native_library_numpy_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    symbols, context, tables = drawn(1, count=200)
+    data = encode(symbols, context, tables)
+    monkeypatch.setattr(rans, "native_reason", lambda: "none")
+    assert encode(symbols, context, tables) == data
+    assert (decode(data, context, tables) == symbols).all()
+    with pytest.raises(StreamError, match="no entropy coder"):
+        decode(data, context, tables, native=True)

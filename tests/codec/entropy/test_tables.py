@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+from contextlib import suppress
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from structgstream.codec.entropy.bits import fixed, packed_bits, signed_golomb
+from structgstream.codec.entropy.rans import encode
+from structgstream.codec.entropy.table_choice import chosen_tables
+from structgstream.codec.entropy.table_sets import decoded_tables, levels_of, top_level, weights_of
+from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, code_costs, geometric, logs, normalised
+from structgstream.errors import StreamError
+
+COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 2**31)), min_size=1, max_size=32)
+
+
+def bits_for(counts: np.ndarray, rows: np.ndarray) -> float:
+    """Exact code length in bits."""
+    with np.errstate(divide="ignore"):
+        cost = np.where(counts > 0, -np.log2(rows / TOTAL), 0)
+    return float((counts * cost).sum())
+
+
+def laplace_counts(*, count: int, contexts: int, low: float, high: float, seed: int = 0) -> np.ndarray:
+    g = np.random.default_rng(seed)
+    context = g.integers(0, contexts, count)
+    values = np.rint(g.laplace(0, np.linspace(low, high, contexts)[context])).astype(int)
+    symbols = np.minimum(np.where(values >= 0, 2 * values, -2 * values - 1), 15)
+    counts = np.zeros((contexts, 16), np.int64)
+    np.add.at(counts, (context, symbols), 1)
+    return counts
+
+
+# Frequencies.
+
+
+@given(COUNTS)
+def test_what_occurs_has_a_frequency_and_a_row_sums_to_4096(counts: list[int]) -> None:
+    row = normalised(np.array([counts])).rows[0]
+    assert row.sum() == TOTAL
+    assert ((row > 0) == (np.array(counts) > 0)).all() or not any(counts)
+
+
+@pytest.mark.parametrize("counts", [[1000, 3, 1], [70_000, 2, 2], [5, 5, 5], [1, 100, 10_000], [123_456, 65_432, 7]])
+def test_no_other_frequencies_code_noticeably_shorter(counts: list[int]) -> None:
+    """The code length is convex in the frequencies: what is best nearby is best."""
+    n = np.array(counts)
+    row = normalised(n[None]).rows[0].astype(int)
+    step = np.arange(-100, 101)
+    first, second = np.meshgrid(row[0] + step, row[1] + step, indexing="ij")
+    others = np.stack([first, second, TOTAL - first - second])
+    bits = (n[:, None, None] * -np.log2(np.maximum(others, 0.5) / TOTAL)).sum(0)
+    best = float(bits[(others > 0).all(0)].min())
+    assert bits_for(n, row) <= best * (1 + 1e-5) + 1e-9
+
+
+def test_equals_are_served_from_the_first_on() -> None:
+    assert normalised(np.array([[7, 7, 7]])).rows.tolist() == [[1366, 1365, 1365]]
+    assert normalised(np.array([[0, 0, 0]])).rows.tolist() == [[1366, 1365, 1365]]
+    assert normalised(np.array([[1, 0, 10**9, 1, 10**9]])).rows.tolist() == [[1, 0, 2047, 1, 2047]]
+
+
+def test_counts_and_tables_that_cannot_be_are_refused() -> None:
+    for counts in ([[-1, 2]], [[1 << 40, 2]]):
+        with pytest.raises(StreamError, match="Counts"):
+            normalised(np.array(counts))
+    for rows in (np.full((1, 2), 2000, np.uint16), np.full((1, 2), 2048), np.zeros((2, 0), np.uint16)):
+        with pytest.raises(StreamError, match="must"):
+            FrequencyTables(rows)
+    with pytest.raises(StreamError, match="at most 4096 contexts"):
+        FrequencyTables(np.full((4097, 1), TOTAL, np.uint16))
+
+
+def test_costs_are_logarithms() -> None:
+    exact = np.log2(np.arange(1, 8192)) * 65536
+    assert ((logs()[1:] <= exact + 1e-6) & (logs()[1:] > exact - 1.001)).all()
+    assert code_costs()[[1, 2048, 4096]].tolist() == [12 << 16, 1 << 16, 0]
+
+
+def test_the_default_family_is_that_of_the_document() -> None:
+    """The example of docs/entropy.md: number 8 * 12 + 4."""
+    assert geometric(np.array([100]), alphabet=5).rows.tolist() == [[3644, 145, 145, 81, 81]]
+    rows = geometric(np.arange(256), alphabet=16).rows.astype(int)
+    assert (rows > 0).all()
+    assert (np.diff(rows[:, 1::2], axis=1) <= 0).all()
+    # The largest may have got the rest; all others come in equal pairs.
+    pairs = rows[8 * 8 :]
+    assert (pairs[:, 1:15:2] == pairs[:, 2:16:2]).all()
+    zero = rows[::8, 0] / TOTAL
+    assert zero[0] < 0.2
+    assert zero[-1] > 0.995
+    assert (np.diff(zero[8:]) >= 0).all()
+
+
+@pytest.mark.parametrize("alphabet", [2, 3, 31, 32])
+def test_the_default_family_has_any_alphabet(alphabet: int) -> None:
+    assert geometric(np.arange(256), alphabet=alphabet).alphabet == alphabet
+
+
+def test_numbers_and_alphabets_without_a_family_are_refused() -> None:
+    for number, alphabet in ((256, 16), (-1, 16), (0, 1), (0, 33)):
+        with pytest.raises(StreamError, match="geometric rows"):
+            geometric(np.array([number]), alphabet=alphabet)
+
+
+@pytest.mark.parametrize("precision", range(4))
+def test_levels_are_floating_point_numbers(precision: int) -> None:
+    f = np.arange(1, TOTAL + 1)
+    levels = levels_of(f, precision=precision)
+    values = weights_of(levels, precision=precision) / 2**precision
+    assert ((values <= f) & (values > f * (1 - 2.0**-precision) - 1e-9)).all()
+    assert (levels.min(), weights_of(np.zeros(1, int), precision=precision)[0]) == (1, 0)
+    assert levels.max() <= top_level(precision)
+    every = np.arange(1, top_level(precision) + 1)
+    assert (np.diff(weights_of(every, precision=precision)) > 0).all()
+
+
+# Table sets.
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.data())
+def test_chosen_tables_come_back_and_can_code_what_was_counted(data: st.DataObject) -> None:
+    contexts, alphabet = data.draw(st.integers(1, 6)), data.draw(st.integers(2, 32))
+    row = st.lists(
+        st.one_of(st.just(0), st.integers(0, 5), st.integers(0, 10**6)), min_size=alphabet, max_size=alphabet
+    )
+    counts = np.array(data.draw(st.lists(row, min_size=contexts, max_size=contexts)))
+    before = np.array(data.draw(st.lists(row, min_size=contexts, max_size=contexts)))
+    previous = normalised(before)
+    tables, bits = chosen_tables(counts, previous)
+    assert (decoded_tables(bits, previous).rows == tables.rows).all()
+    assert (tables.rows[counts > 0] > 0).all()
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 2**31), st.integers(1, 5000))
+def test_a_choice_is_never_longer_than_keeping_what_there_is(seed: int, count: int) -> None:
+    counts = laplace_counts(count=count, contexts=8, low=0.2, high=2, seed=seed)
+    previous = geometric(np.full(8, 100), alphabet=16)
+    tables, bits = chosen_tables(counts, previous)
+    assert bits_for(counts, tables.rows) + 8 * len(bits) <= bits_for(counts, previous.rows) + 8 + 8
+
+
+def test_tables_that_fit_are_kept_in_no_bytes() -> None:
+    counts = laplace_counts(count=20_000, contexts=50, low=0.2, high=2)
+    tables, _ = chosen_tables(counts, geometric(np.full(50, 100), alphabet=16))
+    again, bits = chosen_tables(counts, tables)
+    assert bits == b""
+    assert (again.rows == tables.rows).all()
+    assert (decoded_tables(bytes(7), tables).rows == tables.rows).all(), "a bit each says the same"
+    nothing, bits = chosen_tables(np.zeros((50, 16), np.int64), tables)
+    assert bits == b""
+    assert (nothing.rows == tables.rows).all()
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.2, 0.6), (0.3, 1.0), (0.5, 2.0), (1.5, 5.0)])
+def test_fifty_contexts_of_peaked_symbols_with_tables_are_within_a_twentieth(low: float, high: float) -> None:
+    counts = laplace_counts(count=30_000, contexts=50, low=low, high=high)
+    tables, bits = chosen_tables(counts, geometric(np.full(50, 100), alphabet=16))
+    context, symbols = np.divmod(np.repeat(np.arange(counts.size), counts.reshape(-1)), 16)
+    section = encode(symbols.astype(np.uint8), context.astype(np.uint16), tables)
+    p = counts / counts.sum(1, keepdims=True)
+    entropy = float(-(counts * np.log2(np.where(p > 0, p, 1))).sum()) / 8
+    assert len(bits) + len(section) <= 1.05 * entropy
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_peaked_row_of_no_family_takes_ten_bytes(seed: int) -> None:
+    g = np.random.default_rng(seed)
+    shape = np.exp(-np.arange(16) / 2) * np.exp(g.normal(0, 0.5, 16))
+    counts = np.rint(2000 * shape / shape.sum()).astype(int)[None]
+    tables, bits = chosen_tables(counts, geometric(np.array([100]), alphabet=16))
+    assert len(bits) <= 10
+    assert bits_for(counts, tables.rows) <= 1.01 * bits_for(counts, normalised(counts).rows)
+
+
+def test_precision_follows_the_number_of_symbols() -> None:
+    shape = np.array([[700, 130, 90, 33, 57, 12, 15, 1, 0, 4, 0, 0, 0, 0, 0, 2]])
+    previous = geometric(np.array([100]), alphabet=16)
+    excess = []
+    for times in (1, 10, 1000):
+        tables, bits = chosen_tables(shape * times, previous)
+        excess.append((len(bits), bits_for(shape, tables.rows) / bits_for(shape, normalised(shape).rows) - 1))
+    (few, rough), (_, better), (many, fine) = excess
+    assert few < many <= 16
+    assert rough > better > fine
+    assert fine < 1e-3
+
+
+def plain_normalised(weights: list[int]) -> list[int]:
+    """As docs/entropy.md says it, in Python's integers."""
+    total = sum(weights)
+    row = [max(1, 4096 * w // total) if w else 0 for w in weights]
+    row[weights.index(max(weights))] += 4096 - sum(row)
+    return row
+
+
+def plain_geometric(number: int, alphabet: int) -> list[int]:
+    z, q, u = number >> 3, number % 8, 2**16
+    weights = [0]
+    for _ in range(16):
+        weights += [max(u, 1)] * 2
+        u = u * (2 * q + 1) >> 4
+    weights = weights[:alphabet]
+    weights[0] = (2 + z % 2) * 2 ** (z >> 1) * sum(weights) >> 4
+    return plain_normalised(weights)
+
+
+def plain_tables(data: bytes, previous: list[list[int]]) -> list[list[int]]:
+    text = iter("".join(f"{byte:08b}" for byte in data))
+    alphabet = len(previous[0])
+
+    def bits(width: int) -> int:
+        return sum(int(next(text)) << place for place in reversed(range(width)))
+
+    def signed(order: int) -> int:
+        zeros = 0
+        while next(text) == "0":
+            zeros += 1
+        value = (1 << zeros + order) + bits(zeros + order) - (1 << order)
+        return -(value + 1) // 2 if value % 2 else value // 2
+
+    def level(f: int, p: int) -> int:
+        exponent = max(f, 1).bit_length() - 1
+        return 1 + exponent * 2**p + max(f, 1) * 2**p // 2**exponent - 2**p
+
+    rows = []
+    for row in previous if data else ():
+        if not bits(1):
+            rows.append(row)
+        elif not bits(1):
+            rows.append(plain_geometric(bits(8), alphabet))
+        else:
+            reference = plain_geometric(bits(8), alphabet) if bits(1) else row
+            p, order, told = bits(2), bits(1), bits(1)
+            present = [s for s in range(alphabet) if bits(1)] if told else list(range(bits(5) + 1))
+            weights = [0] * alphabet
+            for symbol in present:
+                place = level(reference[symbol], p) + (signed(order) if len(present) > 1 else 0) - 1
+                weights[symbol] = (2**p + place % 2**p) << place // 2**p
+            rows.append(plain_normalised(weights))
+    return rows or previous
+
+
+@pytest.mark.parametrize("alphabet", [2, 5, 16, 32])
+def test_the_family_written_from_the_document_agrees(alphabet: int) -> None:
+    rows = geometric(np.arange(256), alphabet=alphabet).rows
+    assert rows.tolist() == [plain_geometric(g, alphabet) for g in range(256)]
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**31), st.integers(2, 32), st.integers(1, 7))
+def test_a_decoder_written_from_the_document_agrees(seed: int, alphabet: int, size: int) -> None:
+    g = np.random.default_rng(seed)
+    shapes = np.exp(-np.arange(alphabet) / g.uniform(0.5, 8) + g.normal(0, 0.6, (4, alphabet)))
+    counts = g.poisson(10**size * shapes * (g.random((4, alphabet)) < 0.8))
+    previous = normalised(g.poisson(500 * shapes))
+    tables, data = chosen_tables(counts, previous)
+    assert plain_tables(data, previous.rows.tolist()) == tables.rows.tolist()
+
+
+def row_bits(*, head: str = "110", precision: int = 1, order: int = 0, presence: str, steps: list[int]) -> bytes:
+    text = head + fixed(precision, 2) + fixed(order, 1) + presence
+    return packed_bits([text, *(signed_golomb(step, order=order) for step in steps)])
+
+
+def test_the_rows_of_the_document() -> None:
+    """The example of docs/entropy.md: a row with steps against the previous one."""
+    previous = FrequencyTables(np.array([[3072, 512, 512, 0]], np.uint16))
+    data = row_bits(presence="0" + fixed(2, 5), steps=[0, 1, -2])
+    assert data.hex() == "c82b20"
+    assert decoded_tables(data, previous).rows.tolist() == [[3072, 768, 256, 0]]
+    data = row_bits(presence="1" + "1001", steps=[0, 0])
+    assert decoded_tables(data, previous).rows.tolist() == [[4095, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"\x00\x00", "goes on"),
+        (b"\x40", "goes on"),
+        (bytes(400), "bytes for 1 contexts"),
+        (b"\x80", "ends within"),
+        (row_bits(presence="0" + fixed(4, 5), steps=[0] * 5), "more than 4"),
+        (row_bits(presence="1" + "0000", steps=[]), "without symbols"),
+        (row_bits(presence="0" + fixed(1, 5), steps=[4, 0]), "out of bounds"),
+        (row_bits(presence="0" + fixed(1, 5), steps=[-24, 0]), "out of bounds"),
+        (row_bits(presence="0" + fixed(1, 5), steps=[1 << 10, 0]), "cut or out of bounds"),
+    ],
+)
+def test_a_damaged_set_is_refused(data: bytes, problem: str) -> None:
+    with pytest.raises(StreamError, match=problem):
+        decoded_tables(data, FrequencyTables(np.array([[3072, 512, 512, 0]], np.uint16)))
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.binary(max_size=60))
+def test_arbitrary_bytes_are_refused_or_are_tables(data: bytes) -> None:
+    with suppress(StreamError):
+        assert decoded_tables(data, geometric(np.array([3, 100, 250]), alphabet=16)).contexts == 3
+
+
+def test_every_damaged_byte_is_refused_or_gives_tables() -> None:
+    previous = geometric(np.full(6, 100), alphabet=16)
+    _, bits = chosen_tables(laplace_counts(count=20_000, contexts=6, low=0.2, high=5), previous)
+    assert len(bits) > 20
+    for place, change in product(range(len(bits)), (0x01, 0x80, 0xFF, 0x5A)):
+        damaged = bytearray(bits)
+        damaged[place] ^= change
+        with suppress(StreamError):
+            assert decoded_tables(bytes(damaged), previous).rows.shape == previous.rows.shape
+
+
+def test_counts_of_another_shape_are_refused() -> None:
+    with pytest.raises(StreamError, match="must be of the tables' shape"):
+        chosen_tables(np.zeros((2, 16), np.int64), geometric(np.array([0]), alphabet=16))

@@ -1,0 +1,415 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compact codec from scene to file and back."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rigs import random_scene
+from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
+from structgstream.codec.container.blocks import coded_fields
+from structgstream.codec.container.payload import FRAME, packet_of
+from structgstream.codec.container.records import RECORD, RecordType, scanned
+from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
+from structgstream.codec.scene.shapes import check_shapes
+from structgstream.codec.sinks import MemorySink
+from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import PAPER_DYNAMIC, FieldName, flatten_head, scene_of, state_of
+
+FREE: frozenset[FieldName] = frozenset({"free", "free_births"})
+DYNAMICS: list[frozenset[FieldName]] = [
+    PAPER_DYNAMIC,
+    CODABLE,
+    FREE,
+    frozenset(),
+    frozenset({"anchor_positions"}),
+    frozenset({"color_mlp", "base_scales"}),
+]
+
+
+def next_scene(scene: Scene, frame: int, *, dynamic: frozenset[FieldName], g: torch.Generator) -> Scene:
+    """A third of the rows of everything dynamic moves; of free Gaussians a fifth dies and up to three are born."""
+    state = dict(state_of(scene))
+    for name in dynamic - FREE:
+        value = state[name]
+        which = torch.rand(value.shape[:1], generator=g) < 0.3
+        step = torch.randn(value.shape, generator=g) * 0.1
+        state[name] = torch.where(which.reshape(-1, *[1] * (value.dim() - 1)), value + step, value)
+    if "free" in dynamic:
+        alive = torch.rand(len(scene.free), generator=g) > 0.2
+        born = int(torch.randint(0, 4, (), generator=g))
+        moved = state["free"] + (torch.rand(len(alive), 1, generator=g) < 0.3) * torch.randn(
+            len(alive), 14, generator=g
+        )
+        state["free"] = torch.cat([moved[alive], torch.randn(born, 14, generator=g)])
+        state["free_births"] = torch.cat([state["free_births"][alive], (frame + 2**10) * 2**32 + torch.arange(born)])
+    return scene_of(state, distance_input=scene.distance_input)
+
+
+def story(first: Scene, frames: int, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC, seed: int = 0) -> list[Scene]:
+    g = torch.Generator().manual_seed(seed)
+    scenes = [first]
+    for frame in range(1, frames):
+        scenes.append(next_scene(scenes[-1], frame, dynamic=dynamic, g=g))
+    return scenes
+
+
+def written(
+    scenes: list[Scene], header: StreamHeader, *, keys: tuple[int, ...] = (0, 3)
+) -> tuple[bytes, list[Scene], list[Packet]]:
+    """The file, what the encoder says a reader will see, and the packets."""
+    sink, encoder = MemorySink(), SceneEncoder(header)
+    sink.open(header)
+    seen, packets = [], []
+    for i, scene in enumerate(scenes):
+        kind = PacketKind.KEY if i in keys else PacketKind.DELTA
+        encoded = encoder.encode(scene, index=i, pts_seconds=i / 30.0, kind=kind)
+        sink.write(encoded.packet)
+        seen.append(encoded.reconstruction)
+        packets.append(encoded.packet)
+    sink.close()
+    return sink.data, seen, packets
+
+
+@cache
+def small() -> tuple[StreamHeader, bytes, list[Scene], list[Packet]]:
+    """Five frames of three anchors and a few free Gaussians; two groups."""
+    first = small_scene(3, free=2)
+    header = compact_header(first)
+    return header, *written(story(first, 5), header)
+
+
+@pytest.mark.parametrize("dynamic", DYNAMICS, ids=lambda names: "+".join(sorted(names)) or "nothing")
+@pytest.mark.parametrize("anchors", [0, 1, 50])
+def test_a_reader_sees_what_the_encoder_says(dynamic: frozenset[FieldName], anchors: int) -> None:
+    first = random_scene(anchors, free=20 if dynamic >= FREE else 0, seed=3)
+    if "appearance" in dynamic:
+        first = with_appearance(first, 5)
+    header = compact_header(first, dynamic=dynamic)
+    scenes = story(first, 7, dynamic=dynamic)
+    data, seen, _ = written(scenes, header)
+    reader = StreamReader(data)
+    for (_, scene), expected, true in zip(reader.scenes(), seen, scenes, strict=True):
+        assert same(scene, expected)
+        state, wanted = state_of(scene), state_of(true)
+        assert torch.equal(state["free_births"], wanted["free_births"] if "free" in dynamic else torch.zeros(0))
+        for name in dynamic - {"free_births"}:
+            assert torch.allclose(state[name], wanted[name], atol=2.0**-7, rtol=0), name
+    for name in state_of(first).keys() - dynamic:
+        assert torch.allclose(state_of(seen[-1])[name], state_of(first)[name], atol=STATIC_STEP / 2, rtol=0), name
+        assert torch.equal(state_of(seen[-1])[name], state_of(seen[0])[name]), name
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.integers(0, 4), max_size=8))
+def test_frames_in_any_order(order: list[int]) -> None:
+    _, data, seen, _ = small()
+    reader = StreamReader(data)
+    assert all(same(reader.scene(index), seen[index]) for index in order)
+
+
+def test_forwards_backwards_and_twice() -> None:
+    _, data, seen, _ = small()
+    for order in (range(5), range(4, -1, -1), [3, 3, 4, 4, 0, 4, 1]):
+        reader = StreamReader(data, by_index=True)
+        assert all(same(reader.scene(i), seen[i]) for i in order)
+
+
+def test_a_group_stands_alone() -> None:
+    header, _, seen, packets = small()
+    decoder = SceneDecoder(header)
+    for index in (3, 4, 0, 1, 2, 3):
+        assert same(decoder.decode(packets[index]), seen[index])
+
+
+def test_damage_costs_its_group_and_no_more() -> None:
+    """Opened by the index, a flipped bit shows where its record is read: the frames after it in its group are lost."""
+    _, data, seen, _ = small()
+    packet = StreamReader(data).packets[1]
+    for at in range(packet.offset + 20, packet.offset + packet.bytes, 7):
+        mangled = bytearray(data)
+        mangled[at] ^= 16
+        reader = StreamReader(bytes(mangled), by_index=True)
+        for index in (2, 0, 1, 3, 2, 4):
+            if index in (1, 2):
+                with pytest.raises(StreamError, match=f"Packet 1 of The stream, at byte {packet.offset}, is damaged"):
+                    reader.scene(index)
+            else:
+                assert same(reader.scene(index), seen[index])
+
+
+def test_a_packet_out_of_order() -> None:
+    header, _, seen, packets = small()
+    decoder = SceneDecoder(header)
+    with pytest.raises(StreamError, match="Packet 1 needs packet 0, which was not decoded before it"):
+        decoder.decode(packets[1])
+    decoder.decode(packets[0])
+    with pytest.raises(StreamError, match="Packet 2 needs packet 1"):
+        decoder.decode(packets[2])
+    assert same(decoder.decode(packets[1]), seen[1]), "the packet before is still known"
+    with pytest.raises(StreamError, match="Packet 1 needs packet 0"):
+        decoder.decode(packets[1])
+
+
+def test_an_encoder_keeps_the_order_as_well() -> None:
+    first = small_scene()
+    encoder = CompactEncoder(compact_header(first))
+    with pytest.raises(StreamError, match="Packet 0 needs packet -1"):
+        encoder.encode(state_of(first), kind=PacketKind.DELTA, index=0)
+    encoder.encode(state_of(first), kind=PacketKind.KEY, index=0)
+    with pytest.raises(StreamError, match="Packet 2 needs packet 1"):
+        encoder.encode(state_of(first), kind=PacketKind.DELTA, index=2)
+
+
+def test_a_scene_of_another_size_is_refused() -> None:
+    encoder = CompactEncoder(compact_header(small_scene(3)))
+    with pytest.raises(StreamError, match="Frame 0 has 4 anchors, the header 3"):
+        encoder.encode(state_of(small_scene(4)), kind=PacketKind.KEY, index=0)
+    state: dict[FieldName, torch.Tensor] = {**state_of(small_scene(3)), "covariance_mlp": torch.zeros(7)}
+    with pytest.raises(StreamError, match="Frame 0 has covariance_mlp of another size"):
+        encoder.encode(state, kind=PacketKind.KEY, index=0)
+
+
+def test_what_stands_still_keeps_its_bins_and_costs_next_to_nothing() -> None:
+    first = random_scene(200, free=50, seed=1)
+    header = compact_header(first)
+    _data, seen, packets = written([first] * 4, header, keys=(0,))
+    assert all(same(seen[0], scene) for scene in seen[1:])
+    assert [len(packet.payload) < 260 for packet in packets] == [False, True, True, True]
+    # From what is drawn to the file nothing is rounded a second time.
+    again = written([seen[0]] * 2, header, keys=(0,))[1]
+    assert same(again[1], seen[0])
+
+
+def test_bytes_of_each_field_add_up() -> None:
+    _, data, _, packets = small()
+    reader = StreamReader(data)
+    for packet, info in zip(packets, reader.packets, strict=True):
+        assert info.field_bytes == packet.field_bytes
+        assert info.field_bytes.keys() == PAPER_DYNAMIC
+        assert sum(packet.field_bytes.values()) + 12 == len(packet.payload)
+
+
+def test_the_header_comes_back() -> None:
+    header = compact_header(small_scene(3, free=2), steps={name: float(np.float32(0.013)) for name in STEPS})
+    back = unpacked_header(packed_header(header))
+    assert (back.codec, back.steps, back.dynamic) == ("compact", header.steps, header.dynamic)
+    assert back.reference.keys() == {"anchor_positions", "offset_scales", "covariance_mlp"}
+    assert all(torch.equal(back.reference[name], value) for name, value in header.reference.items())
+    assert back.static.keys() == header.static.keys()
+
+
+def without(header: StreamHeader, name: str) -> dict[str, float]:
+    return {key: step for key, step in header.steps.items() if key != name}
+
+
+def test_a_header_that_does_not_fit_the_codec() -> None:
+    header = compact_header(small_scene(3, free=2))
+    reference = {name: value for name, value in header.reference.items() if name != "offset_scales"}
+    for wrong, message in (
+        (replace(header, steps=without(header, "free_quats")), "no step for free_quats"),
+        (replace(header, steps=without(header, "offset_scales")), "no step for offset_scales"),
+        (replace(header, reference=reference), "reference state does not hold the dynamic fields"),
+        (replace(header, reference={**header.reference, "base_scales": torch.zeros(3, 3)}), "reference state does not"),
+        (replace(header, dynamic=PAPER_DYNAMIC - {"free_births"}), "free Gaussians without their births"),
+        (replace(header, dynamic=PAPER_DYNAMIC | {"camera_color"}), "no coding for camera_color; keep it static"),
+        (
+            replace(header, reference={**header.reference, "anchor_positions": torch.full((3, 3), float("nan"))}),
+            "steps from zero",
+        ),
+    ):
+        with pytest.raises(StreamError, match=message):
+            SceneDecoder(wrong)
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, 0.1, 2.0**-65, 2.0**65, 1e300, "1", True, None])
+def test_a_step_that_is_none(step: object) -> None:
+    header = compact_header(small_scene())
+    with pytest.raises(StreamError, match="The init record does not follow the format"):
+        unpacked_header(packed_header(replace(header, steps={**header.steps, "free_quats": step})))  # type: ignore[dict-item]
+
+
+def test_a_value_out_of_range() -> None:
+    first = small_scene()
+    encoder = SceneEncoder(compact_header(first))
+    far = replace(first, anchors=replace(first.anchors, positions=first.anchors.positions + 1e6))
+    with pytest.raises(StreamError, match="steps from zero, at most 4194304 can be coded"):
+        encoder.encode(far, index=0, pts_seconds=0.0, kind=PacketKind.KEY)
+    assert encoder.encode(first, index=0, pts_seconds=0.0, kind=PacketKind.KEY).packet.index == 0
+
+
+def test_a_raw_block_in_a_compact_packet_and_the_other_way_round() -> None:
+    header, _, _, packets = small()
+    scene = small_scene(3, free=2)
+    raw = replace(header, codec="raw", steps={}, reference={})
+    packet = SceneEncoder(raw).encode(scene, index=0, pts_seconds=0.0, kind=PacketKind.KEY).packet
+    with pytest.raises(StreamError, match="holds field anchor_positions as it is, where it should be coded"):
+        SceneDecoder(header).decode(packet)
+    with pytest.raises(StreamError, match="holds field anchor_positions coded, where its numbers as they are belong"):
+        SceneDecoder(raw).decode(packets[0])
+
+
+def mended(data: bytes) -> bytes:
+    """The stream with right checksums, wherever the records' heads still stand."""
+    out, start = bytearray(data), 12
+    while start + RECORD.size + 4 <= len(out):
+        end = start + RECORD.size + RECORD.unpack_from(out, start)[3]
+        if end + 4 > len(out):
+            break
+        struct.pack_into("<I", out, end, zlib.crc32(out[start:end]))
+        if out[start] == RecordType.INDEX:
+            break
+        start = end + 4
+    return bytes(out)
+
+
+def test_mending_leaves_a_good_stream_as_it_is() -> None:
+    data = small()[1]
+    assert mended(data) == data
+
+
+def flipped(data: bytes, start: int = 0) -> Iterator[bytes]:
+    """One bit of every byte from ``start`` on changed."""
+    for at in range(start, len(data)):
+        yield data[:at] + bytes([data[at] ^ 1 << at % 8]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize("index", range(5))
+def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index: int) -> None:
+    """With the checksum out of the way, the decoders see it all."""
+    header, _, seen, packets = small()
+    decoder = CompactDecoder(header)
+    for packet in packets[(index // 3) * 3 : index]:
+        decoder.decode(coded_fields(packet.payload, FRAME.size, where=""), kind=packet.kind, index=packet.index)
+    state, failed, different = decoder.state, 0, 0
+    for payload in flipped(packets[index].payload, FRAME.size):
+        decoder.state = state
+        try:
+            packet = packet_of(payload, packets[index].kind)
+            found = decoder.decode(coded_fields(payload, FRAME.size, where=""), kind=packet.kind, index=index)
+        except StreamError:
+            failed += 1
+            continue
+        check_shapes({**header.static, **found}, distance_input=True, training_cameras=2, where="")
+        different += any(not torch.equal(value, state_of(seen[index])[name]) for name, value in found.items())
+    assert failed > 50
+    assert different > 0, "the checksum is there for what decodes to something else"
+
+
+def test_every_byte_of_an_init_record_changed_gives_a_decoder_or_one_kind_of_error() -> None:
+    header, data, _, packets = small()
+    payload, failed = next(scanned(data)).payload, 0
+    for mangled in flipped(payload):
+        try:
+            scene = SceneDecoder(unpacked_header(mangled)).decode(packets[0])
+        except StreamError:
+            failed += 1
+            continue
+        assert len(scene.anchors) == 3
+    assert len(payload) // 3 < failed < len(payload)
+    assert header.codec == "compact"
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_mangled_file_gives_scenes_or_one_kind_of_error(data: st.DataObject) -> None:
+    _, whole, seen, _ = small()
+    mangled = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(12, len(whole) - 1))
+        mangled[at] ^= 1 << data.draw(st.integers(0, 7))
+    try:
+        reader = StreamReader(mended(bytes(mangled)), by_index=data.draw(st.booleans()))
+    except StreamError:
+        return
+    for index in range(len(reader)):
+        try:
+            assert len(reader.scene(index).anchors) == len(seen[0].anchors)
+        except StreamError:
+            continue
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_a_mangled_packet_gives_a_scene_or_one_kind_of_error(data: st.DataObject) -> None:
+    header, _, _, packets = small()
+    index = data.draw(st.integers(0, 4))
+    payload = bytearray(packets[index].payload)
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(12, len(payload) - 1))
+        payload[at] = data.draw(st.integers(0, 255))
+    end = data.draw(st.one_of(st.just(len(payload)), st.integers(0, len(payload))))
+    decoder = SceneDecoder(header)
+    for packet in packets[(index // 3) * 3 : index]:
+        decoder.decode(packet)
+    try:
+        scene = decoder.decode(packet_of(bytes(payload[:end]), packets[index].kind))
+    except StreamError:
+        return
+    assert len(scene.anchors) == 3
+    assert len(scene.free) < 2**18
+
+
+@pytest.mark.parametrize("field", sorted(PAPER_DYNAMIC))
+def test_truncated_fields(field: FieldName) -> None:
+    """Each field cut at each of its bytes, and with one more; now and then a cut one is a code of something else."""
+    header, _, seen, packets = small()
+    coded = CompactEncoder(header).encode(state_of(seen[0]), kind=PacketKind.KEY, index=0)
+    decoder = SceneDecoder(header)._compact
+    assert decoder is not None
+    failed, cuts = 0, [coded[field][:end] for end in range(len(coded[field]))]
+    for data in cuts:
+        try:
+            found = decoder.decode({**coded, field: data}, kind=PacketKind.KEY, index=0)
+        except StreamError:
+            failed += 1
+            continue
+        check_shapes({**header.static, **found}, distance_input=True, training_cameras=2, where="")
+    assert failed >= len(cuts) - 1 - len(cuts) // 20
+    with pytest.raises(StreamError, match="Packet 0"):
+        decoder.decode({**coded, field: coded[field] + b"\0"}, kind=PacketKind.KEY, index=0)
+    assert decoder.decode(coded, kind=PacketKind.KEY, index=0).keys() == PAPER_DYNAMIC
+    assert packets[0].index == 0
+
+
+def test_values_stay_within_range_over_frames() -> None:
+    """A residual that leads beyond 22 bits is damage."""
+    far = small_scene()
+    positions = far.anchors.positions + 2.0**16 - 100.0
+    positions[0, 0] = 2.0**16  # the last bin
+    far = replace(far, anchors=replace(far.anchors, positions=positions))
+    header = compact_header(far)
+    assert same(StreamReader(written([far], header)[0]).scene(0), written([far], header)[1][0])
+    near = {**header.reference, "anchor_positions": far.anchors.positions - 1.0}
+    first = (
+        SceneEncoder(replace(header, reference=near)).encode(far, index=0, pts_seconds=0, kind=PacketKind.KEY).packet
+    )
+    with pytest.raises(StreamError, match="Packet 0 has a bin beyond 22 bits"):
+        SceneDecoder(header).decode(first)
+
+
+def test_an_mlp_that_moves_and_free_gaussians_that_none_has() -> None:
+    first = small_scene(2)
+    head = first.mlps.opacity
+    moving = replace(first, mlps=first.mlps._replace(opacity=head._replace(b2=head.b2 + 0.5)))
+    dynamic: frozenset[FieldName] = frozenset({"opacity_mlp", *FREE})
+    seen = written([first, moving], compact_header(first, dynamic=dynamic))[1]
+    assert torch.allclose(flatten_head(seen[1].mlps.opacity), flatten_head(moving.mlps.opacity), atol=2.0**-7)
+    assert len(seen[1].free) == 0
+    assert isinstance(seen[1].free, FreeGaussians)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that mostly stay: both directions, the documents' decoder beside them, and what the contexts are worth."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import documented
+from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
+from structgstream.codec.entropy.models import Models
+from structgstream.codec.scene.change import Change
+from structgstream.codec.scene.rows import coded_change
+from structgstream.errors import StreamError
+
+GROUPS = (("anchor_positions", 0, 2), ("offset_scales", 2, 3))
+NOTHING = {"anchor_positions": b"", "offset_scales": b""}
+
+
+def drawn(g: np.random.Generator, rows: int, *, share: float, scale: float) -> np.ndarray:
+    """Residuals ``[n, 3]``, mostly zeros, with a few far values."""
+    values = np.clip(np.rint(g.laplace(0, scale, (rows, 3))), -(2**23), 2**23)
+    values[g.random(rows) >= share] = 0
+    return values.astype(np.int32)
+
+
+@st.composite
+def stories(draw: st.DrawFn) -> list[np.ndarray]:
+    rows, seed = draw(st.integers(0, 120)), draw(st.integers(0, 2**32 - 1))
+    g = np.random.default_rng(seed)
+    shares, scales = st.sampled_from([0.0, 0.1, 0.7, 1.0]), st.sampled_from([0.5, 3.0, 60.0, 1e6])
+    return [drawn(g, rows, share=draw(shares), scale=draw(scales)) for _ in range(draw(st.integers(1, 4)))]
+
+
+def written(models: Models, residuals: np.ndarray, before: Change) -> tuple[dict[str, bytes], Change]:
+    writer = AdaptiveEncoder(models, where="Frame 0")
+    change = coded_change(writer, Change.of(residuals), before, groups=GROUPS)
+    return NOTHING | writer.fields(), change
+
+
+@settings(max_examples=60, deadline=None)
+@given(stories())
+def test_changes_come_back_and_the_documents_say_the_same(frames: list[np.ndarray]) -> None:
+    rows = len(frames[0])
+    mine, its, theirs = Models(), Models(), {}
+    known = back = Change.none(rows, 3)
+    documented_rows = documented.Rows([[0, 0, 0] for _ in range(rows)])
+    for residuals in frames:
+        mine, its = Models(mine), Models(its)
+        fields, known = written(mine, residuals, known)
+        reader = AdaptiveDecoder(its, fields, where="Packet 0")  # type: ignore[arg-type]
+        back = coded_change(reader, None, back, groups=GROUPS)
+        reader.end()
+        for one in (known, back):
+            assert (one.residuals == residuals).all()
+            assert (one.active == (residuals != 0).any(1)).all()
+        assert (known.history == back.history).all()
+        assert (known.sizes == back.sizes).all()
+        if rows:
+            packet = documented.Packet(fields, theirs)
+            documented_rows.read(packet, list(GROUPS))
+            assert packet.is_whole()
+            assert documented_rows.last == residuals.tolist()
+            assert documented_rows.history == back.history.tolist()
+
+
+def test_nothing_to_code_takes_nothing() -> None:
+    before = Change.none(5, 0)
+    assert coded_change(AdaptiveEncoder(Models(), where=""), before, before, groups=()) is before
+
+
+def test_what_stands_still_is_free() -> None:
+    """45,000 rows, of which none moves: a few bits a packet, whatever moved before."""
+    g = np.random.default_rng(1)
+    models, change = Models(), Change.none(45_000, 3)
+    _, change = written(models, drawn(g, 45_000, share=0.05, scale=2.0), change)
+    sizes = []
+    for _ in range(5):
+        models = Models(models)
+        fields, change = written(models, np.zeros((45_000, 3), np.int32), change)
+        sizes.append(sum(map(len, fields.values())))
+    assert sizes[0] < 300, "the first learns that it is over"
+    assert max(sizes[3:]) <= 4
+
+
+def test_history_goes_back_three_frames() -> None:
+    models, change = Models(), Change.none(2, 3)
+    for active, history in ((1, [1, 0]), (0, [2, 0]), (0, [4, 0]), (1, [1, 0]), (1, [3, 0])):
+        _, change = written(models, np.array([[active, 0, 0], [0, 0, 0]], np.int32), change)
+        assert change.history.tolist() == history
+
+
+@pytest.mark.parametrize("what", ["motion goes on", "neighbours move alike"])
+def test_prediction_saves_bytes(what: str) -> None:
+    """A motion that its own past or its neighbours foretell costs less than one that nothing foretells."""
+    g = np.random.default_rng(3)
+
+    def cost(alike: bool) -> int:
+        models, change, size = Models(), Change.none(2000, 3), 0
+        if what == "motion goes on":
+            velocity = g.normal(0, 6, (2000, 3))
+            frames = [velocity if alike else g.permutation(velocity) for _ in range(4)]
+        else:
+            smooth = np.repeat(g.normal(0, 6, (100, 3)), 20, axis=0)
+            frames = [g.permutation(smooth)] if not alike else [smooth]
+        for frame in frames:
+            models = Models(models)
+            fields, change = written(models, np.rint(frame + g.normal(0, 0.3, frame.shape)).astype(np.int32), change)
+            size += sum(map(len, fields.values()))
+        return size
+
+    assert 1.3 * cost(True) < cost(False)
+
+
+def test_a_group_of_frames_is_near_the_entropy_of_its_noise() -> None:
+    """2000 of 30,000 rows move in 12 frames by a steady step and noise; who knew the steps would pay the noise."""
+    g = np.random.default_rng(7)
+    rows = 30_000
+    moving = np.zeros(rows, np.bool_)
+    for start in g.integers(0, rows - 400, 8):
+        moving[start : start + 250] = True
+    velocity = np.repeat(g.integers(-4, 5, (rows // 50, 3)), 50, axis=0)
+    models, change, size, noises = Models(), Change.none(rows, 3), 0, []
+    for _ in range(12):
+        models = Models(models)
+        noise = np.rint(g.laplace(0, 0.6, (rows, 3)))
+        noises.append(noise[moving].astype(int))
+        fields, change = written(models, ((velocity + noise) * moving[:, None]).astype(np.int32), change)
+        size += sum(map(len, fields.values()))
+    counts = np.unique(np.concatenate(noises), return_counts=True)[1]
+    share = counts / counts.sum()
+    entropy_bytes = -float((counts * np.log2(share)).sum()) / 8
+    assert entropy_bytes < size < 1.2 * entropy_bytes
+
+
+def test_a_residual_beyond_23_bits_cannot_be_coded() -> None:
+    residuals = np.zeros((3, 3), np.int32)
+    residuals[1, 2] = 2**23 + 1
+    with pytest.raises(StreamError, match=r"Frame 0 changes more than offset_scales\.change can; take a larger step"):
+        written(Models(), residuals, Change.none(3, 3))
+
+
+def test_models_of_a_packet_that_is_thrown_away_change_nothing() -> None:
+    g = np.random.default_rng(5)
+    one, two = (drawn(g, 100, share=0.5, scale=2.0) for _ in range(2))
+    known, before = Models(), Change.none(100, 3)
+    _, before = written(known, one, before)
+    first = written(Models(known), two, before)[0]
+    written(Models(known), one, before)
+    assert written(Models(known), two, before)[0] == first

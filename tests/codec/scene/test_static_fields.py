@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The coded fields of the init record."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from streams import small_scene
+from structgstream.codec.entropy.coder import Encoder, Tables, varint
+from structgstream.codec.scene.bins import on_bins
+from structgstream.codec.scene.static_fields import (
+    AS_THEY_ARE,
+    FREE_NUMBERS,
+    MOST_ANCHORS,
+    MOST_COLUMNS,
+    MOST_WEIGHTS,
+    decoded_fields,
+    encoded_fields,
+)
+from structgstream.errors import StreamError
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.order import space_order
+from structgstream.scene.state import STATE_TABLE, FieldName, state_of
+
+CODED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.name not in AS_THEY_ARE)
+STEPS: dict[FieldName, float] = {name: float(np.float32(0.01 + i / 100)) for i, name in enumerate(CODED)}
+
+
+def fields_of(anchors: int = 5, *, seed: int = 0, scale: float = 1.0) -> dict[FieldName, torch.Tensor]:
+    """Fields of a small scene with an appearance, on bins."""
+    scene = replace(
+        with_appearance(small_scene(anchors, seed=seed), 2), environment=torch.arange(12.0).reshape(4, 3) - 5
+    )
+    state = state_of(scene)
+    return on_bins({name: state[name] * scale for name in CODED}, STEPS)
+
+
+def row(**changes: torch.Tensor) -> dict[FieldName, torch.Tensor]:
+    """:func:`fields_of` with some fields replaced by these bins times their steps."""
+    changed: dict[FieldName, torch.Tensor] = {
+        name: torch.from_numpy(changes[name].numpy().astype(np.float32) * np.float32(STEPS[name]))
+        for name in CODED
+        if name in changes
+    }
+    return fields_of() | changed
+
+
+@cache
+def three_anchors() -> dict[FieldName, bytes]:
+    return encoded_fields(fields_of(3), STEPS)
+
+
+def check(fields: Mapping[FieldName, torch.Tensor]) -> int:
+    """Comes back bit for bit; the size in bytes."""
+    coded = encoded_fields(fields, STEPS)
+    back = decoded_fields(coded, STEPS)
+    assert list(back) == sorted(fields, key=CODED.index) or back.keys() == fields.keys()
+    for name, value in fields.items():
+        assert back[name].dtype == torch.float32
+        assert back[name].shape == value.shape, name
+        assert back[name].numpy().tobytes() == value.numpy().tobytes(), name
+    return sum(len(data) for data in coded.values())
+
+
+@pytest.mark.parametrize("anchors", [0, 1, 2, 5, 300])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0])
+def test_fields_come_back(anchors: int, scale: float) -> None:
+    check(fields_of(anchors, scale=scale))
+
+
+def test_without_appearance() -> None:
+    fields = fields_of()
+    check({name: value for name, value in fields.items() if not name.startswith("appearance")})
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.lists(st.integers(-(2**19), 2**19 - 1), min_size=3, max_size=3), max_size=12), st.booleans())
+def test_positions_in_any_order(cells: list[list[int]], ordered: bool) -> None:
+    bins = torch.tensor(cells, dtype=torch.int32).reshape(-1, 3)
+    step = STEPS["anchor_positions"]
+    positions = torch.from_numpy(bins.numpy().astype(np.float32) * np.float32(step))
+    if ordered:
+        positions = positions[space_order(positions, step=step)]
+    fields: dict[FieldName, torch.Tensor] = {"anchor_positions": positions}
+    check(fields)
+
+
+def test_the_corners_of_what_positions_may_be() -> None:
+    low, high = -(2**22), -(2**22) + 2**20 - 1
+    check(row(anchor_positions=torch.tensor([[low, 2**22, 0], [high, 2**22 - 2**20 + 1, 5]] + [[low, 2**22, 0]] * 3)))
+    apart = torch.zeros(5, 3, dtype=torch.int32)
+    apart[2, 1] = 2**20
+    with pytest.raises(StreamError, match=r"Anchors are 1048576 steps apart, at most 2\^20; take a larger step"):
+        encoded_fields(row(anchor_positions=apart), STEPS)
+
+
+def test_ordered_positions_take_fewer_bits() -> None:
+    g = torch.Generator().manual_seed(0)
+    places = torch.randperm(32**3, generator=g)[:2000]
+    bins = torch.stack([places % 32, places // 32 % 32, places // 32**2], dim=1)
+    positions = bins * STEPS["anchor_positions"]
+    order = space_order(positions, step=STEPS["anchor_positions"])
+    fields = fields_of(2000) | on_bins({"anchor_positions": positions[order]}, STEPS)
+    check(fields)
+    size = len(encoded_fields(fields, STEPS)["anchor_positions"])
+    # 2000 of 32768 places, in no particular order: log2 of the binomial is 10.7 kbit.
+    assert 10_700 / 8 < size < 1.25 * 10_700 / 8
+    shuffled = fields["anchor_positions"][torch.randperm(2000, generator=g)]
+    mixed: dict[FieldName, torch.Tensor] = {**fields, "anchor_positions": shuffled}
+    assert len(encoded_fields(mixed, STEPS)["anchor_positions"]) > 2 * size
+
+
+def test_a_coarse_row_takes_the_bits_of_its_precision() -> None:
+    """Half of the anchors on bins 8 times as coarse: nearly 3 bits less for each of their numbers."""
+    g = torch.Generator().manual_seed(1)
+    fine = torch.randint(-20, 21, (1000, 16), generator=g)
+    coarse = torch.randint(-2, 3, (1000, 16), generator=g) * 8
+    mixed = torch.where(torch.rand(1000, 1, generator=g) < 0.5, fine, coarse)
+
+    def size(bins: torch.Tensor) -> int:
+        fields: dict[FieldName, torch.Tensor] = {**fields_of(1000), "anchor_features": bins.float()}
+        del fields["appearance"], fields["appearance_basis"]
+        steps: dict[FieldName, float] = {**STEPS, "anchor_features": 1.0}
+        return 8 * len(encoded_fields(fields, steps)["anchor_features"])
+
+    wanted = 1000 * (1 + 16 * (np.log2(41) + np.log2(5)) / 2)
+    assert size(mixed) < 1.1 * wanted
+    assert size(fine) > 1.2 * wanted
+
+
+def test_shifts_and_large_numbers() -> None:
+    g = torch.Generator().manual_seed(2)
+    for power in range(9):
+        bins = torch.randint(-(2**22 >> power), (2**22 >> power) + 1, (5, 3), generator=g) << power
+        bins[3] = 0
+        bins[0, 0] = -(2**22)
+        check(row(base_scales=bins, anchor_offsets=torch.cat([bins, -bins], dim=1).reshape(5, 2, 3)))
+
+
+def test_numbers_that_no_bin_stands_for() -> None:
+    fields = fields_of()
+    for wrong in (fields["anchor_features"] + 1e-4, -0.0 * fields["anchor_features"].abs()):
+        with pytest.raises(StreamError, match="header's anchor_features are no multiples of their step 0.05; round"):
+            encoded_fields({**fields, "anchor_features": wrong}, STEPS)
+    for wrong in (torch.nan, torch.inf, 1e9):
+        with pytest.raises(StreamError, match="steps from zero"):
+            encoded_fields({**fields, "anchor_features": torch.full((5, 2), wrong)}, STEPS)
+
+
+def test_steps_that_are_missing() -> None:
+    fields = fields_of()
+    less: dict[FieldName, float] = {name: step for name, step in STEPS.items() if name != "color_mlp"}
+    with pytest.raises(StreamError, match="states no step for color_mlp in the init record"):
+        encoded_fields(fields, less)
+    with pytest.raises(StreamError, match="states no step for color_mlp in the init record"):
+        decoded_fields(encoded_fields(fields, STEPS), less)
+
+
+def test_fields_without_a_coding() -> None:
+    coded = encoded_fields(fields_of(), STEPS)
+    with pytest.raises(StreamError, match="holds camera_color coded; it has no coding"):
+        decoded_fields({**coded, "camera_color": b""}, STEPS)
+    assert encoded_fields({**fields_of(), "camera_color": torch.ones(2, 6) / 3}, STEPS) == coded
+    less: dict[FieldName, bytes] = {name: data for name, data in coded.items() if name != "anchor_positions"}
+    with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_positions"):
+        decoded_fields(less, STEPS)
+    less = {name: data for name, data in coded.items() if name != "appearance"}
+    with pytest.raises(StreamError, match="directions of an appearance without the appearance"):
+        decoded_fields(less, STEPS)
+
+
+def test_more_numbers_than_allowed_are_refused() -> None:
+    coded = encoded_fields(fields_of(), STEPS)
+    limits: dict[FieldName, int] = {"anchor_positions": MOST_ANCHORS, "color_mlp": MOST_WEIGHTS, **MOST_COLUMNS}
+    for name, most in limits.items():
+        rest = coded[name][1:]
+        with pytest.raises(StreamError, match=f"has {most + 1} .*at most {most} are allowed"):
+            decoded_fields({**coded, name: varint(most + 1) + rest}, STEPS)
+        if most != 3:
+            with pytest.raises(StreamError, match="damaged|not fit"):
+                decoded_fields({**coded, name: varint(most) + rest}, STEPS)
+
+
+def test_few_bytes_do_not_make_many_numbers() -> None:
+    """A section whose symbols take no bits has any number of anchors in a few bytes, and 256 columns for each."""
+
+    def positions(anchors: int) -> bytes:
+        return encoded_fields({"anchor_positions": torch.zeros(anchors, 3)}, STEPS)["anchor_positions"]
+
+    most = FREE_NUMBERS // 3
+    assert len(positions(most)) < 60
+    assert decoded_fields({"anchor_positions": positions(most)}, STEPS)["anchor_positions"].shape == (most, 3)
+    with pytest.raises(StreamError, match="numbers that cost nothing; at most .* Take smaller steps"):
+        positions(most + 2000)
+    message = "The init record has more than 64 numbers a byte; it is damaged"
+    with pytest.raises(StreamError, match=message):
+        decoded_fields({"anchor_positions": varint(most + 2000) + positions(most)[3:]}, STEPS)
+    anchors = FREE_NUMBERS // 256
+    encoder = Encoder(Tables())
+    encoder.number("anchor_features.columns", 256)
+    many: dict[FieldName, bytes] = {
+        "anchor_positions": positions(anchors),
+        "anchor_features": encoder.fields["anchor_features"],
+    }
+    with pytest.raises(StreamError, match=message):
+        decoded_fields(many, STEPS)
+    # As many more as bytes are there.
+    with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_features"):
+        decoded_fields({**many, "color_mlp": bytes(256)}, STEPS)
+
+
+def test_offsets_and_directions_that_do_not_fit() -> None:
+    fields = fields_of()
+    coded = encoded_fields(fields, STEPS)
+    with pytest.raises(StreamError, match="damaged|not fit"):
+        decoded_fields({**coded, "anchor_offsets": coded["anchor_features"]}, STEPS)
+    one: dict[FieldName, torch.Tensor] = {**fields, "appearance_basis": fields["appearance_basis"][:1]}
+    with pytest.raises(StreamError, match=r"holds 2 numbers of appearance_basis, which do not fit \(2, 2\)"):
+        decoded_fields(_unchecked(one), STEPS)
+
+
+def test_an_environment_of_no_whole_rows() -> None:
+    alone = Encoder(Tables())
+    alone.number("environment.count", 4)
+    alone.naturals("environment.value", np.arange(4), np.zeros(4, np.uint16), count=1)
+    with pytest.raises(StreamError, match=r"holds 4 numbers of environment, which do not fit \(1, 3\)"):
+        decoded_fields({**encoded_fields(fields_of(), STEPS), "environment": alone.fields["environment"]}, STEPS)
+
+
+def _unchecked(fields: dict[FieldName, torch.Tensor]) -> dict[FieldName, bytes]:
+    whole = encoded_fields(fields_of(), STEPS)
+    alone = Encoder(Tables())
+    bins = np.rint(fields["appearance_basis"].numpy().ravel() / STEPS["appearance_basis"]).astype(np.int64)
+    alone.number("appearance_basis.count", len(bins))
+    values = np.where(bins < 0, -2 * bins - 1, 2 * bins)
+    alone.naturals("appearance_basis.value", values, np.zeros(len(bins), np.uint16), count=1)
+    return {**whole, "appearance_basis": alone.fields["appearance_basis"]}
+
+
+@pytest.mark.parametrize("name", CODED)
+def test_every_byte_changed_or_missing_gives_fields_or_one_kind_of_error(name: FieldName) -> None:
+    fields = fields_of()
+    coded = encoded_fields(fields, STEPS)
+    failed = 0
+    for at in range(len(coded[name])):
+        mangled = bytearray(coded[name])
+        mangled[at] ^= 1 << at % 8
+        try:
+            assert decoded_fields({**coded, name: bytes(mangled)}, STEPS).keys() == fields.keys()
+        except StreamError:
+            failed += 1
+        with pytest.raises(StreamError, match="The init record"):
+            decoded_fields({**coded, name: coded[name][:at]}, STEPS)
+    assert failed > len(coded[name]) // 3
+    with pytest.raises(StreamError, match=f"has more bytes of {name} than it should"):
+        decoded_fields({**coded, name: coded[name] + b"\0"}, STEPS)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_any_bytes_give_fields_or_one_kind_of_error(data: st.DataObject) -> None:
+    coded = three_anchors()
+    name = data.draw(st.sampled_from(CODED))
+    try:
+        decoded_fields({**coded, name: data.draw(st.binary(max_size=40))}, STEPS)
+    except StreamError:
+        return

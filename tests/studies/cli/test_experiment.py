@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``ablate`` and ``compare`` on the bundled clip, and what they say when something is wrong."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+from rich.console import Console
+
+from structgstream.cli import main
+from structgstream.cli.options import resolved_config
+from structgstream.data.clip import bundled_clip, bundled_clip_path
+from structgstream.data.wrappers import WithRig
+from structgstream.kernels._load import native_reason
+from structgstream.kernels.backend import select_backend
+from structgstream.presets import PRESETS, StreamConfig
+from structgstream_studies.cli.experiment import Display, print_sheet
+from structgstream_studies.experiments.captures import CapturePart
+from structgstream_studies.experiments.results import read_results
+from structgstream_studies.experiments.sheets import Sheet
+from structgstream_studies.experiments.studies import ablation_runs, needed
+from structgstream_studies.experiments.sweep import Outcome, Progress
+from structgstream_studies.experiments.tasks import Variation
+from structgstream_studies.experiments.worker import Task
+
+CLIP = str(bundled_clip_path())
+DEVICE = "cpu" if native_reason() is None else "reference"
+SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", DEVICE, "--jobs", "2"]
+QUICK = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2"]
+QUICK += ["--online.patching.iteration", "1"]
+
+
+def with_iterations(config: StreamConfig, iterations: int) -> StreamConfig:
+    return replace(config, online=replace(config.online, iterations=iterations))
+
+
+def ablate(folder: Path) -> list[str]:
+    return ["ablate", CLIP, "--table", "distance", "-o", str(folder), *SMALL, *QUICK]
+
+
+def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
+    """What a command that fails with ``status`` says; never a traceback."""
+    capsys.readouterr()
+    assert main(arguments) == status
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert "should not happen" not in error
+    return error
+
+
+def contents(folder: Path) -> dict[str, int]:
+    """When each stream, log and result was written."""
+    files = [path for name in ("first", "streams", "results") for path in (folder / name).iterdir()]
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in files}
+
+
+@pytest.fixture(scope="module")
+def ablated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The table of the distance regularisation, of which all but one step was done before."""
+    folder, backend = tmp_path_factory.mktemp("ablate") / "out", select_backend(DEVICE)
+    config, _ = resolved_config(QUICK[1], QUICK[2:], command="ablate", seed=None)
+    part = CapturePart(bundled_clip_path(), scale=0.25, frames=2)
+    *tasks, last = needed(ablation_runs(["distance"], config, part, frames=2, seeds=(0,), folder=folder))
+    assert len(tasks) == 3
+    for task in tasks:
+        task.run(backend)
+    before = contents(folder)
+    assert main(ablate(folder)) == 0
+    assert last.done()
+    assert before.items() <= contents(folder).items()
+    assert [path.name for path in (folder / "logs").iterdir()] == [f"{last.name}.txt"]
+    return folder
+
+
+def test_ablate_leaves_table_pictures_results_and_streams(ablated: Path) -> None:
+    table = (ablated / "distance.md").read_text()
+    assert table.startswith("# Distance regularisation at frame 0\n")
+    assert "| full method |" in table
+    assert "| w/o distance regularisation |" in table
+    for name in ("distance-curves.png", "distance-detail.png"):
+        picture = cv2.imread(str(ablated / name))
+        assert picture is not None
+        assert picture.std() > 5
+    assert {(result.key, result.seed) for result in read_results(ablated / "results")} == {
+        ("full", 0),
+        ("without-distance", 0),
+    }
+    assert len(list((ablated / "first").glob("*.sgs"))) == 2
+    assert len(list((ablated / "streams").glob("*.sgs"))) == 2
+    assert not list(ablated.rglob("*.partial"))
+
+
+def test_a_second_time_prints_the_table_and_does_nothing_again(
+    ablated: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(ablated)
+    table = (ablated / "distance.md").read_text()
+    capsys.readouterr()
+    assert main(ablate(ablated)) == 0
+    text = capsys.readouterr().out
+    assert contents(ablated) == before
+    assert (ablated / "distance.md").read_text() == table
+    assert "2 of 2 steps were done already." in text
+    assert f"{read_results(ablated / 'results')[0].mean['psnr']:.2f}" in text
+    assert "w/o distance" in text
+    assert f"Tables and pictures: {ablated}" in text
+
+
+@pytest.mark.parametrize(
+    ("command", "extra", "status", "words"),
+    [
+        ("ablate", ["--table", "colours"], 2, "colours"),
+        ("ablate", ["--preset", "tny"], 2, "there is no preset 'tny'"),
+        ("ablate", ["--online.iteration", "5"], 2, "--online.iterations"),
+        ("ablate", ["--scored", "cam03"], 2, "camera 'cam03' is not held out; held out are cam00."),
+        ("ablate", ["--held-out", "cam77"], 1, "cam77"),
+        ("ablate", ["--jobs", "0"], 1, "1 or more, got 0"),
+        ("ablate", ["--frames", "13"], 1, "has 12 frames"),
+        ("compare", ["--scored", "cam03"], 2, "camera 'cam03' is not held out"),
+        ("compare", ["--methods", "nerf"], 1, "There is no method 'nerf'; there are"),
+        ("compare", ["--scratch-every", "0"], 2, "--scratch-every counts frames, from 1; got 0."),
+    ],
+)
+def test_wrong_options_are_told_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, extra: list[str], status: int, words: str
+) -> None:
+    out = tmp_path / "out"
+    error = error_of([command, CLIP, "-o", str(out), "--device", DEVICE, *extra], capsys, status=status)
+    assert words in error
+    assert not out.exists()
+
+
+def test_a_capture_that_holds_out_no_camera_cannot_be_scored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = bundled_clip()
+    alike = WithRig(whole, whole.rig.with_held_out(frozenset()))
+    monkeypatch.setattr(CapturePart, "open", lambda self: alike)
+    for command in ("ablate", "compare"):
+        error = error_of([command, CLIP, "-o", str(tmp_path / "out")], capsys, status=2)
+        assert error == "structgstream: clip holds out no camera to score; name one with --held-out.\n"
+
+
+@pytest.mark.parametrize("command", ["ablate", "compare"])
+def test_ctrl_c_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    def stopped(*_: object, **__: object) -> Outcome:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("structgstream_studies.experiments.sweep.sweep", stopped)
+    extra = ["--methods", "fast"] if command == "compare" else []
+    error = error_of([command, CLIP, "-o", str(tmp_path), *SMALL, *extra], capsys, status=130)
+    assert error == "\nInterrupted. Whole frames are stored; go on with the same command.\n"
+
+
+def configs_asked(arguments: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, StreamConfig]:
+    """What ``ablate`` would run, by key; nothing is."""
+    asked: dict[str, StreamConfig] = {}
+
+    def noted(tasks: Sequence[Task], *_: object, **__: object) -> Outcome:
+        asked.update({task.key: task.config for task in tasks if isinstance(task, Variation)})
+        return Outcome((), (), ())
+
+    monkeypatch.setattr("structgstream_studies.experiments.sweep.sweep", noted)
+    assert main(["ablate", CLIP, "-o", str(folder), *SMALL, *arguments]) == 0
+    return asked
+
+
+def test_tables_of_the_compact_stream_are_of_its_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--table", "distance", "effects", "rates", "--online.iterations", "7"]
+    asked = configs_asked(arguments, tmp_path, monkeypatch)
+    assert asked["compact"] == with_iterations(PRESETS["compact"], 7)
+    assert asked["full"] == with_iterations(PRESETS["rig"], 7)
+    assert asked["quality-p2"].online.rounding.quality == 2.0
+    assert asked["without-distance"].codec == "raw"
+    assert "w/o change gate" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"distance.md", "effects.md", "rates.md"}
+
+
+def test_the_paper_alone_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = configs_asked([], tmp_path, monkeypatch)
+    assert asked["full"] == PRESETS["rig"]
+    assert not [key for key in asked if key.startswith(("compact", "quality"))]
+
+
+def test_another_full_method_of_the_compact_tables_must_be_compact(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = error_of(["ablate", CLIP, "-o", str(tmp_path), "--table", "rates", "--preset", "motion"], capsys, status=1)
+    assert "need codec 'compact', got 'raw'; take --preset compact." in error
+
+
+def test_failed_steps_are_named_with_those_that_were_not_begun(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcome = Outcome(failed=("first-1.seed0",), blocked=("full.seed0", "held.seed0"), skipped=())
+    monkeypatch.setattr("structgstream_studies.experiments.sweep.sweep", lambda *_, **__: outcome)
+    error = error_of(ablate(tmp_path), capsys, status=1)
+    assert "1 of 4 steps failed (first-1.seed0), and 2 that needed them were not begun." in error
+    assert f"{tmp_path / 'logs' / 'first-1.seed0.txt'}; the same command goes on" in error
+
+
+def test_progress_off_a_terminal_is_a_line_for_each_step(capsys: pytest.CaptureFixture[str]) -> None:
+    with Display(Console(width=80)) as view:
+        view.show(Progress({"full.seed0": (0, 3)}, 1, 4, ()))
+        view.show(Progress({"full.seed0": (2, 3)}, 1, 4, ()))
+        view.show(Progress({"held.seed0": (0, 3)}, 2, 4, ("full.seed0",)))
+    assert capsys.readouterr().out.splitlines() == [
+        "1 of 4 steps done; begins full.seed0",
+        "2 of 4 steps done, failed: full.seed0; begins held.seed0",
+    ]
+
+
+def test_a_wide_sheet_is_printed_in_parts_that_fit(capsys: pytest.CaptureFixture[str]) -> None:
+    heads = [f"score {i}" for i in range(9)]
+    rows = [[f"row {j}", *(f"{i}.{j}" for i in range(9))] for j in range(2)]
+    print_sheet(Sheet("Scores [of] rows", ["name", *heads], rows), Console(width=80))
+    text = capsys.readouterr().out
+    assert max(len(line) for line in text.splitlines()) <= 80
+    assert all(text.count(head) == 1 for head in heads)
+    assert all(f"{i}.{j}" in text for i in range(9) for j in range(2))
+    assert text.count("row 0") == text.count("row 1") == 3
+    assert text.count("Scores [of]") == 3
+    assert text.count("continued") == 2

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs that take a second: the bundled clip at 80x60 pixels, hardly trained."""
+
+from dataclasses import replace
+
+from small_presets import TINY_RIG
+from structgstream.data.clip import bundled_clip_path
+from structgstream.presets import COMPACT, StreamConfig
+from structgstream_studies.experiments.captures import CapturePart
+
+CLIP = CapturePart(bundled_clip_path(), scale=0.25, frames=3)
+
+
+def quick(*, seed: int = 0) -> StreamConfig:
+    """Paper mode with next to no iterations."""
+    patching = replace(TINY_RIG.online.patching, iteration=1)
+    initial = replace(TINY_RIG.initial, iterations=3)
+    return replace(
+        TINY_RIG, seed=seed, initial=initial, online=replace(TINY_RIG.online, iterations=2, patching=patching)
+    )
+
+
+def compact(*, seed: int = 0) -> StreamConfig:
+    """The preset compact with as few iterations."""
+    few = quick(seed=seed)
+    patching = replace(COMPACT.online.patching, iteration=few.online.patching.iteration)
+    online = replace(COMPACT.online, iterations=few.online.iterations, patching=patching)
+    return replace(COMPACT, seed=seed, initial=few.initial, online=online)
