@@ -164,6 +164,27 @@ def test_the_picture_and_its_gradients_are_the_references(budgeted: bool, case: 
 
 
 @pytest.mark.usefixtures("pretended")
+def test_with_tiles_who_reaches_none_counts_as_not_drawn_and_the_picture_is_drawn_onto() -> None:
+    values = splats("cpu")
+    tiles = asked("cpu")
+    tiles.mask[1:] = False
+    pictures = [torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64) for _ in range(2)]
+    outputs = [
+        rasterize(splats_of(*values[:5]), camera(values[0]), tiles=tiles, onto=picture)
+        for rasterize, picture in zip((reference_raster.rasterize, cuda.rasterize), pictures, strict=True)
+    ]
+    for output, picture in zip(outputs, pictures, strict=True):
+        assert output.image.data_ptr() == picture.data_ptr()
+    pixels = tiles.pixels()[..., None].expand(-1, -1, 1).double()
+    shown = reference_raster.blending_weights(
+        reference_raster.rasterize, splats_of(*values[:5]), camera(values[0]), pixels
+    )
+    everything = cuda.rasterize(splats_of(*values[:5]), camera(values[0]))
+    assert 0 < (shown > 0).sum() <= (outputs[1].radii > 0).sum() < (everything.radii > 0).sum()
+    assert (outputs[1].radii[shown[:, 0] > 0] > 0).all()
+
+
+@pytest.mark.usefixtures("pretended")
 def test_a_budget_that_is_too_small_says_so() -> None:
     budget = PairBudget.of(20, torch.device("cpu"))
     run(partial(cuda.rasterize, budget=budget), splats("cpu"))
