@@ -13,7 +13,7 @@ from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.roofline import Work
 from benchmarks.world import FEATURES, HIDDEN, OFFSETS_PER_ANCHOR, wall_rig, wall_scene
 from structgstream.kernels import cpu_anchors, reference_anchors
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
 
 Trained = Literal["all", "online"]
 """``all``: as in frame 0; ``online``: the paper's dynamic set: positions, offset scales and the covariance head."""
@@ -37,13 +37,14 @@ def workload(anchors: int, trained: Trained) -> tuple[list[Tensor], Tensor]:
 
 
 def forward_and_backward(
-    generate: Callable[..., StructuredGaussians], work: tuple[list[Tensor], Tensor], camera_center: Tensor
+    activate: Callable[..., StructuredGaussians], work: tuple[list[Tensor], Tensor], camera_center: Tensor
 ) -> Results:
     """Ids, the drawn Gaussians ``[N, 14]``, and the gradients of what is trained as two vectors."""
     leaves, cotangent = work
     heads = [HeadWeights(*leaves[5 + 4 * head : 9 + 4 * head]) for head in range(3)]
     visible = torch.arange(leaves[0].shape[0])
-    drawn = generate(*leaves[:5], MLPWeights(*heads), camera_center, visible, distance_input=True)
+    anchors = Anchors(*leaves[:5])
+    drawn = activate(anchors, MLPWeights(*heads), camera_center, visible, distance_input=True).gaussians
     outputs = [drawn.means, drawn.quats, drawn.scales, drawn.opacities, drawn.colors]
     given = cotangent.to(drawn.means)[drawn.ids].split((3, 4, 3, 1, 3), dim=1)
     given = [part[:, 0] if output.ndim == 1 else part for part, output in zip(given, outputs, strict=True)]
@@ -63,10 +64,10 @@ def contestants(*, anchors: int, trained: Trained) -> list[Contestant]:
     work, center = workload(anchors, trained), _center()
     return [
         Contestant(
-            "torch, 2 threads", partial(forward_and_backward, reference_anchors.generate_structured, work, center), 2
+            "torch, 2 threads", partial(forward_and_backward, reference_anchors.activate_anchors, work, center), 2
         ),
-        Contestant("cpu, 1 thread", partial(forward_and_backward, cpu_anchors.generate_structured, work, center), 1),
-        Contestant("cpu, 2 threads", partial(forward_and_backward, cpu_anchors.generate_structured, work, center), 2),
+        Contestant("cpu, 1 thread", partial(forward_and_backward, cpu_anchors.activate_anchors, work, center), 1),
+        Contestant("cpu, 2 threads", partial(forward_and_backward, cpu_anchors.activate_anchors, work, center), 2),
     ]
 
 
@@ -74,7 +75,7 @@ def oracle(*, anchors: int, trained: Trained) -> Results:
     """The torch reference in float64."""
     leaves, cotangent = workload(anchors, trained)
     doubles = [leaf.detach().double().requires_grad_(leaf.requires_grad) for leaf in leaves]
-    return forward_and_backward(reference_anchors.generate_structured, (doubles, cotangent), _center().double())
+    return forward_and_backward(reference_anchors.activate_anchors, (doubles, cotangent), _center().double())
 
 
 def _center() -> Tensor:

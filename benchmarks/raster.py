@@ -2,7 +2,6 @@
 """The rasteriser, forward and backward: this package's C++ against its own vectorised torch reference."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -11,11 +10,14 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity
 from benchmarks.roofline import Work
+from structgstream.cameras import Viewport
+from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels import cpu_raster, reference_raster
+from structgstream.kernels.operations import Rasterize
 
-Workload = tuple[list[Tensor], Tensor, Tensor, Tensor]
-"""The five tensors of the Gaussians, viewmat, K, and the gradient of the picture."""
+Workload = tuple[Gaussians, Viewport, Tensor]
+"""The Gaussians, where they are seen from, and the gradient of the picture."""
 
 
 def workload(splats: int, width: int, height: int) -> Workload:
@@ -26,7 +28,7 @@ def workload(splats: int, width: int, height: int) -> Workload:
     z = 2.75 + 1.25 * torch.sin(7.0 * u) * torch.cos(5.0 * v) + 0.5 * (torch.rand(splats, generator=g) - 0.5)
     means = torch.stack([(u - 0.5) * width / focal * z, (v - 0.5) * height / focal * z, z], dim=1)
     pixels = 1.15 * torch.exp(0.5 * torch.randn(splats, 3, generator=g))
-    gaussians = [
+    tensors = [
         means,
         torch.randn(splats, 4, generator=g),
         pixels * z[:, None] / focal,
@@ -35,15 +37,17 @@ def workload(splats: int, width: int, height: int) -> Workload:
     ]
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     cotangent = torch.randn(height, width, 3, generator=g)
-    return [tensor.requires_grad_() for tensor in gaussians], torch.eye(4), K, cotangent
+    means, quats, scales, opacities, colors = (tensor.requires_grad_() for tensor in tensors)
+    gaussians = Gaussians(means, quats, scales, opacities, colors, torch.arange(splats))
+    return gaussians, Viewport(torch.eye(4), K, torch.zeros(3), width, height, near=0.1), cotangent
 
 
-def forward_and_backward(rasterize: Callable[..., object], work: Workload) -> list[Tensor]:
+def forward_and_backward(rasterize: Rasterize, work: Workload) -> list[Tensor]:
     """The picture and the gradients of all five inputs."""
-    gaussians, viewmat, K, cotangent = work
-    height, width = cotangent.shape[:2]
-    output = rasterize(*gaussians, viewmat, K, width=width, height=height, near=0.1)
-    return [output.image, *torch.autograd.grad(output.image, gaussians, cotangent)]  # type: ignore[attr-defined]
+    gaussians, viewport, cotangent = work
+    inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors]
+    output = rasterize(gaussians, viewport)
+    return [output.image, *torch.autograd.grad(output.image, inputs, cotangent)]
 
 
 def contestants(*, splats: int = 60_000, width: int = 480, height: int = 360) -> list[Contestant]:
@@ -68,16 +72,16 @@ def blended_pairs(work: Workload) -> float:
     ``2 pi ln(255 o) sqrt(det S)``; the part of its box inside the picture is taken of it. Pairs behind a pixel that is
     already opaque are counted although a rasteriser skips them: at this workload's depth few pixels get there.
     """
-    (means, quats, scales, opacities, _), _, K, cotangent = work
+    gaussians, viewport, _ = work
+    K, width, height = viewport.K, viewport.width, viewport.height
     with torch.no_grad():
-        height, width = cotangent.shape[:2]
-        x, y, z = means.unbind(1)
+        x, y, z = gaussians.means.unbind(1)
         zero = torch.zeros_like(z)
         fx, fy = K[0, 0], K[1, 1]
         jacobian = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], dim=1).reshape(-1, 2, 3)
-        axes = jacobian @ (quaternion_matrices(quats) * scales[:, None])
+        axes = jacobian @ (quaternion_matrices(gaussians.quats) * gaussians.scales[:, None])
         covariance = axes @ axes.transpose(1, 2) + 0.3 * torch.eye(2)
-        reach = 2.0 * torch.log(255.0 * opacities).clamp(min=0.0)
+        reach = 2.0 * torch.log(255.0 * gaussians.opacities).clamp(min=0.0)
         area = math.pi * reach * torch.linalg.det(covariance).sqrt()
         size = torch.tensor([width, height])
         centre = torch.stack([fx * x / z + K[0, 2], fy * y / z + K[1, 2]], dim=1)

@@ -15,12 +15,24 @@ from torch import Tensor
 from structgstream.errors import CalibrationError
 
 
-class CameraMatrices(NamedTuple):
-    """``viewmat`` ``[4, 4]``, ``K`` ``[3, 3]`` and ``center`` ``[3]`` of a camera."""
+class Viewport(NamedTuple):
+    """A camera as kernels take it, in the precision and on the device of what is drawn.
+
+    Args:
+        viewmat: ``[4, 4]`` world to camera.
+        K: ``[3, 3]`` pixels.
+        center: ``[3]`` position of the camera.
+        width: pixels.
+        height: pixels.
+        near: distance along z under which nothing is drawn.
+    """
 
     viewmat: Tensor
     K: Tensor
     center: Tensor
+    width: int
+    height: int
+    near: float
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
-    _beside: dict[tuple[torch.dtype, torch.device], CameraMatrices] = field(
+    _viewports: dict[tuple[torch.dtype, torch.device], Viewport] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -75,12 +87,14 @@ class Camera:
         """Position of the camera in the world, ``[3]`` float64."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
-    def beside(self, like: Tensor) -> CameraMatrices:
-        """The camera's matrices in the precision and on the device of ``like``; kept, as a copy to a GPU waits."""
+    def viewport(self, like: Tensor) -> Viewport:
+        """The camera in the precision and on the device of ``like``; kept, as a copy to a GPU waits."""
         key = (like.dtype, like.device)
-        if key not in self._beside:
-            self._beside[key] = CameraMatrices(self.viewmat.to(like), self.K.to(like), self.center.to(like))
-        return self._beside[key]
+        if key not in self._viewports:
+            self._viewports[key] = Viewport(
+                self.viewmat.to(like), self.K.to(like), self.center.to(like), self.width, self.height, self.near
+            )
+        return self._viewports[key]
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with its picture resampled to ``width x height`` pixels.

@@ -81,11 +81,12 @@ def test_averages_are_what_the_cameras_draw(scene: Scene) -> None:
     drawn: dict[int, list[tuple[float, torch.Tensor]]] = {}
     seen: dict[int, int] = {}
     for camera in CAMERAS:
-        generated, visible = scene.structured(camera, BACKEND)
-        for anchor in visible.tolist():
+        structured = scene.structured(camera, BACKEND)
+        for anchor in structured.anchors.tolist():
             for offset in range(scene.anchors.offsets_per_anchor):
                 number = anchor * scene.anchors.offsets_per_anchor + offset
                 seen[number] = seen.get(number, 0) + 1
+        generated = structured.gaussians
         for i, number in enumerate(generated.ids.tolist()):
             drawn.setdefault(number, []).append((float(generated.opacities[i]), generated.scales[i].log()))
     structured = replace(scene, free=random_scene(0).free)

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the cuda back-end is made of, on a machine that only says it has a GPU, and on one that has."""
 
-import ctypes
 import logging
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
 from structgstream.cli import doctor
 from structgstream.kernels import _nvcc, backend, cuda, cuda_ssim, reference_ssim
+from structgstream.kernels.prototypes import CUDA_PROTOTYPES
 
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_the_loss_is_the_kernels_or_says_why_not(
     compiled: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    library = cuda_ssim.LossLibrary(ctypes.CDLL(None), "cuda", lambda device: 0) if compiled else None
+    functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
+    library = cuda_ssim.LossLibrary(functions, "cuda", lambda device: 0) if compiled else None
     monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
     monkeypatch.setattr(_nvcc, "loss_library", lambda: (library, "this is why"))
     with caplog.at_level(logging.INFO):

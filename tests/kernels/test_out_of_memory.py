@@ -2,27 +2,31 @@
 """What a kernel says when it gets no memory becomes an error of the package that still is a ``MemoryError``."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from splats import splats_of, viewport_of
 from structgstream.codec.entropy import decisions, rans
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_raster
 from structgstream.kernels._load import native_reason
+from structgstream.kernels.anchor_types import Anchors
+from structgstream.kernels.motion_types import Neighbours, ViewFlows
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
 Z = torch.zeros
-SPLATS = (Z(1, 3), Z(1, 4), Z(1, 3), Z(1), Z(1, 3))
-VIEW = {"width": 8, "height": 8, "near": 0.1}
+SPLATS = splats_of(Z(1, 3), Z(1, 4), Z(1, 3), Z(1), Z(1, 3))
+VIEW = viewport_of(torch.eye(4), torch.eye(3), width=8, height=8, near=0.1)
 
 
 def backward() -> None:
     """Forward has memory, backward has none."""
     means = Z(1, 3, requires_grad=True)
-    drawn = cpu_raster.rasterize(means, *SPLATS[1:], torch.eye(4), torch.eye(3), **VIEW)
+    drawn = cpu_raster.rasterize(replace(SPLATS, means=means), VIEW)
     short = SimpleNamespace(sgs_raster_backward=lambda *_: 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cpu_raster, "native_library", lambda: short)
@@ -38,20 +42,24 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         cpu_raster,
         "sgs_raster_forward",
         None,
-        lambda: cpu_raster.rasterize(*SPLATS, torch.eye(4), torch.eye(3), **VIEW),
+        lambda: cpu_raster.rasterize(SPLATS, VIEW),
     ),
     "weights": (
         cpu_raster,
         "sgs_raster_weights",
         1,
-        lambda: cpu_raster.blending_weights(*SPLATS[:4], torch.eye(4), torch.eye(3), Z(8, 8, 1), near=0.1),
+        lambda: cpu_raster.blending_weights(SPLATS, VIEW, Z(8, 8, 1)),
     ),
     "lift": (
         cpu_lift,
         "sgs_lift_flow",
         1,
         lambda: cpu_lift.lift(
-            Z(1, 3), Z(1, 1), Z(1, 1, 2), Z(1, 4, 4), Z(1, 3, 3), Z(1), Z(1, 1).long(), Z(1, 1), Z(1, 3), share=0.5
+            Z(1, 3),
+            ViewFlows(Z(1, 1), Z(1, 1, 2), Z(1, 4, 4), Z(1, 3, 3), Z(1)),
+            Neighbours(Z(1, 1).long(), Z(1, 1)),
+            Z(1, 3),
+            share=0.5,
         ),
     ),
     "change": (
@@ -64,7 +72,7 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         cpu_anchors,
         "sgs_anchors_visible",
         -1,
-        lambda: cpu_anchors.visible_anchors(Z(1, 3), Z(1, 3), Z(1, 3), Z(1, 2, 3), torch.eye(4), torch.eye(3), **VIEW),
+        lambda: cpu_anchors.visible_anchors(Anchors(Z(1, 3), Z(1, 3), Z(1, 3), Z(1, 2, 3), Z(1, 2)), VIEW, None),
     ),
     "encode": (
         rans,

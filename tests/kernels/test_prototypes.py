@@ -8,20 +8,28 @@ from pathlib import Path
 import pytest
 
 from structgstream.kernels._load import native_library, native_reason
-from structgstream.kernels.prototypes import PROTOTYPES, TYPES
+from structgstream.kernels.prototypes import CUDA_PROTOTYPES, PROTOTYPES, TYPES
 
-HEADER = Path(__file__).parents[2] / "csrc" / "include" / "structgstream.h"
+SOURCES = Path(__file__).parents[2] / "csrc"
+HEADERS = {"include/structgstream.h": PROTOTYPES, "cuda/ssim.h": CUDA_PROTOTYPES}
 LETTERS = {"int": "i", "int64_t": "l", "float": "f", "double": "d", "void": "v"}
 
 
 def letter(declaration: str) -> str:
     """The letter of a C type, with or without the name of an argument."""
+    if declaration.strip() == "const char*":
+        return "s"
     return "p" if "*" in declaration else LETTERS[declaration.replace("const", "").split()[0]]
 
 
-def declared() -> dict[str, tuple[str, str]]:
+def code_of(header: str) -> str:
+    """Without its comments."""
+    return re.sub(r"/\*.*?\*/", "", (SOURCES / header).read_text(), flags=re.DOTALL)
+
+
+def declared(header: str) -> dict[str, tuple[str, str]]:
     """What the header says, read by its text alone."""
-    text = re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.DOTALL)
+    text = code_of(header)
     found = re.findall(r"^(\w[\w ]*[ *]+)(sgs_\w+)\(([^)]*)\);", text, flags=re.MULTILINE)
     return {
         name: (letter(result), "" if given.strip() == "void" else "".join(map(letter, given.split(","))))
@@ -29,14 +37,13 @@ def declared() -> dict[str, tuple[str, str]]:
     }
 
 
-def test_the_table_is_the_header_s() -> None:
-    header = declared()
-    assert len(header) > 20
-    assert header.keys() == {
-        *re.findall(r"\b(sgs_\w+)\(", re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.DOTALL))
-    }
-    assert header == PROTOTYPES
-    assert TYPES.keys() == {*LETTERS.values(), "p"}
+@pytest.mark.parametrize("header", HEADERS)
+def test_the_table_is_the_header_s(header: str) -> None:
+    found = declared(header)
+    assert len(found) > 2
+    assert found.keys() == {*re.findall(r"\b(sgs_\w+)\(", code_of(header))}
+    assert found == HEADERS[header]
+    assert TYPES.keys() == {*LETTERS.values(), "p", "s"}
 
 
 @pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")

@@ -5,27 +5,19 @@ import numpy as np
 import torch
 
 from rigs import random_scene
-from structgstream.kernels.reference_anchors import generate_structured
+from structgstream.kernels.anchor_types import Anchors
+from structgstream.kernels.reference_anchors import activate_anchors
 
 
 def generated(scene, center, visible):
     a = scene.anchors
-    return generate_structured(
-        a.positions,
-        a.log_offset_scales,
-        a.log_base_scales,
-        a.offsets,
-        a.features,
-        scene.mlps,
-        center,
-        visible,
-        distance_input=True,
-    )
+    anchors = Anchors(a.positions, a.log_offset_scales, a.log_base_scales, a.offsets, a.features)
+    return activate_anchors(anchors, scene.mlps, center, visible, distance_input=True)
 
 
 def test_every_attribute_by_hand() -> None:
     scene, center = random_scene(12), torch.tensor([0.3, -0.2, -3.0])
-    result = generated(scene, center, torch.arange(12))
+    result = generated(scene, center, torch.arange(12)).gaussians
     a = {name: value.double().numpy() for name, value in vars(scene.anchors).items()}
 
     def head(weights, x):
@@ -59,6 +51,6 @@ def test_only_visible_anchors_are_dressed() -> None:
     scene, center = random_scene(12), torch.zeros(3)
     visible = torch.tensor([1, 5, 11])
     result = generated(scene, center, visible)
-    assert set((result.ids // 5).tolist()) <= {1, 5, 11}
+    assert set((result.gaussians.ids // 5).tolist()) <= {1, 5, 11}
     assert result.raw_opacities.shape == (3, 5)
-    assert len(generated(scene, center, visible[:0]).ids) == 0
+    assert len(generated(scene, center, visible[:0]).gaussians) == 0

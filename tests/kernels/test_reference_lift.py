@@ -3,6 +3,7 @@
 
 import torch
 
+from structgstream.kernels.motion_types import Neighbours, ViewFlows
 from structgstream.kernels.reference_lift import lift, projection_jacobians
 
 MOTION = torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
@@ -28,13 +29,8 @@ def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torc
     viewmats, Ks, near = cameras()
     return lift(
         centers(),
-        torch.full((VIEWS, MOVERS), 5.0, dtype=torch.float64) if weights is None else weights,
-        flows,
-        viewmats,
-        Ks,
-        near,
-        torch.arange(MOVERS)[:, None],
-        torch.ones(MOVERS, 1, dtype=torch.float64),
+        ViewFlows(torch.full_like(flows[..., 0], 5.0) if weights is None else weights, flows, viewmats, Ks, near),
+        Neighbours(torch.arange(MOVERS)[:, None], torch.ones(MOVERS, 1, dtype=torch.float64)),
         torch.zeros(MOVERS, 3, dtype=torch.float64) if prior is None else prior,
         share=0.4,
     )

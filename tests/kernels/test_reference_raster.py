@@ -6,10 +6,12 @@ import math
 import pytest
 import torch
 
+from splats import splats_of, viewport_of
 from structgstream.kernels.reference_raster import blending_weights, rasterize
 
 K = torch.tensor([[50.0, 0, 16.5], [0, 50.0, 12.5], [0, 0, 1]], dtype=torch.float64)
 EYE = torch.eye(4, dtype=torch.float64)
+VIEW = viewport_of(EYE, K, width=33, height=25, near=0.1)
 
 
 def draw(means, scales, opacities, colors, *, quats=None, near=0.1, **options):
@@ -18,7 +20,7 @@ def draw(means, scales, opacities, colors, *, quats=None, near=0.1, **options):
         torch.as_tensor(t, dtype=torch.float64) for t in (means, scales, opacities, colors)
     )
     quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(n, 4) if quats is None else quats
-    return rasterize(means, quats, scales, opacities, colors, EYE, K, width=33, height=25, near=near, **options)
+    return rasterize(splats_of(means, quats, scales, opacities, colors), VIEW._replace(near=near), **options)
 
 
 def test_one_gaussian_has_the_projected_gaussian_profile() -> None:
@@ -72,7 +74,7 @@ def test_blending_weights_are_the_pictures_of_each_gaussian_alone_in_its_colour(
     quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(3, 4)
     pictures = draw(means, scales, opacities, torch.eye(3)).image
     maps = torch.rand(25, 33, channels, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    found = blending_weights(rasterize, means, quats, scales, opacities, EYE, K, maps, near=0.1)
+    found = blending_weights(rasterize, splats_of(means, quats, scales, opacities, torch.zeros_like(means)), VIEW, maps)
     assert found.shape == (3, channels)
     assert torch.allclose(found, torch.einsum("hwn,hwc->nc", pictures, maps), rtol=1e-12)
 
@@ -94,9 +96,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
     rows, columns = slice(9, 16), slice(12, 21)  # Near the middle, where every alpha is well above 1/255.
 
     def centre(means, quats, scales, opacities, colors, offsets):
-        output = rasterize(
-            means, quats, scales, opacities, colors, EYE, K, width=33, height=25, near=0.1, screen_offsets=offsets
-        )
+        output = rasterize(splats_of(means, quats, scales, opacities, colors), VIEW, screen_offsets=offsets)
         return output.image[rows, columns], output.alpha[rows, columns]
 
     assert torch.autograd.gradcheck(centre, inputs, eps=1e-6, atol=1e-5, rtol=1e-4)

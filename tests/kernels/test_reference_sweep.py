@@ -9,7 +9,7 @@ import torch
 from rigs import arc_rig
 from structgstream.kernels import cpu_sweep, reference_sweep
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.reference_sweep import SweepView, Swept
+from structgstream.kernels.motion_types import SweepView, Swept
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 SWEEPERS = [
@@ -23,7 +23,7 @@ def emerged(planes: int = 65) -> tuple[list[SweepView], torch.Tensor, torch.Tens
     rig, found = arc_rig(5, width=64, height=48), []
     for name in rig.training:
         camera = rig[name]
-        matrices = camera.beside(torch.zeros(1))
+        matrices = camera.viewport(torch.zeros(1))
         center = matrices.viewmat[:3, 3]
         y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
         u, v = (matrices.K @ center)[:2] / center[2]

@@ -5,11 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from splats import viewport_of
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import tiles_of
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.raster_types import TileSelection, tiles_of
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -37,11 +38,13 @@ def tensors(m: int, k: int, *, distance_input: bool, d: int = 32, hidden: int = 
 def generate(module, values: list[Tensor], visible: Tensor, distance_input: bool) -> StructuredGaussians:
     heads = [HeadWeights(*values[5 + 4 * h : 9 + 4 * h]) for h in range(3)]
     center = torch.tensor([0.3, 0.2, -5.0], dtype=values[0].dtype)
-    return module.generate_structured(*values[:5], MLPWeights(*heads), center, visible, distance_input=distance_input)
+    return module.activate_anchors(
+        Anchors(*values[:5]), MLPWeights(*heads), center, visible, distance_input=distance_input
+    )
 
 
-def attributes(gaussians: StructuredGaussians) -> list[Tensor]:
-    g = gaussians
+def attributes(structured: StructuredGaussians) -> list[Tensor]:
+    g = structured.gaussians
     return [g.means, g.quats, g.scales, g.opacities, g.colors]
 
 
@@ -98,8 +101,9 @@ def test_attributes_and_gradients(isa: int, m: int, k: int, distance_input: bool
     exact_values = [value.double() for value in values]
     ours, gradients = run(cpu_anchors, values, visible, distance_input, cotangents)
     exact, exact_gradients = run(reference_anchors, exact_values, visible, distance_input, cotangents)
-    assert len(ours.ids) > 0
-    assert torch.equal(ours.ids, exact.ids)
+    assert len(ours.gaussians) > 0
+    assert torch.equal(ours.gaussians.ids, exact.gaussians.ids)
+    assert torch.equal(ours.anchors, visible)
     assert (ours.raw_opacities - exact.raw_opacities).abs().max() < 1e-5
     assert not ours.raw_opacities.requires_grad
     for value, wanted in zip(attributes(ours), attributes(exact), strict=True):
@@ -136,7 +140,7 @@ def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     for threads in (1, 2, 3, 2):
         torch.set_num_threads(threads)
         gaussians, gradients = run(cpu_anchors, values, visible, True, cotangents)
-        results.append([*attributes(gaussians), gaussians.ids, gaussians.raw_opacities, *gradients.values()])
+        results.append([*attributes(gaussians), gaussians.gaussians.ids, gaussians.raw_opacities, *gradients.values()])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -145,8 +149,8 @@ def test_no_visible_anchor() -> None:
     values, visible = tensors(20, 5, distance_input=True), torch.zeros(0, dtype=torch.int64)
     cotangents = cotangents_of(values, visible, True)
     ours, gradients = run(cpu_anchors, values, visible, True, cotangents)
-    assert ours.ids.shape == (0,)
-    assert ours.means.shape == (0, 3)
+    assert ours.gaussians.ids.shape == (0,)
+    assert ours.gaussians.means.shape == (0, 3)
     assert ours.raw_opacities.shape == (0, 5)
     assert all(gradients[index].shape == values[index].shape for index in gradients)
     assert all((gradient == 0).all() for gradient in gradients.values())
@@ -157,7 +161,7 @@ def test_no_positive_opacity() -> None:
     values[8].fill_(-20.0)
     cotangents = cotangents_of(values, visible, True)
     ours, gradients = run(cpu_anchors, values, visible, True, cotangents)
-    assert ours.ids.shape == (0,)
+    assert len(ours.gaussians) == 0
     assert (ours.raw_opacities < 0).all()
     assert all((gradient == 0).all() for gradient in gradients.values())
 
@@ -177,8 +181,8 @@ def test_extreme_outputs_stay_finite(isa: int) -> None:
         values[index] *= 1e4
     ours, gradients = run(cpu_anchors, values, visible, True, cotangents_of(values, visible, True))
     assert all(torch.isfinite(x).all() for x in [*attributes(ours), *gradients.values()])
-    assert ours.opacities.max() <= 1.0
-    assert ours.colors.min() >= 0.0
+    assert ours.gaussians.opacities.max() <= 1.0
+    assert ours.gaussians.colors.min() >= 0.0
 
 
 @pytest.mark.parametrize("module", [cpu_anchors, reference_anchors])
@@ -205,18 +209,16 @@ def test_culling(isa: int, tiled: bool) -> None:
     viewmat = torch.eye(4)
     viewmat[:3, 3] = torch.tensor([0.2, -0.1, 1.0])
     K = torch.tensor([[90.0, 0, 50], [0, 95.0, 41], [0, 0, 1]])
-    tiles = torch.rand(tiles_of(101, 77)) < 0.2 if tiled else None
+    tiles = TileSelection(torch.rand(tiles_of(101, 77)) < 0.2, 101, 77) if tiled else None
     found = [
         module.visible_anchors(
-            *(tensor.to(dtype) for tensor in values[:4]),
-            viewmat.to(dtype),
-            K.to(dtype),
-            width=101,
-            height=77,
-            near=0.3,
-            tiles=tiles,
+            Anchors(*(tensor.to(dtype) for tensor in values[:5])),
+            viewport_of(viewmat.to(dtype), K.to(dtype), width=101, height=77, near=0.3),
+            tiles,
         )
         for module, dtype in ((cpu_anchors, torch.float32), (reference_anchors, torch.float64))
     ]
     assert 20 < len(found[1]) < 900
     assert torch.equal(*found)
+    assert found[0].dtype == found[1].dtype == torch.int64
+    assert (found[0].diff() > 0).all()

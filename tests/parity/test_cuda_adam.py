@@ -38,18 +38,6 @@ def test_a_gradient_laid_out_otherwise(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_rate_and_number_on_the_device(device: str) -> None:
-    param, gradients = torch.randn(9, 4, device=device), [torch.randn(9, 4, device=device) for _ in range(4)]
-    exact = steps(cuda_adam, param, gradients)
-    state = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
-    lr, step = torch.tensor(OPTIONS["lr"], device=device), torch.zeros((), device=device)
-    for gradient in gradients:
-        step += 1.0
-        cuda_adam.adam_step(state[0], gradient, *state[1:], step=step, **{**OPTIONS, "lr": lr})
-    assert all(torch.allclose(a, b, rtol=1e-6, atol=1e-7) for a, b in zip(state, exact, strict=True))
-
-
-@pytest.mark.parametrize("device", DEVICES)
 def test_selected_rows_are_the_references(device: str) -> None:
     param, rows = torch.randn(60, 3, device=device), torch.tensor([1, 3, 59], device=device)
     gradients = [torch.randn_like(param) for _ in range(3)]

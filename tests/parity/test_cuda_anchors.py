@@ -7,14 +7,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from splats import viewport_of
+from structgstream.cameras import Viewport
 from structgstream.kernels import cuda_anchors, reference_anchors, reference_raster
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import tiles_of
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.raster_types import TileSelection, tiles_of
 
 M, K, D, HIDDEN = 60, 5, 12, 16
 WIDTH, HEIGHT = 53, 41
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "colors")
-CAMERA = {"width": WIDTH, "height": HEIGHT, "near": 0.2}
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
 
 
@@ -36,40 +37,44 @@ def tensors(*, distance_input: bool) -> list[Tensor]:
     return [value.double() for value in values]
 
 
-def matrices(like: Tensor) -> tuple[Tensor, Tensor]:
+def camera(like: Tensor) -> Viewport:
     viewmat = torch.eye(4).to(like)
     viewmat[0, 3] = 0.1
-    return viewmat, torch.tensor([[40.0, 0, WIDTH / 2], [0, 42.0, HEIGHT / 2], [0, 0, 1]]).to(like)
+    K = torch.tensor([[40.0, 0, WIDTH / 2], [0, 42.0, HEIGHT / 2], [0, 0, 1]]).to(like)
+    return viewport_of(viewmat, K, width=WIDTH, height=HEIGHT, near=0.2)
 
 
-def visible(module, values: list[Tensor], tiles: Tensor | None = None) -> Tensor:
-    return module.visible_anchors(*values[:4], *matrices(values[0]), tiles=tiles, **CAMERA)
-
-
-def generate(module, values: list[Tensor], seen: Tensor, *, distance_input: bool) -> StructuredGaussians:
+def generate(
+    module, values: list[Tensor], *, tiles: TileSelection | None = None, distance_input: bool = True
+) -> StructuredGaussians:
     mlps = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13)))
-    center = torch.tensor([-0.1, 0.0, 0.0]).to(values[0])
-    return module.generate_structured(*values[:5], mlps, center, seen, distance_input=distance_input)
+    return module.generate_structured(
+        Anchors(*values[:5]), mlps, camera(values[0]), distance_input=distance_input, tiles=tiles
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("tiled", [False, True])
-def test_the_mask_marks_what_the_reference_lists(device: str, tiled: bool) -> None:
+def test_who_is_looked_at(device: str, tiled: bool) -> None:
+    """All anchors, and those that the reference does not look at say that they draw nothing."""
     values = [value.to(device) for value in tensors(distance_input=True)]
-    tiles = (torch.rand(tiles_of(WIDTH, HEIGHT)) < 0.3).to(device) if tiled else None
-    mask, listed = visible(cuda_anchors, values, tiles), visible(reference_anchors, values, tiles)
-    assert mask.shape == (M,)
-    assert 0 < len(listed) < M
-    assert torch.equal(mask.nonzero()[:, 0], listed)
+    mask = (torch.rand(tiles_of(WIDTH, HEIGHT)) < 0.3).to(device)
+    tiles = TileSelection(mask, WIDTH, HEIGHT) if tiled else None
+    ours, exact = (generate(module, values, tiles=tiles) for module in (cuda_anchors, reference_anchors))
+    assert torch.equal(ours.anchors, torch.arange(M, device=device))
+    assert 0 < len(exact.anchors) < M
+    assert (exact.anchors.diff() > 0).all()
+    assert torch.equal((ours.raw_opacities > -1).any(1).nonzero()[:, 0], exact.anchors)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("distance_input", [True, False])
 def test_the_drawn_set_is_the_references(device: str, distance_input: bool) -> None:
     values = [value.to(device) for value in tensors(distance_input=distance_input)]
-    ours = generate(cuda_anchors, values, visible(cuda_anchors, values), distance_input=distance_input)
-    listed = visible(reference_anchors, values)
-    exact = generate(reference_anchors, values, listed, distance_input=distance_input)
+    found, wanted = (
+        generate(module, values, distance_input=distance_input) for module in (cuda_anchors, reference_anchors)
+    )
+    ours, exact = found.gaussians, wanted.gaussians
     drawn = ours.opacities > 0
     assert ours.means.shape == (M * K, 3)
     assert 0 < len(exact.ids) < M * K
@@ -79,9 +84,9 @@ def test_the_drawn_set_is_the_references(device: str, distance_input: bool) -> N
         assert torch.allclose(getattr(ours, name)[drawn], getattr(exact, name), rtol=1e-10, atol=1e-12), name
     assert not ours.scales[~drawn].any()
     assert not ours.opacities[~drawn].any()
-    assert torch.allclose(ours.raw_opacities[listed], exact.raw_opacities)
-    assert (ours.raw_opacities.clamp(min=0.0).sum(1) > 0).sum() <= len(listed)
-    assert not ours.raw_opacities.requires_grad
+    assert torch.allclose(found.raw_opacities[wanted.anchors], wanted.raw_opacities)
+    assert (found.raw_opacities.clamp(min=0.0).sum(1) > 0).sum() <= len(wanted.anchors)
+    assert not found.raw_opacities.requires_grad
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -90,8 +95,7 @@ def test_gradients_of_the_drawn_set(device: str, trained: tuple[int, ...]) -> No
     values = [value.to(device) for value in tensors(distance_input=True)]
     for i in trained:
         values[i].requires_grad_()
-    ours = generate(cuda_anchors, values, visible(cuda_anchors, values), distance_input=True)
-    exact = generate(reference_anchors, values, visible(reference_anchors, values), distance_input=True)
+    ours, exact = (generate(module, values).gaussians for module in (cuda_anchors, reference_anchors))
     drawn = ours.opacities > 0
     cotangents = {name: torch.randn_like(getattr(exact, name)) for name in ATTRIBUTES}
     leaves = [values[i] for i in trained]
@@ -114,10 +118,8 @@ def test_pictures_and_their_gradients() -> None:
     weights = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)
     pictures, gradients = [], []
     for module in (cuda_anchors, reference_anchors):
-        g = generate(module, values, visible(module, values), distance_input=True)
-        attributes = [getattr(g, name) for name in ATTRIBUTES]
-        viewmat, K = matrices(values[0])
-        image = reference_raster.rasterize(*attributes, viewmat=viewmat, K=K, **CAMERA).image
+        g = generate(module, values).gaussians
+        image = reference_raster.rasterize(g, camera(values[0])).image
         loss = (image * weights).sum() + g.scales.prod(1).sum() / (g.opacities > 0).sum()
         pictures.append(image.detach())
         gradients.append(torch.autograd.grad(loss, [values[i] for i in trained]))
@@ -128,25 +130,13 @@ def test_pictures_and_their_gradients() -> None:
         assert (a - b).norm() <= 1e-9 * b.norm()
 
 
-def test_indices_take_the_references_way() -> None:
-    values = tensors(distance_input=True)
-    seen = torch.tensor([3, 7, 50])
-    ours, exact = (generate(module, values, seen, distance_input=True) for module in (cuda_anchors, reference_anchors))
-    assert all(torch.equal(getattr(ours, name), getattr(exact, name)) for name in (*ATTRIBUTES, "ids", "raw_opacities"))
-
-
 @pytest.mark.needs_cuda
 def test_nothing_waits_for_the_gpu() -> None:
     values = [value.float().cuda().requires_grad_() for value in tensors(distance_input=True)]
-    viewmat, K = matrices(values[0])
-    mlps = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13)))
-    center = torch.zeros(3, device="cuda")
+    mlps, view = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13))), camera(values[0])
     torch.cuda.set_sync_debug_mode("error")
     try:
-        seen = cuda_anchors.visible_anchors(*values[:4], viewmat=viewmat, K=K, **CAMERA)
-        g = cuda_anchors.generate_structured(
-            *values[:5], mlps=mlps, camera_center=center, visible=seen, distance_input=True
-        )
+        g = cuda_anchors.generate_structured(Anchors(*values[:5]), mlps, view, distance_input=True).gaussians
         torch.autograd.grad(sum(getattr(g, name).sum() for name in ATTRIBUTES), values)  # type: ignore[arg-type]
     finally:
         torch.cuda.set_sync_debug_mode("default")

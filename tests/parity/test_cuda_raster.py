@@ -4,7 +4,6 @@ gsplat 1.5.3 as its sources state it; and, where there is a GPU, the same with t
 """
 
 import sys
-from collections.abc import Callable
 from functools import partial
 from types import ModuleType
 
@@ -12,12 +11,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from splats import splats_of, viewport_of
+from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, reference_raster
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, tiles_of
+from structgstream.kernels.operations import Rasterize
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles_of
 
 WIDTH, HEIGHT, NEAR, COUNT = 41, 35, 0.2, 30
-Rasterize = Callable[..., RasterOutput]
 PAIRS = 700
 
 
@@ -25,9 +26,8 @@ def projection(means, covars, quats, scales, viewmats, Ks, width, height, *, opa
     assert (covars, eps2d, packed) == (None, 0.3, False)
     assert viewmats.shape == (1, 4, 4)
     assert Ks.shape == (1, 3, 3)
-    p = reference_raster._project(
-        means, quats, scales, opacities, means, viewmats[0], Ks[0], width, height, near_plane, None
-    )
+    view = viewport_of(viewmats[0], Ks[0], width=width, height=height, near=near_plane)
+    p = reference_raster._project(splats_of(means, quats, scales, opacities, means), view, None)
     count = means.shape[0]
 
     def whole(values: Tensor, rest: float) -> Tensor:
@@ -115,24 +115,25 @@ def splats(device: str) -> list[Tensor]:
     return [value.to(device, torch.float32 if device == "cuda" else torch.float64) for value in values]
 
 
+def camera(like: Tensor) -> Viewport:
+    K = torch.tensor([[30.0, 0, 20.0], [0, 31.0, 17.0], [0, 0, 1]])
+    return viewport_of(torch.eye(4).to(like), K.to(like), width=WIDTH, height=HEIGHT, near=NEAR)
+
+
 def run(rasterize: Rasterize, values: list[Tensor], **options) -> tuple[list[Tensor], list[Tensor]]:
     """Picture, coverage and radii, and the gradients of all inputs for fixed cotangents."""
     leaves = [value.clone().requires_grad_() for value in values]
-    viewmat = torch.eye(4).to(values[0])
-    K = torch.tensor([[30.0, 0, 20.0], [0, 31.0, 17.0], [0, 0, 1]]).to(values[0])
-    output = rasterize(
-        *leaves[:5], viewmat=viewmat, K=K, width=WIDTH, height=HEIGHT, near=NEAR, screen_offsets=leaves[5], **options
-    )
+    output = rasterize(splats_of(*leaves[:5]), camera(values[0]), screen_offsets=leaves[5], **options)
     generator = torch.Generator().manual_seed(3)
     v_image = torch.rand(HEIGHT, WIDTH, 3, generator=generator).to(values[0])
     gradients = torch.autograd.grad((output.image * v_image).sum() + output.alpha.sum(), leaves)
     return [output.image.detach(), output.alpha.detach(), output.radii], list(gradients)
 
 
-def asked(device: str) -> Tensor:
-    tiles = torch.ones(tiles_of(WIDTH, HEIGHT), dtype=torch.bool, device=device)
-    tiles[0, 1] = tiles[2, 0] = False
-    return tiles
+def asked(device: str) -> TileSelection:
+    mask = torch.ones(tiles_of(WIDTH, HEIGHT), dtype=torch.bool, device=device)
+    mask[0, 1] = mask[2, 0] = False
+    return TileSelection(mask, WIDTH, HEIGHT)
 
 
 @pytest.mark.usefixtures("pretended")
@@ -144,12 +145,14 @@ def test_the_picture_and_its_gradients_are_the_references(budgeted: bool, case: 
         "plain": {},
         "background": {"background": torch.tensor([0.2, 0.5, 0.1], dtype=torch.float64)},
         "tiles": {"tiles": asked("cpu")},
-        "onto": {"tiles": asked("cpu"), "onto": torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)},
+        "onto": {"tiles": asked("cpu")},
         "trained": {"trained": 20},
     }[case]
     budget = PairBudget.of(PAIRS, torch.device("cpu")) if budgeted else None
-    exact, exact_gradients = run(reference_raster.rasterize, values, **options)
-    ours, gradients = run(partial(cuda.rasterize, budget=budget), values, **options)
+    pictures = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64).expand(2, HEIGHT, WIDTH, 3).clone()
+    ontos = [{"onto": picture} if case == "onto" else {} for picture in pictures]
+    exact, exact_gradients = run(reference_raster.rasterize, values, **options, **ontos[0])
+    ours, gradients = run(partial(cuda.rasterize, budget=budget), values, **options, **ontos[1])
     assert exact[1].amax() > 0.3
     for got, truth in zip(ours[:2], exact[:2], strict=True):
         assert torch.allclose(got, truth, rtol=0, atol=1e-9)
@@ -158,6 +161,27 @@ def test_the_picture_and_its_gradients_are_the_references(budgeted: bool, case: 
     if budget is not None:
         assert 30 < int(budget.needed) < PAIRS
         assert budget.shortage() == 0
+
+
+@pytest.mark.usefixtures("pretended")
+def test_with_tiles_who_reaches_none_counts_as_not_drawn_and_the_picture_is_drawn_onto() -> None:
+    values = splats("cpu")
+    tiles = asked("cpu")
+    tiles.mask[1:] = False
+    pictures = [torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64) for _ in range(2)]
+    outputs = [
+        rasterize(splats_of(*values[:5]), camera(values[0]), tiles=tiles, onto=picture)
+        for rasterize, picture in zip((reference_raster.rasterize, cuda.rasterize), pictures, strict=True)
+    ]
+    for output, picture in zip(outputs, pictures, strict=True):
+        assert output.image.data_ptr() == picture.data_ptr()
+    pixels = tiles.pixels()[..., None].expand(-1, -1, 1).double()
+    shown = reference_raster.blending_weights(
+        reference_raster.rasterize, splats_of(*values[:5]), camera(values[0]), pixels
+    )
+    everything = cuda.rasterize(splats_of(*values[:5]), camera(values[0]))
+    assert 0 < (shown > 0).sum() <= (outputs[1].radii > 0).sum() < (everything.radii > 0).sum()
+    assert (outputs[1].radii[shown[:, 0] > 0] > 0).all()
 
 
 @pytest.mark.usefixtures("pretended")
@@ -186,20 +210,10 @@ def test_with_a_budget_gsplat_draws_the_same(tiled: bool) -> None:
 def test_with_a_budget_nothing_waits_for_the_gpu() -> None:
     values, budget = splats("cuda"), PairBudget.of(PAIRS, torch.device("cuda"))
     leaves = [value.requires_grad_() for value in values]
-    viewmat = torch.eye(4, device="cuda")
-    K = torch.tensor([[30.0, 0, 20.0], [0, 31.0, 17.0], [0, 0, 1]], device="cuda")
+    splats_, view = splats_of(*leaves[:5]), camera(values[0])
 
     def once() -> None:
-        output = cuda.rasterize(
-            *leaves[:5],
-            viewmat=viewmat,
-            K=K,
-            width=WIDTH,
-            height=HEIGHT,
-            near=NEAR,
-            screen_offsets=leaves[5],
-            budget=budget,
-        )
+        output = cuda.rasterize(splats_, view, screen_offsets=leaves[5], budget=budget)
         torch.autograd.grad(output.image.sum(), leaves)
 
     once()  # the kernels are loaded

@@ -5,15 +5,15 @@ with the reference's rasteriser, on a GPU with everything real.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from structgstream.cameras import Viewport
 from structgstream.kernels import cuda_adam, cuda_anchors
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
-from structgstream.kernels.backend import Backend, cuda_backend, reference_backend, without_waiting
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights
+from structgstream.kernels.backend import Backend, cuda_backend, nonblocking, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
 
 M, K, D, HIDDEN, WIDTH, HEIGHT = 40, 4, 6, 8, 48, 40
@@ -56,13 +56,12 @@ class Fit:
     def state(self) -> list[Tensor]:
         return [self.values[i] for i in TRAINED] + [moment for pair in self.moments for moment in pair]
 
-    def step(self, viewmat: Tensor, intrinsics: Tensor, center: Tensor, image: Tensor, number: Any) -> tuple[Tensor]:
+    def step(self, viewmat: Tensor, intrinsics: Tensor, center: Tensor, image: Tensor, number: int) -> tuple[Tensor]:
         v, backend = self.values, self.backend
         mlps = MLPWeights(*(HeadWeights(*v[i : i + 4]) for i in (5, 9, 13)))
-        view = {"width": WIDTH, "height": HEIGHT, "near": 0.2}
-        seen = backend.visible_anchors(*v[:4], viewmat, intrinsics, **view)
-        g = backend.generate_structured(*v[:5], mlps, center, seen, distance_input=True)
-        picture = backend.rasterize(g.means, g.quats, g.scales, g.opacities, g.colors, viewmat, intrinsics, **view)
+        view = Viewport(viewmat, intrinsics, center, WIDTH, HEIGHT, near=0.2)
+        g = backend.generate_structured(Anchors(*v[:5]), mlps, view, distance_input=True).gaussians
+        picture = backend.rasterize(g, view)
         l1, ssim = backend.l1_ssim(picture.image, image)
         volume = g.scales[:, 0] * g.scales[:, 1] * g.scales[:, 2]
         loss = l1 + 0.2 * (1.0 - ssim) + 0.01 * volume.sum() / (g.opacities > 0).sum()
@@ -82,18 +81,19 @@ class Fit:
             intrinsics = torch.tensor([[35.0, 0, WIDTH / 2], [0, 36.0, HEIGHT / 2], [0, 0, 1]]).to(like)
             generator = torch.Generator().manual_seed(n % 2)
             image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator, dtype=torch.uint8).to(device)
-            (loss,) = step(viewmat, intrinsics, -viewmat[:3, 3], image, torch.tensor(float(n), device=device))
+            (loss,) = step(viewmat, intrinsics, -viewmat[:3, 3], image, n)
             losses.append(float(loss))
         return losses
 
 
-def example(device: str) -> list[Tensor]:
+def example(device: str) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
     floats = torch.float32 if device == "cuda" else torch.float64
     shapes = [((4, 4), floats), ((3, 3), floats), ((3,), floats), ((HEIGHT, WIDTH, 3), torch.uint8)]
     values = [torch.zeros(shape, dtype=dtype, device=device) for shape, dtype in shapes]
     values[0].fill_diagonal_(1.0)
     values[1].fill_diagonal_(35.0)[2, 2] = 1.0
-    return [*values, torch.ones((), device=device)]
+    viewmat, intrinsics, center, image = values
+    return viewmat, intrinsics, center, image, 1
 
 
 def compare(ours: Fit, exact: Fit, losses: list[float], exact_losses: list[float], tolerance: float) -> None:
@@ -107,7 +107,6 @@ def test_fixed_shapes_move_the_anchors_as_the_reference() -> None:
     reference = reference_backend()
     fixed = replace(
         reference,
-        visible_anchors=cuda_anchors.visible_anchors,
         generate_structured=cuda_anchors.generate_structured,
         adam_step=cuda_adam.adam_step,
     )
@@ -122,7 +121,7 @@ def test_fixed_shapes_move_the_anchors_as_the_reference() -> None:
 def test_on_a_gpu() -> None:
     plain = cuda_backend()
     budget = PairBudget.of(20_000, plain.device)
-    exact, ours = Fit(plain, "cuda"), Fit(without_waiting(plain, budget), "cuda")
+    exact, ours = Fit(plain, "cuda"), Fit(nonblocking(plain, budget), "cuda")
     exact_losses = exact.run(exact.step, "cuda")
     losses = ours.run(ours.step, "cuda")
     assert budget.shortage() == 0
@@ -132,7 +131,7 @@ def test_on_a_gpu() -> None:
 @pytest.mark.needs_cuda
 def test_an_iteration_waits_for_nothing() -> None:
     plain = cuda_backend()
-    fit = Fit(without_waiting(plain, PairBudget.of(20_000, plain.device)), "cuda")
+    fit = Fit(nonblocking(plain, PairBudget.of(20_000, plain.device)), "cuda")
     inputs = example("cuda")
     fit.step(*inputs)  # libraries load
     torch.cuda.set_sync_debug_mode("error")

@@ -12,11 +12,14 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from splats import viewport_of
 from structgstream.kernels import cuda_adam, cuda_anchors, reference_anchors
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights
 from structgstream.kernels.cuda_tiles import tile_lists
-from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.reference_raster import reaching
 
+VIEW = viewport_of(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 20], [0, 0, 1]]), width=40, height=40, near=0.1)
 WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2", "unique_dim")
 
 
@@ -45,25 +48,21 @@ def anchors(m: int = 30, k: int = 3, d: int = 5) -> tuple[list[Tensor], MLPWeigh
 @pytest.mark.parametrize("tiled", [False, True])
 def test_seeing_and_dressing_anchors(tiled: bool) -> None:
     values, mlps = anchors()
-    viewmat, K = torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 20], [0, 0, 1]])
-    tiles = torch.rand(tiles_of(40, 40)) < 0.5 if tiled else None
+    tiles = TileSelection(torch.rand(tiles_of(40, 40)) < 0.5, 40, 40) if tiled else None
     with NoWaiting():
-        seen = cuda_anchors.visible_anchors(
-            *values[:4], viewmat=viewmat, K=K, width=40, height=40, near=0.1, tiles=tiles
-        )
-        g = cuda_anchors.generate_structured(
-            *values, mlps=mlps, camera_center=torch.zeros(3), visible=seen, distance_input=True
-        )
+        g = cuda_anchors.generate_structured(Anchors(*values), mlps, VIEW, distance_input=True, tiles=tiles).gaussians
         total = g.means.sum() + g.quats.sum() + g.scales.sum() + g.opacities.sum() + g.colors.sum()
         torch.autograd.grad(total, [*values, *(weight for head in mlps for weight in head)])
 
 
 def test_tile_lists_and_masks_of_pixels() -> None:
     means2d, radii = torch.rand(50, 2) * 60, torch.randint(0, 9, (50, 2), dtype=torch.int32)
-    depths, tiles = torch.rand(50), torch.rand(tiles_of(60, 60)) < 0.5
+    depths, tiles = torch.rand(50), TileSelection(torch.rand(tiles_of(60, 60)) < 0.5, 60, 60)
+    low, high = torch.rand(50, 2) * 30, torch.rand(50, 2) * 60
     with NoWaiting():
         tile_lists(means2d, radii, depths, width=60, height=60, capacity=900)
-        pixels_of_tiles(tiles, 60, 60)
+        tiles.pixels()
+        reaching(low, high, tiles)
 
 
 def test_the_optimiser() -> None:
@@ -74,11 +73,8 @@ def test_the_optimiser() -> None:
 
 def test_what_the_other_back_ends_do_is_caught() -> None:
     values, mlps = anchors()
-    seen = torch.arange(30)
     with NoWaiting(), pytest.raises(RuntimeError, match="nonzero"):
-        reference_anchors.generate_structured(
-            *values, mlps=mlps, camera_center=torch.zeros(3), visible=seen, distance_input=True
-        )
+        reference_anchors.generate_structured(Anchors(*values), mlps, VIEW, distance_input=True)
     with NoWaiting(), pytest.raises(RuntimeError, match="index"):
         torch.ones(3)[torch.tensor([True, False, True])]
     with NoWaiting(), pytest.raises(RuntimeError, match="_local_scalar_dense"):

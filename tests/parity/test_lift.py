@@ -6,6 +6,7 @@ import torch
 
 from structgstream.kernels import cpu_lift, reference_lift
 from structgstream.kernels._load import native_library, native_reason
+from structgstream.kernels.motion_types import Lifted, Neighbours, ViewFlows
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -51,6 +52,12 @@ def single(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return {name: t if t.dtype == torch.int64 else t.float() for name, t in tensors.items()}
 
 
+def lifted(module, given: dict[str, torch.Tensor]) -> Lifted:
+    seen = ViewFlows(*(given[name] for name in ViewFlows._fields))
+    around = Neighbours(given["neighbours"], given["affinities"])
+    return module.lift(given["centers"], seen, around, given["priors"], share=0.4)
+
+
 @needs_native
 @pytest.mark.parametrize("isa", [0, 1, 2])
 @pytest.mark.parametrize("seed", [0, 1])
@@ -60,10 +67,10 @@ def test_cpu_finds_what_the_oracle_finds(isa: int, seed: int) -> None:
     try:
         if native_library().sgs_use_isa(isa) != isa:
             pytest.skip("this processor has no such instructions")
-        found = cpu_lift.lift(**single(given), share=0.4)
+        found = lifted(cpu_lift, single(given))
     finally:
         native_library().sgs_use_isa(before)
-    oracle = reference_lift.lift(**given, share=0.4)
+    oracle = lifted(reference_lift, given)
     # Rounds feed on each other, so single precision shows in the fifth digit.
     torch.testing.assert_close(found.displacements.double(), oracle.displacements, atol=2e-5, rtol=1e-3)
     near_the_edge = (found.inlier_share.double() - oracle.inlier_share).abs() > 1e-3
@@ -78,7 +85,7 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
         results = []
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            results.append(cpu_lift.lift(**given, share=0.4))
+            results.append(lifted(cpu_lift, given))
     finally:
         torch.set_num_threads(threads)
     for other in results[1:]:
@@ -90,7 +97,7 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
 def test_cpu_without_evidence_keeps_the_prior() -> None:
     given = single(scenery(2))
     given["weights"] = torch.zeros_like(given["weights"])
-    found = cpu_lift.lift(**given, share=0.4)
+    found = lifted(cpu_lift, given)
     assert torch.equal(found.displacements, given["priors"])
     assert not found.inlier_share.any()
     assert not found.agreeing_views.any()

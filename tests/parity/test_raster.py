@@ -10,9 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from splats import splats_of, viewport_of
+from structgstream.cameras import Viewport
 from structgstream.kernels import cpu_raster, cuda, reference_raster
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tiles_of
 from structgstream.kernels.reference_raster import rasterize as reference
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
@@ -20,14 +22,15 @@ WIDTH, HEIGHT, NEAR = 75, 53, 0.2  # No multiple of the tile.
 NAMES = ("means", "quats", "scales", "opacities", "colors", "screen_offsets")
 
 
-def camera() -> tuple[Tensor, Tensor]:
+def camera(dtype: torch.dtype = torch.float64, device: str = "cpu") -> Viewport:
     angle = torch.tensor(0.2, dtype=torch.float64)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[0, 0] = viewmat[2, 2] = angle.cos()
     viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
     viewmat[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
     K = torch.tensor([[60.0, 0, 36.0], [0, 58.0, 27.0], [0, 0, 1]], dtype=torch.float64)
-    return viewmat, K
+    viewmat, K = (value.to(device, dtype) for value in (viewmat, K))
+    return viewport_of(viewmat, K, width=WIDTH, height=HEIGHT, near=NEAR)
 
 
 def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
@@ -35,7 +38,7 @@ def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
     depths = torch.linspace(1.0, 5.0, count, dtype=torch.float64)[torch.randperm(count, generator=g)]
     spread = torch.rand(count, 2, generator=g, dtype=torch.float64) * 2.0 - 1.0
     means = torch.cat([spread * depths[:, None] * 0.8, depths[:, None]], dim=1)
-    viewmat, _ = camera()
+    viewmat = camera().viewmat
     means = (means - viewmat[:3, 3]) @ viewmat[:3, :3]  # Depths are the camera's, so they stay far apart.
     return (
         means,
@@ -51,14 +54,9 @@ def run(rasterize, inputs: tuple[Tensor, ...], *, background: Tensor | None = No
     """Image, alpha and the gradients for fixed cotangents."""
     dtype = inputs[0].dtype
     leaves = [value.to(device).clone().requires_grad_() for value in inputs]
-    viewmat, K = (value.to(device, dtype) for value in camera())
     output = rasterize(
-        *leaves[:5],
-        viewmat,
-        K,
-        width=WIDTH,
-        height=HEIGHT,
-        near=NEAR,
+        splats_of(*leaves[:5]),
+        camera(dtype, device),
         screen_offsets=leaves[5],
         background=None if background is None else background.to(device, dtype),
     )
@@ -74,7 +72,6 @@ def run(rasterize, inputs: tuple[Tensor, ...], *, background: Tensor | None = No
 def safe_pixels(inputs: tuple[Tensor, ...]) -> Tensor:
     """Mask ``[H, W]``: pixels that do not change when the definition's limits move by a little."""
     values = [value.double() for value in inputs]
-    viewmat, K = camera()
     pictures = []
     saved = reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE
     try:
@@ -82,7 +79,7 @@ def safe_pixels(inputs: tuple[Tensor, ...]) -> Tensor:
             reference_raster.MIN_ALPHA = saved[0] * factor
             reference_raster.MAX_ALPHA = 1 - (1 - saved[1]) * factor
             reference_raster.MIN_TRANSMITTANCE = saved[2] * factor
-            pictures.append(reference(*values[:5], viewmat=viewmat, K=K, width=WIDTH, height=HEIGHT, near=NEAR).image)
+            pictures.append(reference(splats_of(*values[:5]), camera()).image)
     finally:
         reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE = saved
     return ((pictures[0] - pictures[1]).abs().amax(-1) < 1e-7).double()
@@ -179,11 +176,11 @@ def test_the_state_is_freed_without_a_backward_pass() -> None:
     import resource
 
     inputs = tuple(v.float().requires_grad_() for v in gaussians(3000)[:5])
-    viewmat, K = camera()
+    view = camera(torch.float32)._replace(width=320, height=240)
     peaks = []
     for _ in range(3):
         for _ in range(40):
-            cpu_raster.rasterize(*inputs, viewmat=viewmat, K=K, width=320, height=240, near=NEAR)
+            cpu_raster.rasterize(splats_of(*inputs), view)
         peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     assert peaks[2] - peaks[0] < 20_000  # kB; 80 states that leaked would hold more than 60,000
 
@@ -191,32 +188,23 @@ def test_the_state_is_freed_without_a_backward_pass() -> None:
 def test_another_precision_is_refused_with_a_way_out() -> None:
     from structgstream.errors import BackendError
 
-    viewmat, K = camera()
     with pytest.raises(BackendError, match="reference back-end"):
-        cpu_raster.rasterize(*gaussians(3)[:5], viewmat=viewmat, K=K, width=8, height=8, near=NEAR)
+        cpu_raster.rasterize(splats_of(*gaussians(3)[:5]), camera())
 
 
-def some_tiles() -> Tensor:
-    tiles = torch.zeros(tiles_of(WIDTH, HEIGHT), dtype=torch.bool)
-    tiles[0, 1] = tiles[2, 2] = tiles[2, 3] = tiles[3, 4] = True
-    return tiles
+def some_tiles() -> TileSelection:
+    mask = torch.zeros(tiles_of(WIDTH, HEIGHT), dtype=torch.bool)
+    mask[0, 1] = mask[2, 2] = mask[2, 3] = mask[3, 4] = True
+    return TileSelection(mask, WIDTH, HEIGHT)
 
 
-def run_tiles(rasterize, inputs: tuple[Tensor, ...], tiles: Tensor, onto: Tensor | None, trained: int | None):
+def run_tiles(
+    rasterize, inputs: tuple[Tensor, ...], tiles: TileSelection | None, onto: Tensor | None, trained: int | None
+):
     dtype = inputs[0].dtype
     leaves = [value.clone().requires_grad_() for value in inputs]
-    viewmat, K = (value.to(dtype) for value in camera())
     output = rasterize(
-        *leaves[:5],
-        viewmat,
-        K,
-        width=WIDTH,
-        height=HEIGHT,
-        near=NEAR,
-        screen_offsets=leaves[5],
-        tiles=tiles,
-        onto=onto,
-        trained=trained,
+        splats_of(*leaves[:5]), camera(dtype), screen_offsets=leaves[5], tiles=tiles, onto=onto, trained=trained
     )
     g = torch.Generator().manual_seed(11)
     v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * safe_pixels(inputs)[..., None]
@@ -230,10 +218,10 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
     inputs = gaussians()
     single = tuple(value.float() for value in inputs)
     tiles = some_tiles()
-    inside = pixels_of_tiles(tiles, WIDTH, HEIGHT)
+    inside = tiles.pixels()
     onto = torch.rand(HEIGHT, WIDTH, 3)
     exact, exact_gradients = run_tiles(reference, inputs, tiles, onto.double(), trained)
-    whole, _ = run_tiles(cpu_raster.rasterize, single, torch.ones_like(tiles), None, None)
+    whole, _ = run_tiles(cpu_raster.rasterize, single, None, None, None)
     memory = onto.clone()
     output, gradients = run_tiles(cpu_raster.rasterize, single, tiles, memory, trained)
     assert torch.equal(output.image[inside], whole.image[inside])
@@ -254,32 +242,29 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
 @native
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
 def test_blending_weights(isa: int, channels: int) -> None:
-    means, quats, scales, opacities, _, _ = gaussians()
-    viewmat, K = camera()
-    maps = torch.rand(HEIGHT, WIDTH, channels, dtype=torch.float64) * safe_pixels(gaussians())[..., None]
-    exact = reference_raster.blending_weights(reference, means, quats, scales, opacities, viewmat, K, maps, near=NEAR)
-    single = [value.float() for value in (means, quats, scales, opacities, viewmat, K, maps)]
-    ours = cpu_raster.blending_weights(*single, near=NEAR)
-    assert ours.shape == exact.shape == (len(means), channels)
+    inputs = gaussians()
+    maps = torch.rand(HEIGHT, WIDTH, channels, dtype=torch.float64) * safe_pixels(inputs)[..., None]
+    exact = reference_raster.blending_weights(reference, splats_of(*inputs[:5]), camera(), maps)
+    single = splats_of(*(value.float() for value in inputs[:5])), camera(torch.float32), maps.float()
+    ours = cpu_raster.blending_weights(*single)
+    assert ours.shape == exact.shape == (len(inputs[0]), channels)
     # Float32 sums of some hundreds of terms of size one: 1e-5 is 80 units in the last place.
     assert ((ours - exact).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
-    again = reference_raster.blending_weights(cpu_raster.rasterize, *single, near=NEAR)
+    again = reference_raster.blending_weights(cpu_raster.rasterize, *single)
     assert ((ours - again).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
 
 
 @native
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
 def test_blending_weights_do_not_depend_on_threads(isa: int, channels: int) -> None:
-    means, quats, scales, opacities, _, _ = gaussians(2000)
-    viewmat, K = camera()
+    splats = splats_of(*(value.float() for value in gaussians(2000)[:5]))
     maps = torch.rand(HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(3))
-    single = [value.float() for value in (means, quats, scales, opacities, viewmat, K, maps)]
     results = []
     before = torch.get_num_threads()
     try:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
-            results.append(cpu_raster.blending_weights(*single, near=NEAR))
+            results.append(cpu_raster.blending_weights(splats, camera(torch.float32), maps))
     finally:
         torch.set_num_threads(before)
     assert results[0].any()
@@ -288,8 +273,7 @@ def test_blending_weights_do_not_depend_on_threads(isa: int, channels: int) -> N
 
 @native
 def test_blending_weights_of_nothing(isa: int) -> None:
-    means, quats, scales, opacities = (value[:0].float() for value in gaussians()[:4])
-    viewmat, K = camera()
+    nothing = splats_of(*(value[:0].float() for value in gaussians()[:5]))
     maps = torch.ones(HEIGHT, WIDTH, 5)
-    weights = cpu_raster.blending_weights(means, quats, scales, opacities, viewmat, K, maps, near=NEAR)
+    weights = cpu_raster.blending_weights(nothing, camera(torch.float32), maps)
     assert weights.shape == (0, 5)

@@ -7,7 +7,7 @@ import torch
 from rigs import arc_rig
 from structgstream.kernels import cpu_sweep, reference_sweep
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.reference_sweep import SweepView
+from structgstream.kernels.motion_types import SweepView
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

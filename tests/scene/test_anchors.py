@@ -4,26 +4,23 @@ from dataclasses import replace
 import torch
 
 from rigs import arc_rig, random_scene
+from structgstream.kernels.anchor_types import Anchors
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import pixels_of_tiles, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.reference_anchors import activate_anchors
 from structgstream.scene.render import draw
 
 
 def test_culling_never_changes_a_pixel() -> None:
     scene, backend = random_scene(300, seed=3), reference_backend()
     for camera in list(arc_rig(radius=0.6).cameras.values()):
-        _, visible = scene.structured(camera, backend)
-        assert 0 < len(visible) < 300
-        everything = backend.generate_structured(
-            scene.anchors.positions,
-            scene.anchors.log_offset_scales,
-            scene.anchors.log_base_scales,
-            scene.anchors.offsets,
-            scene.anchors.features,
-            scene.mlps,
-            camera.center.float(),
-            torch.arange(300),
-            distance_input=True,
+        assert 0 < len(scene.structured(camera, backend).anchors) < 300
+        cloud = scene.anchors
+        anchors = Anchors(
+            cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, cloud.features
+        )
+        everything = activate_anchors(
+            anchors, scene.mlps, camera.center.float(), torch.arange(300), distance_input=True
         )
         culled = draw(scene.gaussians(camera, backend), camera, backend)
         full = draw(scene.dressed(everything), camera, backend)
@@ -33,11 +30,12 @@ def test_culling_never_changes_a_pixel() -> None:
 def test_culling_for_tiles_never_changes_a_pixel_in_them() -> None:
     scene, backend = random_scene(300, seed=3), reference_backend()
     for camera in list(arc_rig(radius=0.6).cameras.values()):
-        tiles = torch.zeros(tiles_of(camera.width, camera.height), dtype=torch.bool)
-        tiles[-1, 1] = True
-        culled, visible = scene.structured(camera, backend, tiles=tiles)
-        assert len(visible) < len(scene.structured(camera, backend)[1])
-        inside = pixels_of_tiles(tiles, camera.width, camera.height)
+        mask = torch.zeros(tiles_of(camera.width, camera.height), dtype=torch.bool)
+        mask[-1, 1] = True
+        tiles = TileSelection(mask, camera.width, camera.height)
+        culled = scene.structured(camera, backend, tiles=tiles)
+        assert len(culled.anchors) < len(scene.structured(camera, backend).anchors)
+        inside = tiles.pixels()
         part = draw(scene.dressed(culled), camera, backend).image[inside]
         assert torch.allclose(part, draw(scene.gaussians(camera, backend), camera, backend).image[inside], atol=1e-6)
 
@@ -48,4 +46,4 @@ def test_anchors_behind_the_camera_are_culled() -> None:
     behind = scene.anchors.positions + 20.0 * (camera.center - torch.zeros(3)).float()
     moved = replace(scene.anchors, positions=behind)
     scene = replace(scene, anchors=moved)
-    assert scene.structured(camera, reference_backend())[1].numel() == 0
+    assert scene.structured(camera, reference_backend()).anchors.numel() == 0

@@ -26,19 +26,7 @@ def test_the_screen_gradient_is_the_gradient_of_the_projected_mean() -> None:
     sums = []
     for sign in (1, -1):
         offsets[:, 0] = sign * step
-        moved = backend.rasterize(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.colors,
-            camera.viewmat.float(),
-            camera.K.float(),
-            width=48,
-            height=32,
-            near=camera.near,
-            screen_offsets=offsets,
-        )
+        moved = backend.rasterize(gaussians, camera.viewport(gaussians.means), screen_offsets=offsets)
         sums.append((moved.image * target).sum())
     assert rendering.screen_offsets is not None
     assert rendering.screen_offsets.grad is not None

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What anchors contribute to the pictures."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -17,11 +19,8 @@ def test_they_are_the_weights_of_an_anchors_gaussians_in_every_picture() -> None
     expected = torch.zeros(30)
     for camera in CAMERAS:
         gaussians = SCENE.gaussians(camera, BACKEND)
-        viewmat, K = camera.beside(gaussians.means)[:2]
-        arguments = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-        size = {"width": camera.width, "height": camera.height, "near": camera.near}
         ones = torch.ones_like(gaussians.means).requires_grad_()
-        image = BACKEND.rasterize(*arguments, ones, viewmat, K, **size).image
+        image = BACKEND.rasterize(replace(gaussians, colors=ones), camera.viewport(gaussians.means)).image
         (weights,) = torch.autograd.grad(image[..., 0].sum(), ones)
         expected.index_add_(0, gaussians.ids // 5, weights[:, 0])
     torch.testing.assert_close(found, expected / expected.mean())

@@ -78,10 +78,10 @@ def test_base_scales_are_bounded() -> None:
 
 def test_statistics_follow_renderings() -> None:
     scene, _, densifier, _ = prepared()
-    structured, visible = scene.structured(arc_rig()["cam01"], reference_backend())
-    densifier.opacities.add(structured, visible)
-    assert densifier.opacities.visits[visible].eq(1.0).all()
-    expected = torch.zeros(30).index_add_(0, structured.ids // 5, structured.opacities)
+    structured = scene.structured(arc_rig()["cam01"], reference_backend())
+    densifier.opacities.add(structured)
+    assert densifier.opacities.visits[structured.anchors].eq(1.0).all()
+    expected = torch.zeros(30).index_add_(0, structured.gaussians.ids // 5, structured.gaussians.opacities)
     assert torch.allclose(densifier.opacities.opacity, expected, atol=1e-6)
 
 

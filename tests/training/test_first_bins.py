@@ -69,7 +69,7 @@ def test_what_no_camera_draws_is_not_used() -> None:
     scene, worth = before()
     used = torch.zeros_like(worth.used)
     for name in RIG.training:
-        structured, _ = scene.structured(RIG[name], BACKEND)
+        structured = scene.structured(RIG[name], BACKEND).gaussians
         used.view(-1)[structured.ids] = True
     assert torch.equal(worth.used, used)
     assert 0 < int(worth.used.sum()) < worth.used.numel()

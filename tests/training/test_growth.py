@@ -4,6 +4,7 @@ from dataclasses import replace
 import torch
 
 from rigs import random_scene
+from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
 
@@ -109,12 +110,11 @@ def test_the_last_interval_is_left_to_what_grew_before_it() -> None:
 
 def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
     statistics = OpacityStatistics(3, torch.device("cpu"))
-    none = torch.zeros(0)
+    none = Gaussians(*(torch.zeros(0),) * 6)
     raw = torch.tensor([[0.001, -1.0], [0.4, -1.0], [0.001, 0.0]])
     for step in range(81):
         visible = torch.tensor([0, 1, 2]) if step else torch.tensor([0, 1])
-        structured = StructuredGaussians(none, none, none, none, none, none, raw[: len(visible)])
-        statistics.add(structured, visible)
+        statistics.add(StructuredGaussians(none, visible, raw[: len(visible)]))
     assert prunable(statistics, GrowthConfig()).tolist() == [
         True,
         False,

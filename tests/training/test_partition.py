@@ -10,7 +10,6 @@ import torch
 from rigs import random_scene
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
-from structgstream.kernels.raster_types import pixels_of_tiles
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -79,7 +78,7 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
     shares = []
     for view in VIEWS:
         focus, camera = places[view.index], view.camera
-        inside = pixels_of_tiles(focus.tiles, camera.width, camera.height)
+        inside = focus.tiles.pixels()
         shares.append(float(inside.float().mean()))
         whole = draw(SCENE.gaussians(camera, backend), camera, backend).image.detach()
         part = draw(partition.moving.gaussians(camera, backend), camera, backend, focus=focus).image.detach()

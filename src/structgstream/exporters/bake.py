@@ -72,8 +72,8 @@ def baked(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: 
     sums = _Sums(anchors.offsets.shape[0] * anchors.offsets_per_anchor + len(scene.free), anchors.positions, baking)
     with torch.no_grad():
         for camera in cameras:
-            generated, visible = scene.structured(camera, backend)
-            slots = visible[:, None] * anchors.offsets_per_anchor
+            generated = scene.structured(camera, backend)
+            slots = generated.anchors[:, None] * anchors.offsets_per_anchor
             slots = (slots + torch.arange(anchors.offsets_per_anchor, device=slots.device)).flatten()
             free = torch.arange(sums.seen.shape[0] - len(scene.free), sums.seen.shape[0], device=slots.device)
             sums.add(scene.dressed(generated), camera, backend, seen=torch.cat([slots, free]))
@@ -115,7 +115,7 @@ class _Sums:
             weight = blend_weights(gaussians, camera, backend) + 1e-3 * weight
         self.weight[ids] += weight
         self._add_shapes(gaussians, weight)
-        center = camera.beside(gaussians.means).center
+        center = camera.viewport(gaussians.means).center
         basis = sh_basis(torch.nn.functional.normalize(gaussians.means - center, dim=1), self.baking.degree)
         weighted = basis * weight[:, None]
         self.normal[ids] += weighted[:, :, None] * basis[:, None, :]

@@ -63,7 +63,7 @@ class BakedGaussians:
             quats=self.quats,
             scales=self.scales,
             opacities=self.opacities,
-            colors=self.colors(camera.beside(self.means).center),
+            colors=self.colors(camera.viewport(self.means).center),
             ids=torch.arange(len(self), device=self.means.device),
         )
 

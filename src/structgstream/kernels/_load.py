@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from structgstream.errors import BackendError
-from structgstream.kernels.prototypes import declare
+from structgstream.kernels.prototypes import PROTOTYPES, declare
 
 _NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
 ABI_VERSION = 1
@@ -38,7 +38,7 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
             f"The CPU kernels at {path} have version {version} of their interface, and this structgstream calls "
             f"version {ABI_VERSION}; install structgstream again, so that both are of one version."
         )
-    declare(library)
+    declare(library, PROTOTYPES)
     return library, None
 
 

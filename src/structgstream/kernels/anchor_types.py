@@ -1,10 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weights of the three MLPs, and what generating structured Gaussians returns."""
+"""Anchors and the weights of the three MLPs, and what generating structured Gaussians returns."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from torch import Tensor
+
+from structgstream.gaussians import Gaussians
+
+
+class Anchors(NamedTuple):
+    """What the generation reads of ``M`` anchors.
+
+    Args:
+        positions: ``[M, 3]``, x_v.
+        log_offset_scales: ``[M, 3]``, log l_v.
+        log_base_scales: ``[M, 3]``, log of the largest Gaussian scale.
+        offsets: ``[M, K, 3]``, O_v.
+        features: ``[M, D]``, f_v.
+    """
+
+    positions: Tensor
+    log_offset_scales: Tensor
+    log_base_scales: Tensor
+    offsets: Tensor
+    features: Tensor
 
 
 class HeadWeights(NamedTuple):
@@ -26,22 +46,16 @@ class MLPWeights(NamedTuple):
 
 @dataclass(frozen=True)
 class StructuredGaussians:
-    """Drawable Gaussians of the visible anchors, ascending by id.
+    """The Gaussians of the anchors that a camera may see.
 
     Args:
-        means: ``[N, 3]``.
-        quats: ``[N, 4]`` wxyz, unit length.
-        scales: ``[N, 3]``.
-        opacities: ``[N]`` in (0, 1).
-        colors: ``[N, 3]``.
-        ids: ``[N]`` int64, anchor * K + offset.
-        raw_opacities: ``[m, K]`` tanh outputs of all ``m`` visible anchors, without a graph.
+        gaussians: ascending by id, their quaternions of unit length. What has opacity 0 has scale 0 too and shows
+            nowhere; only back-ends that wait for no count have such rows.
+        anchors: ``[m]`` int64, ascending: those that were looked at, among them all that may show.
+        raw_opacities: ``[m, K]`` tanh outputs of these anchors, without a graph; a Gaussian is drawn where it is
+            positive.
     """
 
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
-    ids: Tensor
+    gaussians: Gaussians
+    anchors: Tensor
     raw_opacities: Tensor

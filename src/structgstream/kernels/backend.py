@@ -6,20 +6,26 @@ functions. A back-end that lacks an operation of its own names another's, visibl
 """
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from structgstream.errors import BackendError
-from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.raster_types import RasterOutput
-from structgstream.kernels.reference_lift import Lifted
-from structgstream.kernels.reference_sweep import Swept
+from structgstream.kernels.operations import (
+    L1SSIM,
+    AdamStep,
+    BlendingWeights,
+    ChangedPixels,
+    Excess,
+    GenerateStructured,
+    Lift,
+    Rasterize,
+    Sweep,
+    Volume,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -28,37 +34,25 @@ BackendName = Literal["auto", "cpu", "cuda", "reference"]
 
 @dataclass(frozen=True)
 class Backend:
-    """The operations that a scene and a trainer need.
+    """The operations that a scene and a trainer need; ``kernels.operations`` has the contract of each.
 
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
         device: where its tensors live.
-        rasterize: see ``kernels.reference_raster.rasterize``.
-        blending_weights: see ``kernels.reference_raster.blending_weights``.
-        l1_ssim: ``(image, target) -> (l1, ssim)``, see ``kernels.reference_ssim.l1_ssim``.
-        volume: ``(scales, opacities) -> (sum, count)``, see ``kernels.reference_volume.volume``.
-        excess: ``(offsets, log_scales, limit) -> sum``, see ``kernels.reference_excess.excess``.
-        changed_pixels: ``(before, now) -> mask``, see ``kernels.reference_change.changed_pixels``.
-        lift: see ``kernels.reference_lift.lift``.
-        sweep: see ``kernels.reference_sweep.sweep``.
-        visible_anchors: see ``kernels.reference_anchors.visible_anchors``.
-        generate_structured: see ``kernels.reference_anchors.generate_structured``.
-        adam_step: see ``kernels.reference_adam.adam_step``.
     """
 
     name: str
     device: torch.device
-    rasterize: Callable[..., RasterOutput]
-    blending_weights: Callable[..., Tensor]
-    l1_ssim: Callable[..., tuple[Tensor, Tensor]]
-    volume: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-    excess: Callable[[Tensor, Tensor, float], Tensor]
-    changed_pixels: Callable[..., Tensor]
-    lift: Callable[..., Lifted]
-    sweep: Callable[..., Swept]
-    visible_anchors: Callable[..., Tensor]
-    generate_structured: Callable[..., StructuredGaussians]
-    adam_step: Callable[..., None]
+    rasterize: Rasterize
+    blending_weights: BlendingWeights
+    l1_ssim: L1SSIM
+    volume: Volume
+    excess: Excess
+    changed_pixels: ChangedPixels
+    lift: Lift
+    sweep: Sweep
+    generate_structured: GenerateStructured
+    adam_step: AdamStep
 
 
 def reference_backend() -> Backend:
@@ -86,7 +80,6 @@ def reference_backend() -> Backend:
         changed_pixels=reference_change.changed_pixels,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
-        visible_anchors=reference_anchors.visible_anchors,
         generate_structured=reference_anchors.generate_structured,
         adam_step=reference_adam.adam_step,
     )
@@ -123,7 +116,6 @@ def cpu_backend() -> Backend:
         changed_pixels=cpu_change.changed_pixels,
         lift=cpu_lift.lift,
         sweep=cpu_sweep.sweep,
-        visible_anchors=cpu_anchors.visible_anchors,
         generate_structured=cpu_anchors.generate_structured,
         adam_step=cpu_adam.adam_step,
     )
@@ -137,7 +129,6 @@ def cuda_backend() -> Backend:
     """
     from structgstream.kernels import (
         cuda_adam,
-        cuda_anchors,
         cuda_ssim,
         reference_anchors,
         reference_change,
@@ -167,18 +158,17 @@ def cuda_backend() -> Backend:
         changed_pixels=reference_change.changed_pixels,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
-        visible_anchors=reference_anchors.visible_anchors,
-        generate_structured=cuda_anchors.generate_structured,
+        generate_structured=reference_anchors.generate_structured,
         adam_step=cuda_adam.adam_step,
     )
 
 
-def without_waiting(backend: Backend, budget: PairBudget) -> Backend:
+def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
     """The cuda back-end with shapes that do not depend on numbers: the host waits for nothing within an iteration.
 
-    ``visible_anchors`` gives a mask and ``generate_structured`` all Gaussians (``kernels.cuda_anchors``, Note [Shapes
-    without waiting]); a picture has room for ``budget.capacity`` pairs (``kernels.cuda_tiles``, Note [Pairs without
-    waiting]): ask ``budget.shortage()`` when the work is done.
+    ``generate_structured`` gives all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]); a picture has
+    room for ``budget.capacity`` pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]): ask ``budget.shortage()``
+    when the work is done.
 
     Raises:
         BackendError: another back-end, on which nothing waits anyway.
@@ -188,7 +178,11 @@ def without_waiting(backend: Backend, budget: PairBudget) -> Backend:
 
     if backend.name != "cuda":
         raise BackendError(f"Only the cuda back-end works apart from the host, not {backend.name}.")
-    return replace(backend, rasterize=partial(rasterize, budget=budget), visible_anchors=cuda_anchors.visible_anchors)
+    return replace(
+        backend,
+        rasterize=partial(rasterize, budget=budget),
+        generate_structured=cuda_anchors.generate_structured,
+    )
 
 
 def backend_reasons() -> dict[str, str | None]:

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam in this package's C++; the contract is ``kernels.reference_adam``'s."""
-
-import ctypes
+"""Adam in this package's C++; the contract is ``kernels.operations.AdamStep``."""
 
 import torch
 from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
+from structgstream.kernels.prototypes import addresses
 
 
 def adam_step(
@@ -22,10 +21,10 @@ def adam_step(
     eps: float,
     rows: Tensor | None = None,
 ) -> None:
-    """Move ``param`` in place by one step, see ``kernels.reference_adam.adam_step``; ``rows`` must not repeat.
+    """See ``kernels.operations.AdamStep``.
 
     Raises:
-        BackendError: a tensor is not contiguous float32, or the shapes differ.
+        BackendError: a tensor is not contiguous float32, the shapes differ, or a row is out of bounds.
     """
     for tensor in (param, exp_avg, exp_avg_sq):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous() or tensor.shape != grad.shape:
@@ -44,14 +43,12 @@ def adam_step(
         if count and (int(rows.min()) < 0 or int(rows.max()) >= param.shape[0]):
             raise BackendError(f"Rows to step must lie in 0 ... {param.shape[0] - 1}.")
     native_library().sgs_adam_step(
-        *(ctypes.c_void_p(tensor.data_ptr()) for tensor in (param, grad, exp_avg, exp_avg_sq)),
-        ctypes.c_void_p(None if rows is None else rows.data_ptr()),
-        ctypes.c_int64(count),
-        ctypes.c_int64(width),
-        ctypes.c_double(lr),
-        ctypes.c_int64(step),
-        ctypes.c_double(betas[0]),
-        ctypes.c_double(betas[1]),
-        ctypes.c_double(eps),
-        ctypes.c_int(torch.get_num_threads()),
+        *addresses(param, grad, exp_avg, exp_avg_sq, rows),
+        count,
+        width,
+        lr,
+        step,
+        *betas,
+        eps,
+        torch.get_num_threads(),
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors culled and dressed in this package's C++; the contract is ``kernels.reference_anchors``'s."""
+"""Anchors to drawable Gaussians in this package's C++; the contract is ``kernels.operations.GenerateStructured``."""
 
 import ctypes
 from collections.abc import Sequence
@@ -8,10 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
+from structgstream.gaussians import Gaussians
 from structgstream.kernels._load import native_library
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import tiles_of
+from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
+from structgstream.kernels.prototypes import addresses
+from structgstream.kernels.raster_types import TileSelection
 
 # The structures below mirror csrc/cpu/anchors.h, field by field.
 
@@ -63,18 +66,14 @@ class _AnchorGradients(ctypes.Structure):
     ]
 
 
-def _pointers(tensors: Sequence[Tensor | None]) -> list[int | None]:
-    return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
-
-
 def _heads(weights: Sequence[Tensor | None]) -> Any:
-    return (_Head * 3)(*(_Head(*_pointers(weights[4 * head : 4 * head + 4])) for head in range(3)))
+    return (_Head * 3)(*(_Head(*addresses(*weights[4 * head : 4 * head + 4])) for head in range(3)))
 
 
 def _anchors(tensors: Sequence[Tensor], visible: Tensor, center: list[float], distance_input: bool) -> _Anchors:
     """``tensors``: the five anchor tensors, then four weights for each of the three heads."""
     return _Anchors(
-        *_pointers([*tensors[:5], visible]),
+        *addresses(*tensors[:5], visible),
         _heads(tensors[5:]),
         (ctypes.c_float * 3)(*center),
         visible.shape[0],
@@ -90,18 +89,18 @@ class _Generate(torch.autograd.Function):
     def forward(
         ctx: Any, visible: Tensor, center: list[float], distance_input: bool, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        library, threads = native_library(), ctypes.c_int(torch.get_num_threads())
+        library, threads = native_library(), torch.get_num_threads()
         m, k, hidden = visible.shape[0], tensors[3].shape[1], tensors[5].shape[0]
         raw = torch.empty(m, k)
         bits = torch.empty(m, 3, (hidden + 31) // 32, dtype=torch.int32)
         active, starts = torch.empty(m, dtype=torch.int32), torch.empty(m + 1, dtype=torch.int64)
         anchors = _anchors(tensors, visible, center, distance_input)
-        selection = _Selection(*_pointers([raw, bits, active, starts]))
+        selection = _Selection(*addresses(raw, bits, active, starts))
         library.sgs_anchors_select(ctypes.byref(anchors), ctypes.byref(selection), threads)
         n = selection.gaussian_count
         drawn = [torch.empty(n, 3), torch.empty(n, 4), torch.empty(n, 3), torch.empty(n), torch.empty(n, 3)]
         ids, norms = torch.empty(n, dtype=torch.int64), torch.empty(n)
-        gaussians = _Gaussians(*_pointers([*drawn, ids, norms]))
+        gaussians = _Gaussians(*addresses(*drawn, ids, norms))
         library.sgs_anchors_dress(ctypes.byref(anchors), ctypes.byref(selection), ctypes.byref(gaussians), threads)
         ctx.save_for_backward(visible, raw, bits, active, starts, ids, norms, *drawn, *tensors)
         ctx.arguments = center, distance_input, selection.active_count
@@ -125,11 +124,11 @@ class _Generate(torch.autograd.Function):
         ]
         native_library().sgs_anchors_backward(
             ctypes.byref(_anchors(tensors, visible, center, distance_input)),
-            ctypes.byref(_Selection(*_pointers([raw, bits, active, starts]), active_count, ids.shape[0])),
-            ctypes.byref(_Gaussians(*_pointers([*drawn, ids, norms]))),
-            ctypes.byref(_GaussianGradients(*_pointers(given))),
-            ctypes.byref(_AnchorGradients(*_pointers(results[:5]), _heads(results[5:]))),
-            ctypes.c_int(torch.get_num_threads()),
+            ctypes.byref(_Selection(*addresses(raw, bits, active, starts), active_count, ids.shape[0])),
+            ctypes.byref(_Gaussians(*addresses(*drawn, ids, norms))),
+            ctypes.byref(_GaussianGradients(*addresses(*given))),
+            ctypes.byref(_AnchorGradients(*addresses(*results[:5]), _heads(results[5:]))),
+            torch.get_num_threads(),
         )
         return None, None, None, *(result if want else None for result, want in zip(results, wanted, strict=True))
 
@@ -149,77 +148,73 @@ def _check(tensors: Sequence[Tensor], mlps: MLPWeights, distance_input: bool) ->
             )
 
 
-def visible_anchors(
-    positions: Tensor,
-    log_offset_scales: Tensor,
-    log_base_scales: Tensor,
-    offsets: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    *,
-    width: int,
-    height: int,
-    near: float,
-    tiles: Tensor | None = None,
-) -> Tensor:
-    """Indices ``[m]`` of the anchors in view, see ``kernels.reference_anchors.visible_anchors``.
+def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
+    """Indices ``[m]``, ascending, of the anchors in view, see ``kernels.reference_anchors.visible_anchors``.
 
     Raises:
         BackendError: a tensor of another precision.
         OutOfMemoryError: there is no room for a byte an anchor.
     """
-    tensors = [positions, log_offset_scales, log_base_scales, offsets]
+    tensors = anchors[:4]
     if any(tensor.dtype != torch.float32 for tensor in tensors):
         raise BackendError("The cpu back-end culls float32 anchors; the reference back-end takes other precisions.")
+    assert tiles is None or (tiles.width, tiles.height) == (viewport.width, viewport.height), tiles
     tensors = [tensor.detach().contiguous() for tensor in tensors]
-    count = positions.shape[0]
-    anchors = _Anchors(*_pointers([*tensors, None, None]))
-    anchors.offsets_per_anchor = offsets.shape[1]
-    camera = [matrix.detach().float().contiguous() for matrix in (viewmat, K)]
-    if tiles is not None:
-        assert tiles.shape == tiles_of(width, height), tiles.shape
-        tiles = tiles.to(torch.uint8).contiguous()
+    count = len(anchors.positions)
+    native = _Anchors(*addresses(*tensors, None, None))
+    native.offsets_per_anchor = anchors.offsets.shape[1]
+    viewmat, K = (matrix.detach().float().contiguous() for matrix in (viewport.viewmat, viewport.K))
+    mask = None if tiles is None else tiles.mask.contiguous()
     found = torch.empty(count, dtype=torch.int64)
     seen = native_library().sgs_anchors_visible(
-        ctypes.byref(anchors),
-        ctypes.c_int64(count),
-        *(ctypes.c_void_p(pointer) for pointer in _pointers(camera)),
-        ctypes.c_int(width),
-        ctypes.c_int(height),
-        ctypes.c_float(near),
-        *(ctypes.c_void_p(pointer) for pointer in _pointers([tiles, found])),
-        ctypes.c_int(torch.get_num_threads()),
+        ctypes.byref(native),
+        count,
+        *addresses(viewmat, K),
+        viewport.width,
+        viewport.height,
+        viewport.near,
+        *addresses(mask, found),
+        torch.get_num_threads(),
     )
     if seen < 0:
         raise OutOfMemoryError("to find the anchors in view")
     return found[:seen]
 
 
+def activate_anchors(
+    anchors: Anchors, mlps: MLPWeights, center: Tensor, visible: Tensor, *, distance_input: bool
+) -> StructuredGaussians:
+    """The Gaussians of the anchors ``visible``, see ``kernels.reference_anchors.activate_anchors``.
+
+    Raises:
+        BackendError: a tensor of another precision, or shapes that do not fit each other.
+    """
+    tensors = [tensor.contiguous() for tensor in (*anchors, *(weight for head in mlps for weight in head))]
+    _check(tensors, mlps, distance_input)
+    visible = visible.to(torch.int64).contiguous()
+    means, quats, scales, opacities, colors, ids, raw = _Generate.apply(  # type: ignore[misc]
+        visible, center.tolist(), distance_input, *tensors
+    )
+    return StructuredGaussians(Gaussians(means, quats, scales, opacities, colors, ids), visible, raw)
+
+
 def generate_structured(
-    positions: Tensor,
-    log_offset_scales: Tensor,
-    log_base_scales: Tensor,
-    offsets: Tensor,
-    features: Tensor,
+    anchors: Anchors,
     mlps: MLPWeights,
-    camera_center: Tensor,
-    visible: Tensor,
+    viewport: Viewport,
     *,
     distance_input: bool,
+    tiles: TileSelection | None = None,
+    seen_from: Tensor | None = None,
 ) -> StructuredGaussians:
-    """Dress the visible anchors for one camera, see ``kernels.reference_anchors.generate_structured``.
+    """See ``kernels.operations.GenerateStructured``.
 
     Gradients of what does not require them are not computed. Results do not depend on the number of threads.
 
     Raises:
         BackendError: a tensor of another precision, or shapes that do not fit each other.
+        OutOfMemoryError: there is no room for a byte an anchor.
     """
-    heads: tuple[HeadWeights, ...] = (mlps.opacity, mlps.color, mlps.covariance)
-    tensors = [positions, log_offset_scales, log_base_scales, offsets, features]
-    tensors = [tensor.contiguous() for tensor in [*tensors, *(weight for head in heads for weight in head)]]
-    _check(tensors, mlps, distance_input)
-    visible = visible.to(torch.int64).contiguous()
-    means, quats, scales, opacities, colors, ids, raw = _Generate.apply(  # type: ignore[misc]
-        visible, camera_center.tolist(), distance_input, *tensors
-    )
-    return StructuredGaussians(means, quats, scales, opacities, colors, ids, raw)
+    visible = visible_anchors(anchors, viewport, tiles)
+    center = viewport.center if seen_from is None else seen_from
+    return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)

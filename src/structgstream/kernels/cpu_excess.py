@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far Gaussians stray from their anchors in this package's C++; the contract is ``kernels.reference_excess``'s."""
+"""How far Gaussians stray from their anchors in this package's C++; the
+contract is ``kernels.operations.Excess``."""
 
-import ctypes
 from typing import Any
 
 import torch
@@ -9,16 +9,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
-
-
-def _arguments(offsets: Tensor, scales: Tensor, limit: float) -> list[Any]:
-    return [
-        ctypes.c_void_p(offsets.data_ptr()),
-        ctypes.c_void_p(scales.data_ptr()),
-        ctypes.c_int64(offsets.shape[0]),
-        ctypes.c_int64(offsets.shape[1]),
-        ctypes.c_float(limit),
-    ]
+from structgstream.kernels.prototypes import addresses
 
 
 class _Excess(torch.autograd.Function):
@@ -27,22 +18,20 @@ class _Excess(torch.autograd.Function):
         scales = log_scales.exp()
         ctx.save_for_backward(offsets, scales)
         ctx.limit = limit
-        return offsets.new_tensor(native_library().sgs_excess(*_arguments(offsets, scales, limit)))
+        return offsets.new_tensor(native_library().sgs_excess(*addresses(offsets, scales), *offsets.shape[:2], limit))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
         offsets, scales = ctx.saved_tensors
         found = torch.empty_like(offsets), torch.empty_like(scales)
         native_library().sgs_excess_backward(
-            *_arguments(offsets, scales, ctx.limit),
-            ctypes.c_float(float(gradients[0])),
-            *(ctypes.c_void_p(gradient.data_ptr()) for gradient in found),
+            *addresses(offsets, scales), *offsets.shape[:2], ctx.limit, float(gradients[0]), *addresses(*found)
         )
         return *found, None
 
 
 def excess(offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor:
-    """Sum of what goes beyond, see ``kernels.reference_excess.excess``; float32.
+    """See ``kernels.operations.Excess``.
 
     Raises:
         BackendError: another precision.

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rasteriser in this package's C++; the contract is ``kernels.reference_raster``'s."""
+"""The rasteriser in this package's C++; the contracts are ``kernels.operations.Rasterize`` and ``BlendingWeights``."""
 
-import ctypes
 import weakref
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
+from structgstream.gaussians import Gaussians
 from structgstream.kernels._load import native_library
-from structgstream.kernels.raster_types import RasterOutput, tiles_of
-
-
-def _pointer(tensor: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
+from structgstream.kernels.prototypes import addresses
+from structgstream.kernels.raster_types import RasterOutput, TileSelection
 
 
 class _State:
@@ -24,52 +23,59 @@ class _State:
     def __init__(self, address: int | None) -> None:
         if not address:
             raise OutOfMemoryError("for the lists of the Gaussians that each tile draws")
-        self.pointer = ctypes.c_void_p(address)
-        weakref.finalize(self, native_library().sgs_raster_free, self.pointer)
+        self.address = address
+        weakref.finalize(self, native_library().sgs_raster_free, address)
+
+
+@dataclass(frozen=True)
+class _View:
+    """What a rendering needs beside Gaussians: float32, contiguous, without gradient."""
+
+    viewport: Viewport
+    background: Tensor | None
+    tiles: Tensor | None
+    trained: int
+
+    def arguments(self) -> list[int | float | None]:
+        """The camera's arguments, as the C++ takes them."""
+        viewport = self.viewport
+        return [*addresses(viewport.viewmat, viewport.K), viewport.width, viewport.height, viewport.near]
+
+
+def _constant(tensor: Tensor) -> Tensor:
+    return tensor.detach().float().contiguous()
+
+
+def _in_float32(viewport: Viewport) -> Viewport:
+    return viewport._replace(viewmat=_constant(viewport.viewmat), K=_constant(viewport.K))
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        screen_offsets: Tensor | None,
-        viewmat: Tensor,
-        K: Tensor,
-        background: Tensor | None,
-        tiles: Tensor | None,
-        onto: Tensor | None,
-        size: tuple[int, int],
-        near: float,
-        trained: int,
+        ctx: Any, view: _View, onto: Tensor | None, screen_offsets: Tensor | None, *gaussians: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        width, height = size
-        count = means.shape[0]
-        new = means.new_empty if tiles is None else means.new_zeros
+        """``gaussians``: means, quaternions, scales, opacities and colours."""
+        means, count = gaussians[0], gaussians[0].shape[0]
+        width, height = view.viewport.width, view.viewport.height
+        new = means.new_empty if view.tiles is None else means.new_zeros
         image = new(height, width, 3) if onto is None else onto
         alpha, radii = new(height, width), means.new_empty(count)
         if onto is not None:
             ctx.mark_dirty(onto)
-        state = _State(
+        ctx.state = _State(
             native_library().sgs_raster_forward(
-                ctypes.c_int64(count),
-                *(_pointer(tensor) for tensor in (means, quats, scales, opacities, colors, viewmat, K)),
-                ctypes.c_int(width),
-                ctypes.c_int(height),
-                ctypes.c_float(near),
-                *(_pointer(tensor) for tensor in (background, screen_offsets, tiles)),
-                ctypes.c_int64(trained),
-                *(_pointer(tensor) for tensor in (image, alpha, radii)),
-                ctypes.c_int(torch.get_num_threads()),
+                count,
+                *addresses(*gaussians),
+                *view.arguments(),
+                *addresses(view.background, screen_offsets, view.tiles),
+                view.trained,
+                *addresses(image, alpha, radii),
+                torch.get_num_threads(),
             )
         )
-        ctx.state = state
-        ctx.tracked = screen_offsets is not None
-        ctx.save_for_backward(means, quats, scales, opacities, colors, background, image, alpha)
+        ctx.background, ctx.tracked = view.background, screen_offsets is not None
+        ctx.save_for_backward(image, alpha, *gaussians)
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
         return image, alpha, radii
@@ -80,52 +86,42 @@ class _Rasterize(torch.autograd.Function):
         ctx: Any, *gradients: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         grad_image, grad_alpha, _ = gradients
-        means, quats, scales, opacities, colors, background, image, alpha = ctx.saved_tensors
+        image, alpha, *gaussians = ctx.saved_tensors
         given = torch.zeros_like(image) if grad_image is None else grad_image.contiguous()
         given_alpha = None if grad_alpha is None else grad_alpha.contiguous()
-        results = [torch.empty_like(tensor) for tensor in (means, quats, scales, opacities, colors)]
-        offsets = means.new_empty(means.shape[0], 2) if ctx.tracked else None
+        results = [torch.empty_like(tensor) for tensor in gaussians]
+        count = gaussians[0].shape[0]
+        offsets = image.new_empty(count, 2) if ctx.tracked else None
         failed = native_library().sgs_raster_backward(
-            ctx.state.pointer,
-            ctypes.c_int64(means.shape[0]),
-            *(_pointer(t) for t in (means, quats, scales, opacities, colors, background, image, alpha)),
-            *(_pointer(t) for t in (given, given_alpha, *results, offsets)),
-            ctypes.c_int(torch.get_num_threads()),
+            ctx.state.address,
+            count,
+            *addresses(*gaussians, ctx.background, image, alpha, given, given_alpha, *results, offsets),
+            torch.get_num_threads(),
         )
         if failed:
             raise OutOfMemoryError("for the gradients of the Gaussians that are drawn")
-        return *results, offsets, *(None,) * 8
+        return None, None, offsets, *results
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    gaussians: Gaussians,
+    viewport: Viewport,
     *,
-    width: int,
-    height: int,
-    near: float,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
-    tiles: Tensor | None = None,
+    tiles: TileSelection | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
 ) -> RasterOutput:
-    """Render Gaussians, see ``kernels.reference_raster.rasterize``. What is drawn ``onto`` is drawn in place.
-
-    Repeated calls give the same bits, whatever the number of threads. Cameras and the background get no gradient.
+    """See ``kernels.operations.Rasterize``. Repeated calls give the same bits, whatever the number of threads.
 
     Raises:
         BackendError: a tensor is not float32 on the CPU.
         OutOfMemoryError: the lists of what each tile draws do not fit.
     """
-    gaussians = (means, quats, scales, opacities, colors)
-    given = gaussians if screen_offsets is None else (*gaussians, screen_offsets)
-    n = means.shape[0]
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    given = tensors if screen_offsets is None else (*tensors, screen_offsets)
+    n = len(gaussians)
     shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 3), (n, 2)]
     assert [tuple(t.shape) for t in given] == shapes[: len(given)], [tuple(t.shape) for t in given]
     for tensor in given:
@@ -134,60 +130,47 @@ def rasterize(
                 f"The cpu back-end draws float32 tensors on the CPU, got {tensor.dtype} on {tensor.device}; "
                 "convert them or take the reference back-end."
             )
-    camera = [None if t is None else t.detach().float().contiguous() for t in (viewmat, K, background)]
-    offsets = None if screen_offsets is None else screen_offsets.contiguous()
-    if tiles is not None:
-        assert tiles.shape == tiles_of(width, height), tiles.shape
-        tiles = tiles.to(torch.uint8).contiguous()
+    assert tiles is None or (tiles.width, tiles.height) == (viewport.width, viewport.height), tiles
     if onto is not None:
-        assert onto.shape == (height, width, 3)
+        assert tiles is not None, "a picture to draw onto needs tiles"
+        assert onto.shape == (viewport.height, viewport.width, 3)
         assert onto.is_contiguous()
         assert not onto.requires_grad
         onto = onto.detach()  # An alias: autograd will make the result of what it is given.
-    image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
-        *(tensor.contiguous() for tensor in gaussians),
-        offsets,
-        *camera,
-        tiles,
-        onto,
-        (width, height),
-        near,
+    view = _View(
+        _in_float32(viewport),
+        None if background is None else _constant(background),
+        None if tiles is None else tiles.mask.contiguous(),
         n if trained is None else trained,
+    )
+    offsets = None if screen_offsets is None else screen_offsets.contiguous()
+    image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
+        view, onto, offsets, *(tensor.contiguous() for tensor in tensors)
     )
     return RasterOutput(image, alpha, radii)
 
 
-def blending_weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    maps: Tensor,
-    *,
-    near: float,
-) -> Tensor:
-    """Sums of blending weights ``[N, C]``, see ``kernels.reference_raster.blending_weights``; float32.
+def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
+    """See ``kernels.operations.BlendingWeights``; float32.
 
     Raises:
         OutOfMemoryError: the lists of what each tile draws do not fit.
     """
-    tensors = [t.detach().float().contiguous() for t in (means, quats, scales, opacities, viewmat, K)]
+    tensors = [_constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
     maps = maps.float().contiguous()
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
-    weights = torch.empty(means.shape[0], channels)
+    assert (width, height) == (viewport.width, viewport.height), maps.shape
+    view = _View(_in_float32(viewport), None, None, 0)
+    weights = torch.empty(len(gaussians), channels)
     failed = native_library().sgs_raster_weights(
-        ctypes.c_int64(means.shape[0]),
-        *(_pointer(tensor) for tensor in tensors),
-        ctypes.c_int(width),
-        ctypes.c_int(height),
-        ctypes.c_float(near),
-        _pointer(maps),
-        ctypes.c_int(channels),
-        _pointer(weights),
-        ctypes.c_int(torch.get_num_threads()),
+        len(gaussians),
+        *addresses(*tensors),
+        *view.arguments(),
+        *addresses(maps),
+        channels,
+        *addresses(weights),
+        torch.get_num_threads(),
     )
     if failed:
         raise OutOfMemoryError("for the lists of the Gaussians that each tile draws")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sweep along rays in this package's C++; the contract is ``kernels.reference_sweep``'s."""
+"""The sweep along rays in this package's C++; the contract is ``kernels.operations.Sweep``."""
 
 import ctypes
 from collections.abc import Sequence
@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels._load import native_library
-from structgstream.kernels.reference_sweep import SweepView, Swept
+from structgstream.kernels.motion_types import SweepView, Swept
+from structgstream.kernels.prototypes import addresses
 
 
 class _View(ctypes.Structure):
@@ -34,7 +35,7 @@ def sweep(
     least_supports: int,
     most_contradictions: float,
 ) -> Swept:
-    """The best point of each ray, see ``kernels.reference_sweep.sweep``; float32."""
+    """See ``kernels.operations.Sweep``; float32."""
     assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
     held = [[t.detach().float().contiguous() for t in (v.colors, v.missing, v.depths)] for v in views]
     given = (_View * len(views))()
@@ -42,7 +43,7 @@ def sweep(
         slot.height, slot.width = view.missing.shape
         assert view.colors.shape == (slot.height, slot.width, 3), view.colors.shape
         assert view.depths.shape == view.missing.shape, view.depths.shape
-        slot.colors, slot.missing, slot.depths = (t.data_ptr() for t in tensors)
+        slot.colors, slot.missing, slot.depths = addresses(*tensors)
         slot.viewmat[:] = view.viewmat[:3].reshape(-1).tolist()
         slot.K[:] = view.K.reshape(-1).tolist()
         slot.near_plane = view.near
@@ -50,16 +51,14 @@ def sweep(
     found = Swept(torch.empty(len(pixels)), torch.empty(len(pixels)))
     native_library().sgs_sweep(
         given,
-        ctypes.c_int(len(views)),
-        ctypes.c_int(view_index),
-        ctypes.c_void_p(pixels.data_ptr()),
-        ctypes.c_void_p(farthest.data_ptr()),
-        ctypes.c_int64(len(pixels)),
-        ctypes.c_int(planes),
-        ctypes.c_int(least_supports),
-        ctypes.c_float(most_contradictions),
-        ctypes.c_void_p(found.depths.data_ptr()),
-        ctypes.c_void_p(found.costs.data_ptr()),
-        ctypes.c_int(torch.get_num_threads()),
+        len(views),
+        view_index,
+        *addresses(pixels, farthest),
+        len(pixels),
+        planes,
+        least_supports,
+        most_contradictions,
+        *addresses(found.depths, found.costs),
+        torch.get_num_threads(),
     )
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The volumes of Gaussians in this package's C++; the contract is ``kernels.reference_volume``'s."""
+"""The volumes of Gaussians in this package's C++; the contract is ``kernels.operations.Volume``."""
 
 import ctypes
 from typing import Any
@@ -9,18 +9,14 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels._load import native_library
+from structgstream.kernels.prototypes import addresses
 
 
 class _Volume(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
         drawn = ctypes.c_int64()
-        total = native_library().sgs_volume(
-            ctypes.c_void_p(scales.data_ptr()),
-            ctypes.c_void_p(opacities.data_ptr()),
-            ctypes.c_int64(scales.shape[0]),
-            ctypes.byref(drawn),
-        )
+        total = native_library().sgs_volume(*addresses(scales, opacities), len(scales), ctypes.byref(drawn))
         ctx.save_for_backward(scales)
         count = torch.tensor(drawn.value)
         ctx.mark_non_differentiable(count)
@@ -30,17 +26,12 @@ class _Volume(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
         (scales,) = ctx.saved_tensors
         gradient = torch.empty_like(scales)
-        native_library().sgs_volume_backward(
-            ctypes.c_void_p(scales.data_ptr()),
-            ctypes.c_int64(scales.shape[0]),
-            ctypes.c_float(float(gradients[0])),
-            ctypes.c_void_p(gradient.data_ptr()),
-        )
+        native_library().sgs_volume_backward(*addresses(scales), len(scales), float(gradients[0]), *addresses(gradient))
         return gradient, None
 
 
 def volume(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Summed product of scales and number of drawn Gaussians, see ``kernels.reference_volume.volume``; float32.
+    """See ``kernels.operations.Volume``.
 
     Raises:
         BackendError: another precision.

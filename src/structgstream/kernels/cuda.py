@@ -9,8 +9,11 @@ import importlib.util
 import torch
 from torch import Tensor
 
+from structgstream.cameras import Viewport
+from structgstream.gaussians import Gaussians
 from structgstream.kernels.cuda_tiles import PairBudget, tile_lists
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, pixels_of_tiles, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection, tiles_of
+from structgstream.kernels.reference_raster import in_tiles, reaching, trained_alone
 
 
 def cuda_reason() -> str | None:
@@ -24,94 +27,89 @@ def cuda_reason() -> str | None:
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    gaussians: Gaussians,
+    viewport: Viewport,
     *,
-    width: int,
-    height: int,
-    near: float,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
-    tiles: Tensor | None = None,
+    tiles: TileSelection | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
     budget: PairBudget | None = None,
 ) -> RasterOutput:
-    """The contract of ``kernels.reference_raster.rasterize`` on a GPU.
+    """See ``kernels.operations.Rasterize``.
 
     The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient means the
-    same on every back-end. With ``tiles``, ``radii`` also counts Gaussians that reach other tiles only, and ``trained``
-    saves nothing here: the gradients of the rest are computed and not used. With a ``budget`` the host does not wait
-    (``kernels.cuda_tiles``, Note [Pairs without waiting]).
+    same on every back-end. ``trained`` saves nothing here: the gradients of the rest are computed and not used. With a
+    ``budget`` the host does not wait (``kernels.cuda_tiles``, Note [Pairs without waiting]).
     """
-    if trained is not None:
-        means, quats, scales, opacities, colors = (
-            torch.cat([tensor[:trained], tensor[trained:].detach()])
-            for tensor in (means, quats, scales, opacities, colors)
-        )
-        if screen_offsets is not None:
-            screen_offsets = torch.cat([screen_offsets[:trained], screen_offsets[trained:].detach()])
     from gsplat.cuda._wrapper import (  # pyright: ignore[reportMissingImports]
         fully_fused_projection,
-        isect_offset_encode,
-        isect_tiles,
         rasterize_to_pixels,
     )
 
+    gaussians, screen_offsets = trained_alone(gaussians, screen_offsets, trained)
     radii, means2d, depths, conics, _ = fully_fused_projection(
-        means,
+        gaussians.means,
         None,
-        quats,
-        scales,
-        viewmat[None],
-        K[None],
-        width,
-        height,
+        gaussians.quats,
+        gaussians.scales,
+        viewport.viewmat[None],
+        viewport.K[None],
+        viewport.width,
+        viewport.height,
         eps2d=0.3,
-        near_plane=near,
+        near_plane=viewport.near,
         packed=False,
-        opacities=opacities,
+        opacities=gaussians.opacities,
     )  # [1, N, 2], [1, N, 2], [1, N], [1, N, 3]
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[None]
-    rows, columns = tiles_of(width, height)
-    masks = tiles
-    if budget is None or not means.shape[0]:
-        _, pair_ids, flat_ids = isect_tiles(
-            means2d, radii, depths, TILE_PIXELS, columns, rows, packed=False, n_images=1
-        )
-        tile_starts = isect_offset_encode(pair_ids, 1, columns, rows).reshape(1, rows, columns)
-    else:
-        lists = tile_lists(means2d[0], radii[0], depths[0], width=width, height=height, capacity=budget.capacity)
-        torch.maximum(budget.needed, lists.needed, out=budget.needed)
-        tile_starts, flat_ids = lists.starts[None], lists.ids
-        if masks is not None:
-            masks = torch.cat([masks, torch.zeros_like(masks[:1])])  # the row below the picture
+    starts, ids, masks = _pair_lists(means2d, radii, depths, viewport, tiles, budget)
     image, alpha = rasterize_to_pixels(
         means2d,
         conics,
-        colors[None],
-        opacities[None],
-        width,
-        height,
+        gaussians.colors[None],
+        gaussians.opacities[None],
+        viewport.width,
+        viewport.height,
         TILE_PIXELS,
-        tile_starts,
-        flat_ids,
+        starts,
+        ids,
         backgrounds=None if background is None else background[None],
-        masks=None if masks is None else masks[None],
+        masks=masks,
         packed=False,
     )
     drawn = radii[0].amax(-1).float()
-    if tiles is None:
-        return RasterOutput(image=image[0], alpha=alpha[0, :, :, 0], radii=drawn)
-    inside = pixels_of_tiles(tiles, width, height)
-    return RasterOutput(
-        image=torch.where(inside[..., None], image[0], torch.zeros_like(image[0]) if onto is None else onto),
-        alpha=torch.where(inside, alpha[0, :, :, 0], 0.0),
-        radii=drawn,
-    )
+    if tiles is not None:
+        center = means2d[0].detach()
+        drawn = torch.where(reaching(center - radii[0], center + radii[0], tiles), drawn, 0.0)
+    return in_tiles(image[0], alpha[0, :, :, 0], drawn, tiles, onto)
+
+
+def _pair_lists(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    viewport: Viewport,
+    tiles: TileSelection | None,
+    budget: PairBudget | None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """As gsplat reads them: where each tile's list starts ``[1, rows, columns]``, the rows of the Gaussians, and which
+    tiles are drawn ``[1, rows, columns]``; with a ``budget`` there is a row of tiles more.
+    """
+    masks = None if tiles is None else tiles.mask
+    if budget is not None and means2d.shape[1]:
+        lists = tile_lists(
+            means2d[0], radii[0], depths[0], width=viewport.width, height=viewport.height, capacity=budget.capacity
+        )
+        torch.maximum(budget.needed, lists.needed, out=budget.needed)
+        if masks is not None:
+            masks = torch.cat([masks, torch.zeros_like(masks[:1])])[None]  # the row below the picture
+        return lists.starts[None], lists.ids, masks
+    from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles  # pyright: ignore[reportMissingImports]
+
+    rows, columns = tiles_of(viewport.width, viewport.height)
+    _, pairs, ids = isect_tiles(means2d, radii, depths, TILE_PIXELS, columns, rows, packed=False, n_images=1)
+    starts = isect_offset_encode(pairs, 1, columns, rows).reshape(1, rows, columns)
+    return starts, ids, None if masks is None else masks[None]

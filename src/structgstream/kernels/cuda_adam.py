@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam in torch's fused kernel, one launch a tensor; the contract is ``kernels.reference_adam``'s."""
+"""Adam in torch's fused kernel, one launch a tensor; the contract is ``kernels.operations.AdamStep``."""
 
 import torch
 from torch import Tensor
@@ -13,20 +13,14 @@ def adam_step(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     *,
-    lr: float | Tensor,
-    step: int | Tensor,
+    lr: float,
+    step: int,
     betas: tuple[float, float],
     eps: float,
     rows: Tensor | None = None,
 ) -> None:
-    """Move ``param`` in place by one step, see ``kernels.reference_adam.adam_step``; the host waits for nothing.
-
-    ``lr`` and ``step`` may also be ``[]`` float32 on the parameter's device. Selected ``rows`` take the reference's
-    way.
-    """
+    """See ``kernels.operations.AdamStep``; the host waits for nothing. ``rows`` go the reference's way."""
     if rows is not None:
-        assert isinstance(lr, float)
-        assert isinstance(step, int)
         reference_adam.adam_step(param, grad, exp_avg, exp_avg_sq, lr=lr, step=step, betas=betas, eps=eps, rows=rows)
         return
     if param.numel() == 0:
@@ -38,7 +32,7 @@ def adam_step(
         [exp_avg_sq],
         [],
         # A number is filled in by a kernel: nothing is copied from the host.
-        [step if isinstance(step, Tensor) else torch.full((), float(step), device=param.device)],
+        [torch.full((), float(step), device=param.device)],
         lr=lr,
         beta1=betas[0],
         beta2=betas[1],

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The functions of csrc/include/structgstream.h as ctypes must know them; a call with other arguments is refused.
+"""The functions of csrc/include/structgstream.h and csrc/cuda/ssim.h as ctypes must know them.
 
-A letter stands for a type of C: ``p`` any pointer, ``i`` int, ``l`` int64_t, ``f`` float, ``d`` double, ``v`` void.
+ctypes then takes plain numbers and addresses, and refuses a call with other arguments. A letter stands for a type of C:
+``p`` any pointer, ``i`` int, ``l`` int64_t, ``f`` float, ``d`` double, ``v`` void, ``s`` a string of the library.
 """
 
 import ctypes
 from collections.abc import Mapping
+
+from torch import Tensor
 
 TYPES: Mapping[str, type | None] = {
     "p": ctypes.c_void_p,
@@ -14,6 +17,7 @@ TYPES: Mapping[str, type | None] = {
     "f": ctypes.c_float,
     "d": ctypes.c_double,
     "v": None,
+    "s": ctypes.c_char_p,
 }
 PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_abi_version": ("i", ""),
@@ -44,16 +48,27 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_code_residuals": ("i", "ppilippp"),
     "sgs_code_numbers": ("i", "ppilpip"),
 }
-"""By function: its result, and its arguments in order."""
+"""By function of the library for the processor: its result, and its arguments in order."""
+CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
+    "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
+    "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
+    "sgs_cuda_error": ("s", "i"),
+}
+"""The same of the library for a GPU."""
 
 
-def declare(library: ctypes.CDLL) -> None:
+def declare(library: ctypes.CDLL, prototypes: Mapping[str, tuple[str, str]]) -> None:
     """Tells ctypes the types of every function.
 
     Raises:
         AttributeError: the library lacks one.
     """
-    for name, (result, arguments) in PROTOTYPES.items():
+    for name, (result, arguments) in prototypes.items():
         function = getattr(library, name)
         function.restype = TYPES[result]
         function.argtypes = [TYPES[argument] for argument in arguments]
+
+
+def addresses(*tensors: Tensor | None) -> list[int | None]:
+    """Where the numbers of each tensor lie; None, which is C's null, for one that is not there."""
+    return [None if tensor is None else tensor.data_ptr() for tensor in tensors]

@@ -15,19 +15,37 @@ def tiles_of(width: int, height: int) -> tuple[int, int]:
     return -(-height // TILE_PIXELS), -(-width // TILE_PIXELS)
 
 
-def pixels_of_tiles(tiles: Tensor, width: int, height: int) -> Tensor:
-    """A mask of tiles ``[rows, columns]`` as a mask of pixels ``[H, W]``."""
-    return tiles.repeat_interleave(TILE_PIXELS, 0).repeat_interleave(TILE_PIXELS, 1)[:height, :width]
+@dataclass(frozen=True)
+class TileSelection:
+    """Some tiles of a picture.
 
+    Args:
+        mask: ``[rows, columns]`` bool.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+    """
 
-def count_pixels(tiles: Tensor, width: int, height: int) -> int:
-    """Number of pixels in a mask of tiles ``[rows, columns]``."""
-    rows, columns = tiles_of(width, height)
-    heights = tiles.new_full((rows,), TILE_PIXELS, dtype=torch.int64)
-    widths = tiles.new_full((columns,), TILE_PIXELS, dtype=torch.int64)
-    heights[-1] -= rows * TILE_PIXELS - height
-    widths[-1] -= columns * TILE_PIXELS - width
-    return int(heights @ tiles.to(torch.int64) @ widths)
+    mask: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        assert self.mask.dtype == torch.bool, self.mask.dtype
+        assert self.mask.shape == tiles_of(self.width, self.height), (self.mask.shape, self.width, self.height)
+
+    def pixels(self) -> Tensor:
+        """The pixels of the tiles as a mask ``[H, W]``."""
+        rows = self.mask.repeat_interleave(TILE_PIXELS, 0)
+        return rows.repeat_interleave(TILE_PIXELS, 1)[: self.height, : self.width]
+
+    def count_pixels(self) -> int:
+        """Number of pixels in the tiles."""
+        rows, columns = self.mask.shape
+        heights = self.mask.new_full((rows,), TILE_PIXELS, dtype=torch.int64)
+        widths = self.mask.new_full((columns,), TILE_PIXELS, dtype=torch.int64)
+        heights[-1] -= rows * TILE_PIXELS - self.height
+        widths[-1] -= columns * TILE_PIXELS - self.width
+        return int(heights @ self.mask.to(torch.int64) @ widths)
 
 
 @dataclass(frozen=True)
@@ -36,7 +54,7 @@ class RasterOutput:
 
     Args:
         image: ``[H, W, 3]``, not clamped; zero (or what was there) in tiles that were not asked for.
-        alpha: ``[H, W]`` coverage in [0, 1].
+        alpha: ``[H, W]`` coverage in [0, 1]; zero in tiles that were not asked for.
         radii: ``[N]`` float32 pixels, 0 where a Gaussian was not drawn.
     """
 

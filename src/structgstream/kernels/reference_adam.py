@@ -16,19 +16,7 @@ def adam_step(
     eps: float,
     rows: Tensor | None = None,
 ) -> None:
-    """Move ``param`` in place by one step, as ``torch.optim.Adam`` does.
-
-    Args:
-        param: any shape.
-        grad: like ``param``.
-        exp_avg: first moment, updated in place.
-        exp_avg_sq: second moment, updated in place.
-        lr: learning rate.
-        step: number of this step, from 1.
-        betas: decay of the moments.
-        eps: added to the root of the corrected second moment.
-        rows: ``[r]`` int64; only these rows (first dimension) are touched. None: all.
-    """
+    """See ``kernels.operations.AdamStep``."""
     if rows is not None:
         values = [tensor[rows] for tensor in (param, grad, exp_avg, exp_avg_sq)]
         adam_step(*values, lr=lr, step=step, betas=betas, eps=eps)

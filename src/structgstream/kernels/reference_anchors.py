@@ -4,8 +4,10 @@
 import torch
 from torch import Tensor
 
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TILE_PIXELS
+from structgstream.cameras import Viewport
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection
 
 BALL_DEVIATIONS = 3.4
 """A Gaussian ends within so many standard deviations: alpha = 1/255 is reached before 3.33 at any opacity."""
@@ -13,47 +15,19 @@ BOX_MARGIN_PIXELS = 2.0
 """The rasteriser's low-pass makes the smallest Gaussian this wide."""
 
 
-def seen_anchors(
-    positions: Tensor,
-    log_offset_scales: Tensor,
-    log_base_scales: Tensor,
-    offsets: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    *,
-    width: int,
-    height: int,
-    near: float,
-    tiles: Tensor | None = None,
-) -> Tensor:
-    """Mask ``[M]`` bool of the anchors that can put a Gaussian into a picture.
-
-    Conservative: an anchor counts as a ball that holds all its Gaussians, so culling changes the cost of a rendering
-    and never its pixels.
-
-    Args:
-        positions: ``[M, 3]``.
-        log_offset_scales: ``[M, 3]``.
-        log_base_scales: ``[M, 3]``.
-        offsets: ``[M, K, 3]``.
-        viewmat: ``[4, 4]`` world to camera.
-        K: ``[3, 3]`` pixels.
-        width: pixels.
-        height: pixels.
-        near: smallest z that is drawn.
-        tiles: ``[rows, columns]`` bool: only what reaches one of these tiles counts.
-    """
+def seen_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
+    """Mask ``[M]`` bool of the anchors whose ball of Gaussians reaches the picture, or one of the ``tiles``."""
+    size = (viewport.width, viewport.height)
     with torch.no_grad():
-        points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]  # [M, 3]
-        reach = (offsets * log_offset_scales.exp()[:, None]).norm(dim=-1).amax(1)
-        radius = reach + BALL_DEVIATIONS * log_base_scales.amax(1).exp()  # [M]
+        points = anchors.positions @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]  # [M, 3]
+        reach = (anchors.offsets * anchors.log_offset_scales.exp()[:, None]).norm(dim=-1).amax(1)
+        radius = reach + BALL_DEVIATIONS * anchors.log_base_scales.amax(1).exp()  # [M]
         closest, furthest = points[:, 2] - radius, points[:, 2] + radius
-        size = (width, height)
-        seen = furthest > near
+        seen = furthest > viewport.near
         low, high = [], []
         for axis in range(2):
             below, above = points[:, axis] - radius, points[:, axis] + radius
-            focal, center = K[axis, axis], K[axis, 2]
+            focal, center = viewport.K[axis, axis], viewport.K[axis, 2]
             at_low = below / torch.where(below < 0, closest, furthest)
             at_high = above / torch.where(above < 0, furthest, closest)
             low.append(focal * at_low + center - BOX_MARGIN_PIXELS)
@@ -68,41 +42,22 @@ def seen_anchors(
             low[axis] = torch.where(around, 0.0, low[axis])
             high[axis] = torch.where(around, float(size[axis]), high[axis])
         if tiles is not None:
-            covered = torch.zeros(tiles.shape[0] + 1, tiles.shape[1] + 1, dtype=torch.int64, device=tiles.device)
-            covered[1:, 1:] = tiles.long().cumsum(0).cumsum(1)
-            x0, y0 = (low[axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS for axis in range(2))
-            x1, y1 = (high[axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS + 1 for axis in range(2))
-            seen &= covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
+            seen &= _reaches(tiles.mask, torch.stack(low, dim=1), torch.stack(high, dim=1), size)
         return seen
 
 
-def visible_anchors(
-    positions: Tensor,
-    log_offset_scales: Tensor,
-    log_base_scales: Tensor,
-    offsets: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    *,
-    width: int,
-    height: int,
-    near: float,
-    tiles: Tensor | None = None,
-) -> Tensor:
+def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
+    """Mask ``[M]`` of the boxes of pixels ``low`` ... ``high`` ``[M, 2]`` that share a tile with a mask of tiles."""
+    covered = torch.zeros(tiles.shape[0] + 1, tiles.shape[1] + 1, dtype=torch.int64, device=tiles.device)
+    covered[1:, 1:] = tiles.long().cumsum(0).cumsum(1)
+    x0, y0 = (low[:, axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS for axis in range(2))
+    x1, y1 = (high[:, axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS + 1 for axis in range(2))
+    return covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
+
+
+def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
     """Indices ``[m]`` int64, ascending, of the anchors that :func:`seen_anchors` marks."""
-    seen = seen_anchors(
-        positions,
-        log_offset_scales,
-        log_base_scales,
-        offsets,
-        viewmat,
-        K,
-        width=width,
-        height=height,
-        near=near,
-        tiles=tiles,
-    )
-    return seen.nonzero()[:, 0]
+    return seen_anchors(anchors, viewport, tiles).nonzero()[:, 0]
 
 
 def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:
@@ -111,34 +66,27 @@ def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:
 
 
 def generate_structured(
-    positions: Tensor,
-    log_offset_scales: Tensor,
-    log_base_scales: Tensor,
-    offsets: Tensor,
-    features: Tensor,
+    anchors: Anchors,
     mlps: MLPWeights,
-    camera_center: Tensor,
-    visible: Tensor,
+    viewport: Viewport,
     *,
     distance_input: bool,
+    tiles: TileSelection | None = None,
+    seen_from: Tensor | None = None,
 ) -> StructuredGaussians:
-    """Dress the visible anchors for one camera (paper, equations for mu' and Sigma').
+    """See ``kernels.operations.GenerateStructured``."""
+    visible = visible_anchors(anchors, viewport, tiles)
+    center = viewport.center if seen_from is None else seen_from
+    return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)
 
-    Args:
-        positions: ``[M, 3]``, x_v.
-        log_offset_scales: ``[M, 3]``, log l_v.
-        log_base_scales: ``[M, 3]``, log of the largest Gaussian scale.
-        offsets: ``[M, K, 3]``, O_v.
-        features: ``[M, D]``, f_v.
-        mlps: the three heads; inputs are the feature, the direction (3) and, if asked for, the distance (1).
-        camera_center: ``[3]``.
-        visible: ``[m]`` int64 anchor indices, ascending.
-        distance_input: whether the heads see the distance.
 
-    Opacity is tanh and used as it is, so that only what is positive is drawn; the scale is the base times a sigmoid.
-    """
+def activate_anchors(
+    anchors: Anchors, mlps: MLPWeights, center: Tensor, visible: Tensor, *, distance_input: bool
+) -> StructuredGaussians:
+    """The Gaussians of the anchors ``visible`` ``[m]`` int64, ascending, as seen from ``center`` ``[3]``."""
+    positions, log_offset_scales, log_base_scales, offsets, features = anchors
     k = offsets.shape[1]
-    to_anchor = positions[visible] - camera_center
+    to_anchor = positions[visible] - center
     distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)  # An anchor may sit in the camera.
     parts = [features[visible], to_anchor / distance]
     inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
@@ -148,12 +96,12 @@ def generate_structured(
     covariance = _head(mlps.covariance, inputs).reshape(-1, 7)[drawn]
     anchor = visible[drawn // k]
     offset = offsets[anchor, drawn % k]
-    return StructuredGaussians(
+    gaussians = Gaussians(
         means=positions[anchor] + offset * log_offset_scales[anchor].exp(),
         quats=torch.nn.functional.normalize(covariance[:, 3:7], dim=1),
         scales=log_base_scales[anchor].exp() * torch.sigmoid(covariance[:, :3]),
         opacities=opacity.reshape(-1)[drawn],
         colors=color,
         ids=anchor * k + drawn % k,
-        raw_opacities=opacity.detach(),
     )
+    return StructuredGaussians(gaussians, visible, opacity.detach())

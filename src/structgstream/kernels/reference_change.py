@@ -6,17 +6,7 @@ from torch import Tensor
 
 
 def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor:
-    """Mask ``[H, W]`` of what changed between two pictures ``[H, W, 3]`` uint8, and its surroundings.
-
-    A pixel has changed when the mean absolute difference of the 3 x 3 pixels around it (those that exist), over the
-    channels, exceeds ``threshold`` (in 0 ... 1). Sums are of integers: every back-end finds the same pixels.
-
-    Args:
-        before: the camera's earlier picture.
-        now: its later picture.
-        threshold: above the sensor's noise.
-        reach_pixels: pixels up to this far from a changed one, across or down, count as well.
-    """
+    """See ``kernels.operations.ChangedPixels``."""
     difference = (before.to(torch.int32) - now.to(torch.int32)).abs().sum(-1).float()[None, None]  # exact
     ones = torch.ones(1, 1, 3, 3, device=difference.device)
     sums = torch.nn.functional.conv2d(difference, ones, padding=1)

@@ -6,5 +6,5 @@ from torch import Tensor
 
 
 def excess(offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor:
-    """The parts of |offsets ``[M, K, 3]`` x exp(log_scales ``[M, 3]``)| beyond ``limit``, summed, ``[]``."""
+    """See ``kernels.operations.Excess``."""
     return torch.relu((offsets * log_scales.exp()[:, None]).abs() - limit).sum()

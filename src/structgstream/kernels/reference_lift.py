@@ -1,30 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Displacements in space from flow in pictures, in pure torch: the oracle."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
+
+from structgstream.kernels.motion_types import Lifted, Neighbours, ViewFlows
 
 ROBUST_PIXELS = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
 """Scale of the Geman-McClure weights in each round after the first, which trusts everything."""
 INLIER_PIXELS = 1.5
 PRIOR_SHARE, PRIOR_FLOOR = 0.02, 0.05
-
-
-@dataclass(frozen=True)
-class Lifted:
-    """What :func:`lift` found.
-
-    Args:
-        displacements: ``[T, 3]``.
-        inlier_share: ``[T]`` weight of the flow that agrees within 1.5 pixels, against all of it; 0 without any.
-        agreeing_views: ``[T]`` int64, views of which more than ``share`` of the flow agrees.
-    """
-
-    displacements: Tensor
-    inlier_share: Tensor
-    agreeing_views: Tensor
 
 
 def projection_jacobians(centers: Tensor, viewmats: Tensor, Ks: Tensor, near: Tensor) -> Tensor:
@@ -40,41 +25,12 @@ def projection_jacobians(centers: Tensor, viewmats: Tensor, Ks: Tensor, near: Te
     return (local @ viewmats[:, None, :3, :3]) * front[..., None, None]
 
 
-def lift(
-    centers: Tensor,
-    weights: Tensor,
-    flows: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    near: Tensor,
-    neighbours: Tensor,
-    affinities: Tensor,
-    priors: Tensor,
-    *,
-    share: float,
-) -> Lifted:
-    """For each target the displacement d that explains the flow of its neighbours best, in all views at once.
-
-    Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views, with Geman-McClure weights
-    ``1 / (1 + r^2 / s^2)^2`` of falling scale s (:data:`ROBUST_PIXELS`) after one round without them.
-    ``reg = (0.02 sum + 0.05)`` times the mean square of J, where ``sum`` is that of the present weights.
-
-    Args:
-        centers: ``[E, 3]`` of movers.
-        weights: ``[V, E]`` W, pixels of flow.
-        flows: ``[V, E, 2]`` f, pixels.
-        viewmats: ``[V, 4, 4]``.
-        Ks: ``[V, 3, 3]`` of the pictures in whose pixels f is.
-        near: ``[V]``.
-        neighbours: ``[T, N]`` int64, rows of movers.
-        affinities: ``[T, N]`` g.
-        priors: ``[T, 3]``.
-        share: of :class:`Lifted`.
-    """
-    jacobians = projection_jacobians(centers, viewmats, Ks, near)
-    usable = weights * (jacobians.abs().sum((-1, -2)) > 0)
-    w = affinities[None] * usable[:, neighbours]  # [V, T, N]
-    J, f = jacobians[:, neighbours], flows[:, neighbours]
+def lift(centers: Tensor, seen: ViewFlows, neighbours: Neighbours, priors: Tensor, *, share: float) -> Lifted:
+    """See ``kernels.operations.Lift``."""
+    jacobians = projection_jacobians(centers, seen.viewmats, seen.Ks, seen.near)
+    usable = seen.weights * (jacobians.abs().sum((-1, -2)) > 0)
+    w = neighbours.affinities[None] * usable[:, neighbours.rows]  # [V, T, N]
+    J, f = jacobians[:, neighbours.rows], seen.flows[:, neighbours.rows]
     total = w.sum((0, 2))
     stiffness = (w * J.square().sum((-1, -2))).sum((0, 2)) / (2.0 * total.clamp(min=1e-12))
     eye = torch.eye(3, dtype=centers.dtype, device=centers.device)

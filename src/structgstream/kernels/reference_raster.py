@@ -6,13 +6,15 @@ view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/2
 back by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, pixels_of_tiles
+from structgstream.cameras import Viewport
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.operations import Rasterize
+from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection
 
 LOW_PASS_PIXELS = 0.3
 MIN_ALPHA = 1.0 / 255.0
@@ -48,22 +50,12 @@ def _rotations(quats: Tensor) -> Tensor:
     ).reshape(-1, 3, 3)
 
 
-def _project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    screen_offsets: Tensor | None,
-) -> _Projected:
+def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | None) -> _Projected:
+    means, quats, scales, opacities = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    viewmat, K, width, height = viewport.viewmat, viewport.K, viewport.width, viewport.height
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None], colors], dim=1)).all(1)
-    rows = ((points[:, 2] >= near) & (opacities >= MIN_ALPHA) & finite).nonzero()[:, 0]
+    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None], gaussians.colors], dim=1)).all(1)
+    rows = ((points[:, 2] >= viewport.near) & (opacities >= MIN_ALPHA) & finite).nonzero()[:, 0]
     points = points[rows]
     x, y, z = points.unbind(1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -97,116 +89,84 @@ def _project(
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
+    gaussians: Gaussians,
+    viewport: Viewport,
     *,
-    width: int,
-    height: int,
-    near: float,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
-    tiles: Tensor | None = None,
+    tiles: TileSelection | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
 ) -> RasterOutput:
-    """Render Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
-
-    Args:
-        means: ``[N, 3]`` scene units.
-        quats: ``[N, 4]`` wxyz, normalised here.
-        scales: ``[N, 3]`` standard deviations.
-        opacities: ``[N]`` in (0, 1).
-        colors: ``[N, 3]``.
-        viewmat: ``[4, 4]`` world to camera.
-        K: ``[3, 3]`` pixels.
-        width: pixels.
-        height: pixels.
-        near: Gaussians with a smaller z are not drawn.
-        background: ``[3]``, black when None.
-        screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
-            gradient, by the same contract on every back-end.
-        tiles: ``[rows, columns]`` bool: the tiles to draw, all when None. A Gaussian that reaches none of them counts
-            as not drawn.
-        onto: ``[H, W, 3]`` without gradient: what the picture shows in the other tiles, else zero. Its memory may be
-            drawn into and become the result.
-        trained: only so many Gaussians, the first ones, get gradients; all when None.
-    """
-    if trained is not None:
-        means, quats, scales, opacities, colors = (
-            torch.cat([tensor[:trained], tensor[trained:].detach()])
-            for tensor in (means, quats, scales, opacities, colors)
-        )
-        if screen_offsets is not None:
-            screen_offsets = torch.cat([screen_offsets[:trained], screen_offsets[trained:].detach()])
-    projected = _project(means, quats, scales, opacities, colors, viewmat, K, width, height, near, screen_offsets)
-    radii = means.new_zeros(means.shape[0], dtype=torch.float32)
+    """See ``kernels.operations.Rasterize``."""
+    gaussians, screen_offsets = trained_alone(gaussians, screen_offsets, trained)
+    projected = _project(gaussians, viewport, screen_offsets)
+    radii = gaussians.means.new_zeros(len(gaussians), dtype=torch.float32)
     radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
-    back = means.new_zeros(3) if background is None else background
+    back = gaussians.means.new_zeros(3) if background is None else background
     low = projected.means2d.detach() - projected.extents
     high = projected.means2d.detach() + projected.extents
     if tiles is not None:
-        reaching = _reaching(low, high, tiles, width, height)
-        radii[projected.rows[~reaching]] = 0.0
+        radii[projected.rows[~reaching(low, high, tiles)]] = 0.0
     bands, bands_alpha = [], []
-    for top in range(0, height, TILE_PIXELS):
-        bottom = min(top + TILE_PIXELS, height)
+    for top in range(0, viewport.height, TILE_PIXELS):
+        bottom = min(top + TILE_PIXELS, viewport.height)
         in_band = ((low[:, 1] < bottom) & (high[:, 1] > top)).nonzero()[:, 0]
         row, row_alpha = [], []
-        for left in range(0, width, TILE_PIXELS):
-            right = min(left + TILE_PIXELS, width)
+        for left in range(0, viewport.width, TILE_PIXELS):
+            right = min(left + TILE_PIXELS, viewport.width)
             here = in_band[(low[in_band, 0] < right) & (high[in_band, 0] > left)]
-            image, alpha = _tile(projected, here, opacities, colors, left, right, top, bottom)
+            image, alpha = _tile(projected, here, gaussians, range(left, right), range(top, bottom))
             row.append(image + (1.0 - alpha)[..., None] * back)
             row_alpha.append(alpha)
         bands.append(torch.cat(row, dim=1))
         bands_alpha.append(torch.cat(row_alpha, dim=1))
-    image, alpha = torch.cat(bands), torch.cat(bands_alpha)
-    if tiles is not None:
-        inside = pixels_of_tiles(tiles, width, height)
-        image = torch.where(inside[..., None], image, torch.zeros_like(image) if onto is None else onto)
-        alpha = torch.where(inside, alpha, 0.0)
-    return RasterOutput(image, alpha, radii)
+    return in_tiles(torch.cat(bands), torch.cat(bands_alpha), radii, tiles, onto)
 
 
-def blending_weights(
-    rasterize: Callable[..., RasterOutput],
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    maps: Tensor,
-    *,
-    near: float,
-) -> Tensor:
-    """For each Gaussian the sum over the pixels of its blending weight times each map, ``[N, C]``.
+def trained_alone(
+    gaussians: Gaussians, screen_offsets: Tensor | None, trained: int | None
+) -> tuple[Gaussians, Tensor | None]:
+    """The same, but that rows from ``trained`` on have no graph."""
+    if trained is None:
+        return gaussians, screen_offsets
+    values = {
+        f.name: torch.cat([getattr(gaussians, f.name)[:trained], getattr(gaussians, f.name)[trained:].detach()])
+        for f in fields(gaussians)
+    }
+    if screen_offsets is not None:
+        screen_offsets = torch.cat([screen_offsets[:trained], screen_offsets[trained:].detach()])
+    return Gaussians(**values), screen_offsets
+
+
+def in_tiles(
+    image: Tensor, alpha: Tensor, radii: Tensor, tiles: TileSelection | None, onto: Tensor | None
+) -> RasterOutput:
+    """What was drawn of a whole picture, kept in ``tiles`` alone and drawn ``onto`` the rest."""
+    if tiles is None:
+        assert onto is None, "a picture to draw onto needs tiles"
+        return RasterOutput(image, alpha, radii)
+    inside = tiles.pixels()
+    alpha = torch.where(inside, alpha, 0.0)
+    if onto is None:
+        return RasterOutput(torch.where(inside[..., None], image, 0.0), alpha, radii)
+    onto = onto.detach()  # An alias: autograd makes the result of what it is given.
+    return RasterOutput(onto.copy_(torch.where(inside[..., None], image, onto)), alpha, radii)
+
+
+def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
+    """See ``kernels.operations.BlendingWeights``.
 
     A colour's gradient is the sum of its Gaussian's weights times the picture's gradient, so any rasteriser can tell,
     for three maps with each gradient.
-
-    Args:
-        rasterize: one with the contract of :func:`rasterize`.
-        means: ``[N, 3]``, and the others as for :func:`rasterize`.
-        quats: ``[N, 4]``.
-        scales: ``[N, 3]``.
-        opacities: ``[N]``.
-        viewmat: ``[4, 4]``.
-        K: ``[3, 3]``.
-        maps: ``[H, W, C]``, C at least 1; they give the picture's size.
-        near: smallest z.
     """
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
+    assert (width, height) == (viewport.width, viewport.height), maps.shape
     found = []
     with torch.enable_grad():
-        colors = torch.zeros_like(means).requires_grad_()
-        output = rasterize(means, quats, scales, opacities, colors, viewmat, K, width=width, height=height, near=near)
+        colors = torch.zeros_like(gaussians.means).requires_grad_()
+        output = rasterize(replace(gaussians, colors=colors), viewport)
         for first in range(0, channels, 3):
             group = maps[..., first : first + 3]
             cotangent = torch.nn.functional.pad(group, (0, 3 - group.shape[-1]))
@@ -216,43 +176,37 @@ def blending_weights(
     return torch.cat(found, dim=1)
 
 
-def _reaching(low: Tensor, high: Tensor, tiles: Tensor, width: int, height: int) -> Tensor:
+def reaching(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:
     """Mask ``[n]`` of the boxes (pixels) with the centre of a pixel in one of ``tiles``, or without any centre."""
+    width, height = tiles.width, tiles.height
     first, last = (low - 0.5 - BOX_SLACK_PIXELS).ceil().long(), (high + 0.5 + BOX_SLACK_PIXELS).floor().long()
     x0, y0 = first[:, 0].clamp(0, width), first[:, 1].clamp(0, height)
     x1, y1 = last[:, 0].clamp(0, width), last[:, 1].clamp(0, height)
     covered = torch.zeros(height + 1, width + 1, dtype=torch.int64, device=low.device)
-    covered[1:, 1:] = pixels_of_tiles(tiles, width, height).long().cumsum(0).cumsum(1)
+    covered[1:, 1:] = tiles.pixels().long().cumsum(0).cumsum(1)
     count = covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0]
     return (count > 0) | (x0 >= x1) | (y0 >= y1)
 
 
 def _tile(
-    projected: _Projected,
-    here: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    left: int,
-    right: int,
-    top: int,
-    bottom: int,
+    projected: _Projected, here: Tensor, gaussians: Gaussians, columns: range, rows: range
 ) -> tuple[Tensor, Tensor]:
     """Blend the Gaussians ``here``, ordered by depth, over one tile: ``[h, w, 3]`` and coverage ``[h, w]``."""
-    like = projected.means2d
+    like, opacities, colors = projected.means2d, gaussians.opacities, gaussians.colors
     if here.numel() == 0:
-        return colors.new_zeros(bottom - top, right - left, 3), colors.new_zeros(bottom - top, right - left)
-    xs = torch.arange(left, right, dtype=like.dtype, device=like.device) + 0.5
-    ys = torch.arange(top, bottom, dtype=like.dtype, device=like.device) + 0.5
+        return colors.new_zeros(len(rows), len(columns), 3), colors.new_zeros(len(rows), len(columns))
+    xs = torch.arange(columns.start, columns.stop, dtype=like.dtype, device=like.device) + 0.5
+    ys = torch.arange(rows.start, rows.stop, dtype=like.dtype, device=like.device) + 0.5
     dx = (xs[None, :] - like[here, 0, None])[:, None, :]  # [n, 1, w]
     dy = (ys[None, :] - like[here, 1, None])[:, :, None]  # [n, h, 1]
     xx, xy, yy = (projected.conics[here, i, None, None] for i in range(3))
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
-    rows = projected.rows[here]
-    alpha = opacities[rows, None, None] * power.exp()
+    drawn = projected.rows[here]
+    alpha = opacities[drawn, None, None] * power.exp()
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0.0)
     after = (1.0 - alpha).cumprod(0)
     # Transmittance only falls, so cutting where it would reach the limit is the same as stopping there.
     blended = after.detach() > MIN_TRANSMITTANCE
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     weights = torch.where(blended, alpha * before, 0.0)
-    return torch.einsum("nhw,nc->hwc", weights, colors[rows]), weights.sum(0)
+    return torch.einsum("nhw,nc->hwc", weights, colors[drawn]), weights.sum(0)

@@ -8,7 +8,7 @@ C1 = 0.01^2, C2 = 0.03^2, mean over pixels and channels.
 import torch
 from torch import Tensor
 
-from structgstream.kernels.raster_types import pixels_of_tiles
+from structgstream.kernels.raster_types import TileSelection
 
 WINDOW_PIXELS = 11
 SIGMA_PIXELS = 1.5
@@ -57,24 +57,24 @@ def l1_ssim(
     *,
     gains: Tensor | None = None,
     biases: Tensor | None = None,
-    tiles: Tensor | None = None,
+    tiles: TileSelection | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Mean absolute difference and mean SSIM of ``gains * image + biases`` against ``target``.
-
-    Args:
-        image: ``[H, W, 3]``; gradients flow here only.
-        target: ``[H, W, 3]``, float in [0, 1] or uint8.
-        gains: ``[3]``, constant; one when None.
-        biases: ``[3]``, constant; given with ``gains``.
-        tiles: ``[rows, columns]`` bool: pixels of the other tiles count as equal (difference 0, SSIM 1). They are still
-            read, up to ten pixels from the tiles that count.
-    """
+    """See ``kernels.operations.L1SSIM``."""
     if gains is not None:
         assert biases is not None
         image = image * gains.detach() + biases.detach()
     reference = in_unit_range(target, image)
+    if tiles is None:
+        return (image - reference).abs().mean(), ssim_map(image, reference).mean()
+    inside = tiles.pixels()[..., None]
+    image = torch.where(inside, image, image.detach())
     difference, similarity = (image - reference).abs(), ssim_map(image, reference)
-    if tiles is not None:
-        outside = ~pixels_of_tiles(tiles, image.shape[1], image.shape[0])[..., None]
-        difference, similarity = difference.masked_fill(outside, 0.0), similarity.masked_fill(outside, 1.0)
-    return difference.mean(), similarity.mean()
+    return (
+        _valued(difference.mean(), difference.masked_fill(~inside, 0.0).mean()),
+        _valued(similarity.mean(), similarity.masked_fill(~inside, 1.0).mean()),
+    )
+
+
+def _valued(graph: Tensor, value: Tensor) -> Tensor:
+    """``value`` with the gradient of ``graph``."""
+    return value.detach() + (graph - graph.detach())

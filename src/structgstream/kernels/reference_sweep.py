@@ -2,10 +2,11 @@
 """Along each ray the depth at which several views see the same new thing, in pure torch: the oracle."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from structgstream.kernels.motion_types import SweepView, Swept
 
 SUPPORTING, CONTRADICTING = 0.3, 0.05
 """A view supports a point where so much of it is missing from the rendering, and contradicts one where less is."""
@@ -14,40 +15,6 @@ FRONT_SHARE = 1.03
 MOST_DIFFERENCE = 0.3
 MISS_COST, LONELY_COST = 0.15, 0.05
 EQUAL_COST = 0.01
-
-
-@dataclass(frozen=True)
-class SweepView:
-    """A view that rays are swept through.
-
-    Args:
-        colors: ``[h, w, 3]`` of the picture, 0 ... 1, the same surface having one colour in all views.
-        missing: ``[h, w]`` how much of the surroundings of a pixel the rendering lacks, 0 ... 1.
-        depths: ``[h, w]`` of what is rendered, along z; infinite where nothing is.
-        viewmat: ``[4, 4]``.
-        K: ``[3, 3]`` of a picture of that size.
-        near: nothing lies nearer.
-    """
-
-    colors: Tensor
-    missing: Tensor
-    depths: Tensor
-    viewmat: Tensor
-    K: Tensor
-    near: float
-
-
-@dataclass(frozen=True)
-class Swept:
-    """The best point of each ray.
-
-    Args:
-        depths: ``[P]`` along z; 0 for a ray without a point.
-        costs: ``[P]`` the least; infinite without one.
-    """
-
-    depths: Tensor
-    costs: Tensor
 
 
 def sweep(
@@ -60,22 +27,7 @@ def sweep(
     least_supports: int,
     most_contradictions: float,
 ) -> Swept:
-    """For each ray the cheapest of ``planes`` depths, evenly spaced in inverse depth.
-
-    A view supports a point that falls into its picture where something is missing and in front of what is rendered
-    there; it contradicts one where nothing is missing and the point would be seen. The cost is the mean difference of
-    colour over the supports (each at most 0.3), 0.15 times the share of contradictions, and 0.05 over the supports. Of
-    the depths around the cheapest that cost at most 0.01 more the middle one is taken.
-
-    Args:
-        views: all of them.
-        view_index: whose rays.
-        pixels: ``[P, 2]`` int64, column and row.
-        farthest: ``[P]`` depth at which each ray ends; it begins at the view's near plane.
-        planes: points on a ray.
-        least_supports: a point needs so many ...
-        most_contradictions: ... and at most this share of contradictions among both.
-    """
+    """See ``kernels.operations.Sweep``."""
     own = views[view_index]
     x, y = pixels.unbind(1)
     steps = torch.linspace(0.0, 1.0, planes, dtype=farthest.dtype, device=farthest.device)

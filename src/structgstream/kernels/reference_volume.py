@@ -5,9 +5,6 @@ from torch import Tensor
 
 
 def volume(scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """The product of the three scales ``[N, 3]``, summed, and the number of opacities ``[N]`` above zero.
-
-    Gradients flow to ``scales``.
-    """
+    """See ``kernels.operations.Volume``."""
     x, y, z = scales.unbind(1)
     return (x * y * z).sum(), (opacities > 0).sum()

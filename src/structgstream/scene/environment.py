@@ -31,7 +31,7 @@ def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
     """
     if coefficients is None:
         return None
-    return environment(coefficients, camera.beside(coefficients).viewmat[2, :3])
+    return environment(coefficients, camera.viewport(coefficients).viewmat[2, :3])
 
 
 def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
@@ -39,10 +39,10 @@ def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
 
     A similarity does not rotate: they are the same in units of the capture and of the scene.
     """
-    viewmat, K, _ = camera.beside(torch.zeros(0, dtype=torch.float64, device=pixels.device))
+    viewport = camera.viewport(torch.zeros(0, dtype=torch.float64, device=pixels.device))
     y = torch.div(pixels, camera.width, rounding_mode="floor")
     centers = torch.stack([pixels - y * camera.width + 0.5, y + 0.5, torch.ones_like(y)], dim=1)
-    rays = centers @ (torch.linalg.inv(K).T @ viewmat[:3, :3]).to(centers)
+    rays = centers @ (torch.linalg.inv(viewport.K).T @ viewport.viewmat[:3, :3]).to(centers)
     return rays * rays.square().sum(1, keepdim=True).rsqrt()
 
 

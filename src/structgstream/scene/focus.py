@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from structgstream.gaussians import Gaussians
+from structgstream.kernels.raster_types import TileSelection
 
 
 @dataclass(frozen=True)
@@ -16,12 +17,12 @@ class Focus:
     them, at the cost of the tiles.
 
     Args:
-        tiles: ``[rows, columns]`` bool (``kernels.raster_types``), those that moving Gaussians reach.
+        tiles: those that moving Gaussians reach.
         picture: ``[H, W, 3]`` the rest of the picture, as far as a loss looks beyond the tiles; drawn onto in place.
             In the tiles it shows what was drawn there last.
         still: Gaussians that reach the tiles and do not move; without gradient.
     """
 
-    tiles: Tensor
+    tiles: TileSelection
     picture: Tensor
     still: Gaussians

@@ -65,15 +65,8 @@ def draw(
         if offsets is not None:
             drawn_offsets = torch.cat([offsets, offsets.new_zeros(len(focus.still), 2)])
     output = backend.rasterize(
-        drawn.means,
-        drawn.quats,
-        drawn.scales,
-        drawn.opacities,
-        drawn.colors,
-        *camera.beside(means)[:2],
-        width=camera.width,
-        height=camera.height,
-        near=camera.near,
+        drawn,
+        camera.viewport(means),
         background=background,
         screen_offsets=drawn_offsets,
         tiles=None if focus is None else focus.tiles,

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
-from structgstream.kernels.anchor_types import MLPWeights, StructuredGaussians
+from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.environment import background
@@ -63,39 +64,22 @@ class Scene:
         return background(self.environment, camera)
 
     def structured(
-        self, camera: Camera, backend: Backend, *, tiles: Tensor | None = None, seen_from: Tensor | None = None
-    ) -> tuple[StructuredGaussians, Tensor]:
-        """The structured Gaussians that ``camera`` may see, and the visible anchors ``[m]`` they belong to.
+        self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None, seen_from: Tensor | None = None
+    ) -> StructuredGaussians:
+        """The structured Gaussians that ``camera`` may see, or those that may show in ``tiles``.
 
-        With ``tiles`` (``kernels.raster_types``), those that may show in these tiles. They look as from ``seen_from``
-        ``[3]``, which is where the camera is unless given.
+        They look as from ``seen_from`` ``[3]``, which is where the camera is unless given.
         """
-        anchors = self.anchors
-        matrices = camera.beside(anchors.positions)
-        visible = backend.visible_anchors(
-            anchors.positions,
-            anchors.log_offset_scales,
-            anchors.log_base_scales,
-            anchors.offsets,
-            matrices.viewmat,
-            matrices.K,
-            width=camera.width,
-            height=camera.height,
-            near=camera.near,
-            tiles=tiles,
-        )
-        generated = backend.generate_structured(
-            anchors.positions,
-            anchors.log_offset_scales,
-            anchors.log_base_scales,
-            anchors.offsets,
-            self.features,
+        cloud = self.anchors
+        anchors = Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
+        return backend.generate_structured(
+            anchors,
             self.mlps,
-            matrices.center if seen_from is None else seen_from,
-            visible,
+            camera.viewport(cloud.positions),
             distance_input=self.distance_input,
+            tiles=tiles,
+            seen_from=seen_from,
         )
-        return generated, visible
 
     def free_gaussians(self) -> Gaussians:
         """The free Gaussians after activation, with their ids (Note [Ids])."""
@@ -112,19 +96,11 @@ class Scene:
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
         """Everything that can be drawn for ``camera``: structured Gaussians, then free ones."""
-        generated, _ = self.structured(camera, backend)
-        return self.dressed(generated)
+        return self.dressed(self.structured(camera, backend))
 
     def dressed(self, generated: StructuredGaussians) -> Gaussians:
         """``generated`` and the free Gaussians as one drawable set."""
-        structured = Gaussians(
-            means=generated.means,
-            quats=generated.quats,
-            scales=generated.scales,
-            opacities=generated.opacities,
-            colors=generated.colors,
-            ids=generated.ids,
-        )
+        structured = generated.gaussians
         return concatenate(structured, self.free_gaussians()) if len(self.free) else structured
 
     def without_free(self) -> "Scene":

@@ -16,7 +16,7 @@ from torch.nn.functional import interpolate
 
 from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.reference_sweep import SweepView
+from structgstream.kernels.motion_types import SweepView
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.training.residuals import ResidualFloor, box_mean, residual
@@ -157,8 +157,8 @@ def born(
 def _sweep_view(entry: Missing, depths: Tensor, color: CameraColor) -> SweepView:
     camera, index = entry.view.camera, entry.view.index
     colors = (entry.view.colors - color.biases[index]) / color.gains[index].clamp(min=1e-3)
-    matrices = camera.beside(colors)
-    return SweepView(colors, entry.share, depths, matrices.viewmat, matrices.K, camera.near)
+    viewport = camera.viewport(colors)
+    return SweepView(colors, entry.share, depths, viewport.viewmat, viewport.K, camera.near)
 
 
 def _every(step: int, like: Tensor) -> Tensor:

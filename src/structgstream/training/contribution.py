@@ -21,17 +21,8 @@ def contributions(scene: Scene, cameras: Sequence[Camera], *, scale: float, back
     total = scene.anchors.positions.new_zeros(anchors)
     for camera in cameras:
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-        generated, _ = scene.structured(small, backend)
-        viewmat, intrinsics = small.beside(generated.means)[:2]
-        weights = backend.blending_weights(
-            generated.means,
-            generated.quats,
-            generated.scales,
-            generated.opacities,
-            viewmat,
-            intrinsics,
-            torch.ones(small.height, small.width, 2, device=total.device),
-            near=small.near,
-        )[:, 0]
+        generated = scene.structured(small, backend).gaussians
+        maps = torch.ones(small.height, small.width, 2, device=total.device)
+        weights = backend.blending_weights(generated, small.viewport(generated.means), maps)[:, 0]
         total.index_add_(0, generated.ids // scene.anchors.offsets_per_anchor, weights)
     return total / total.mean().clamp(min=1e-12)

@@ -64,8 +64,8 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
     count = 0
     for name in rig.training:
         open_scene = scene_of(state, distance_input=scene.distance_input)
-        structured, visible = open_scene.structured(rig[name], backend)
-        used[visible] |= structured.raw_opacities > 0
+        structured = open_scene.structured(rig[name], backend)
+        used[structured.anchors] |= structured.raw_opacities > 0
         behind = open_scene.background(rig[name])
         image = draw(open_scene.dressed(structured), rig[name], backend, background=behind).image
         count += image.numel()

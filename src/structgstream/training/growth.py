@@ -74,10 +74,10 @@ class OpacityStatistics:
         self.opacity = torch.zeros(anchors, device=device)
         self.visits = torch.zeros(anchors, device=device)
 
-    def add(self, structured: StructuredGaussians, visible: Tensor) -> None:
-        """Add one rendering: the tanh outputs ``[m, K]`` of the visible anchors ``[m]``."""
-        self.opacity[visible] += structured.raw_opacities.clamp(min=0.0).sum(1)
-        self.visits[visible] += 1.0
+    def add(self, structured: StructuredGaussians) -> None:
+        """Add one rendering."""
+        self.opacity[structured.anchors] += structured.raw_opacities.clamp(min=0.0).sum(1)
+        self.visits[structured.anchors] += 1.0
 
 
 @dataclass(frozen=True)

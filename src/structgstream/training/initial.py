@@ -168,7 +168,7 @@ def fit_first_frame(
             disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
             background=torch.rand(3, generator=generator).to(backend.device) if config.random_background else None,
             seen_from=disturbed_center(
-                view.camera.beside(scene.anchors.positions).center,
+                view.camera.viewport(scene.anchors.positions).center,
                 extent / 1.1,
                 iteration,
                 config.iterations,
@@ -186,7 +186,7 @@ def fit_first_frame(
         if screen_gradient is not None:
             with watch.stage("densify"), torch.no_grad():
                 densifier.gradients.add(loss.rendering, screen_gradient)
-                densifier.opacities.add(loss.structured, loss.visible)
+                densifier.opacities.add(loss.structured)
                 if densifier.due(iteration):
                     densifier.apply(scene, parameters, adam, generator, iteration=iteration)
         if densifier.judges(iteration):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.motion_types import Neighbours, ViewFlows
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View
 
@@ -76,19 +77,15 @@ def lifted_motion(
     if config.color_bandwidth > 0.0:
         apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
         affinities = affinities * torch.exp(-0.5 * apart / config.color_bandwidth**2)
-    matrices = [view.camera.beside(centers) for view in views]
-    found = backend.lift(
-        centers,
+    viewports = [view.camera.viewport(centers) for view in views]
+    seen = ViewFlows(
         evidence.weights,
         evidence.flows,
-        torch.stack([m.viewmat for m in matrices]),
-        torch.stack([m.K for m in matrices]),
-        centers.new_tensor([view.camera.near for view in views]),
-        neighbours,
-        affinities,
-        priors,
-        share=config.inlier_share,
+        torch.stack([viewport.viewmat for viewport in viewports]),
+        torch.stack([viewport.K for viewport in viewports]),
+        centers.new_tensor([viewport.near for viewport in viewports]),
     )
+    found = backend.lift(centers, seen, Neighbours(neighbours, affinities), priors, share=config.inlier_share)
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
     return MotionStart(displacements, lifted)

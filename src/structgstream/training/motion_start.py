@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import pixels_of_tiles
 from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 from structgstream.training.flow_maps import flow_map
@@ -137,7 +136,7 @@ def corrected(
             gaussians = baked.gaussians(view.camera, backend)
             image = as_recorded(focus.picture, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-            inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)
+            inside = focus.tiles.pixels()
             # Outside the tiles nothing was drawn: there the picture takes the place of the rendering.
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)

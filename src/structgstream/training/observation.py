@@ -59,15 +59,7 @@ def gathered(
         still: others, that hide or are hidden and are not told of.
     """
     drawn = gaussians if still is None else concatenate(gaussians, still)
-    found = backend.blending_weights(
-        drawn.means,
-        drawn.quats,
-        drawn.scales,
-        drawn.opacities,
-        *camera.beside(drawn.means)[:2],
-        maps,
-        near=camera.near,
-    )
+    found = backend.blending_weights(drawn, camera.viewport(drawn.means), maps)
     sums = found.new_zeros(slots_of(scene), maps.shape[-1])
     sums[gaussians.ids] = found[: len(gaussians)]
     return sums

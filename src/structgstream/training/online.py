@@ -17,7 +17,7 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import Backend, without_waiting
+from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
@@ -215,7 +215,7 @@ def fit_next_frame(
         return fitted(backend)
     # The host runs ahead of a GPU as long as no iteration waits for it.
     return with_enough_room(
-        lambda budget: fitted(without_waiting(backend, budget)),
+        lambda budget: fitted(nonblocking(backend, budget)),
         capacity=max(1 << 18, 8 * slots_of(scene)),
         device=backend.device,
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles_of
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
@@ -85,15 +85,15 @@ def _focus(
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
     tiles = reached_tiles(reach, shown[in_motion.ids], camera, config.margin_pixels)
-    if not tiles.any():
+    if not tiles.mask.any():
         return None
     if not config.tiles:
-        tiles = torch.ones_like(tiles)
+        tiles = replace(tiles, mask=torch.ones_like(tiles.mask))
     # The loss looks ten pixels beyond a tile: a ring of tiles around them is drawn once and stays as it is.
-    ring = torch.nn.functional.max_pool2d(tiles[None].float(), 3, stride=1, padding=1)[0] > 0
-    structured, _ = still.structured(camera, backend, tiles=ring)
-    at_rest = still.dressed(structured)
-    nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.device))
+    around = torch.nn.functional.max_pool2d(tiles.mask[None].float(), 3, stride=1, padding=1)[0] > 0
+    ring = replace(tiles, mask=around)
+    at_rest = still.dressed(still.structured(camera, backend, tiles=ring))
+    nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=around.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
     drawn, behind = concatenate(in_motion, at_rest), still.background(camera)
     rendering = draw(drawn, camera, backend, focus=Focus(ring, empty, nothing), background=behind)
@@ -101,15 +101,15 @@ def _focus(
     return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
 
 
-def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> Tensor:
-    """Mask of the tiles that drawn Gaussians of the mask ``shown`` reach, or could within ``margin_pixels``.
+def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
+    """The tiles that drawn Gaussians of the mask ``shown`` reach, or could within ``margin_pixels``.
 
     Two standard deviations of a Gaussian count: what lies beyond hardly shows.
     """
     rows, columns = tiles_of(camera.width, camera.height)
     drawn = shown & (rendering.radii > 0)
     means = rendering.gaussians.means[drawn]
-    viewmat, K, _ = camera.beside(means)
+    viewmat, K = camera.viewport(means)[:2]
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     centers = (points @ K.T)[:, :2] / points[:, 2:]
     reach = 0.6 * rendering.radii[drawn, None] + margin_pixels
@@ -124,4 +124,5 @@ def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pi
     one = torch.ones(len(low), device=centers.device)
     for x, y, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
         corners.index_add_(0, y[:, 1] * (columns + 1) + x[:, 0], sign * one)
-    return corners.reshape(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns] > 0.5
+    counts = corners.reshape(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns]
+    return TileSelection(counts > 0.5, camera.width, camera.height)

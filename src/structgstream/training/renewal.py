@@ -10,7 +10,6 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import pixels_of_tiles
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
@@ -136,7 +135,7 @@ def _missing_of(
             onto = replace(focus, picture=focus.picture.clone())
             gaussians, behind = moving.gaussians(view.camera, backend), moving.background(view.camera)
             image = draw(gaussians, view.camera, backend, focus=onto, background=behind).image
-        inside = pixels_of_tiles(focus.tiles, view.camera.width, view.camera.height)[..., None]
+        inside = focus.tiles.pixels()[..., None]
         picture = torch.where(inside, as_recorded(image, moving.camera_color, view.index), picture)
     return missing_in(picture.clamp(0.0, 1.0), view, floor=floor, config=config)
 
@@ -167,7 +166,7 @@ def _depths(parts: Sequence[Scene], camera: Camera, backend: Backend) -> Tensor:
     """Mean depth along z ``[h, w]`` of what a camera sees of scenes together; infinite where little is."""
     first, second = (part.gaussians(camera, backend) for part in parts)
     gaussians = concatenate(first, second)
-    viewmat = camera.beside(gaussians.means).viewmat
+    viewmat = camera.viewport(gaussians.means).viewmat
     z = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
     rendering = draw(replace(gaussians, colors=z[:, None].expand(-1, 3).contiguous()), camera, backend)
     depth = rendering.image[..., 0] / rendering.alpha.clamp(min=LEAST_COVERAGE)

@@ -97,7 +97,7 @@ def pixel_size(positions: Tensor, rig: CameraRig) -> float:
     """
     sizes = []
     for name in rig.training:
-        viewmat, K, _ = rig[name].beside(positions)
+        viewmat, K = rig[name].viewport(positions)[:2]
         points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]
         pixels = (points @ K.T)[:, :2] / points[:, 2:]
         size = pixels.new_tensor([rig[name].width, rig[name].height])

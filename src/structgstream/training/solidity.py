@@ -6,7 +6,7 @@ other. Its depth tells: along a ray it is spread. (Deviation of depth along a ra
 distortion loss of Mip-NeRF 360, Barron et al., CVPR 2022.)
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -46,20 +46,10 @@ def depth_spread(gaussians: Gaussians, camera: Camera, *, scale: float, backend:
     covered by more than :data:`COVERED`. Drawn with the "colours" z, z^2 and 1 this is one more picture.
     """
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    viewmat, intrinsics = small.beside(gaussians.means)[:2]
-    depths = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
-    image = backend.rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        torch.stack([depths, depths.square(), torch.ones_like(depths)], dim=1),
-        viewmat,
-        intrinsics,
-        width=small.width,
-        height=small.height,
-        near=small.near,
-    ).image
+    viewport = small.viewport(gaussians.means)
+    depths = gaussians.means @ viewport.viewmat[2, :3] + viewport.viewmat[2, 3]
+    moments = torch.stack([depths, depths.square(), torch.ones_like(depths)], dim=1)
+    image = backend.rasterize(replace(gaussians, colors=moments), viewport).image
     first, second, coverage = image.unbind(-1)
     covered = coverage.detach() > COVERED
     divisor = coverage.clamp(min=COVERED)  # Not NaN where nothing is drawn, though that does not count.

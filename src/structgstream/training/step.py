@@ -11,7 +11,6 @@ from torch import Tensor
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import pixels_of_tiles
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
@@ -32,7 +31,6 @@ class ViewLoss:
     gains: Tensor
     biases: Tensor
     structured: StructuredGaussians
-    visible: Tensor
     focus: Focus | None
 
     @property
@@ -46,7 +44,7 @@ class ViewLoss:
             squares = (self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square()
             if self.focus is None:
                 return squares.mean()
-            inside = pixels_of_tiles(self.focus.tiles, view.camera.width, view.camera.height)[..., None].to(squares)
+            inside = self.focus.tiles.pixels()[..., None].to(squares)
             return (squares * inside).sum() / (3.0 * inside.sum())
 
 
@@ -74,7 +72,7 @@ def view_loss(
     """
     with watch.stage("generate"):
         tiles = None if focus is None else focus.tiles
-        structured, visible = scene.structured(view.camera, backend, tiles=tiles, seen_from=seen_from)
+        structured = scene.structured(view.camera, backend, tiles=tiles, seen_from=seen_from)
         calm = scene.dressed(structured)
         gaussians = calm if disturbed is None else disturbed(calm)
     with watch.stage("rasterise"):
@@ -103,7 +101,7 @@ def view_loss(
         with watch.stage("rasterise"):
             terms["depth_spread"] = depth_spread(calm, view.camera, scale=spread_scale, backend=backend)
             total = total + spread_weight * terms["depth_spread"]
-    return ViewLoss(total, terms, rendering, gains, biases, structured, visible, focus)
+    return ViewLoss(total, terms, rendering, gains, biases, structured, focus)
 
 
 def gradients_of(

@@ -87,9 +87,9 @@ def point_colors(points: Tensor, views: list[View]) -> Tensor:
     seen = points.new_full((len(views), points.shape[0], 3), float("nan"))
     for row, view in enumerate(views):
         camera = view.camera
-        matrices = camera.beside(points)
-        local = points @ matrices.viewmat[:3, :3].T + matrices.viewmat[:3, 3]
-        pixels = (local @ matrices.K.T)[:, :2] / local[:, 2:].clamp(min=camera.near)
+        viewport = camera.viewport(points)
+        local = points @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]
+        pixels = (local @ viewport.K.T)[:, :2] / local[:, 2:].clamp(min=camera.near)
         size = pixels.new_tensor([camera.width, camera.height])
         shown = (local[:, 2] > camera.near) & (pixels >= 0).all(1) & (pixels < size).all(1)
         columns, rows = pixels[shown].long().unbind(1)

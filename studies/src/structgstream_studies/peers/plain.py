@@ -111,7 +111,7 @@ class PlainGaussians:
             quats=self.quats,
             scales=self.log_scales.exp(),
             opacities=self.logit_opacities.sigmoid(),
-            colors=self.colors(camera.beside(self.means).center, degree=degree),
+            colors=self.colors(camera.viewport(self.means).center, degree=degree),
             ids=torch.arange(len(self), device=self.means.device),
         )
 
