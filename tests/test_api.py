@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import structgstream
+from small_presets import QUICK
 from structgstream.cli import main
 from structgstream.data.clip import bundled_clip_path
 from structgstream.errors import ConfigError, StorageError, StreamError
@@ -18,15 +19,9 @@ from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import read_log
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import BackendName, select_backend
-from structgstream.presets import TINY
 
 CLIP = bundled_clip_path()
 BACKEND: BackendName = "cpu" if native_reason() is None else "reference"
-QUICK = replace(
-    TINY,
-    initial=replace(TINY.initial, iterations=3),
-    online=replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1)),
-)
 PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": BACKEND}
 
 

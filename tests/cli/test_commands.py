@@ -8,12 +8,14 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
 import pytest
 
 from drawn import pixels_of
+from small_presets import few_points
 from structgstream import recorder
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
@@ -27,6 +29,12 @@ DEVICE = "cpu" if native_reason() is None else "reference"
 SMALL = ["--frames", "3", "--scale", "0.25"]
 QUICK = ["--preset", "tiny", "--device", DEVICE, "--initial.iterations", "3", "--online.iterations", "2"]
 QUICK += ["--online.patching.iteration", "1"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_presets() -> Iterator[None]:
+    with few_points("tiny", "paper-meetroom"):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ablate`` and ``compare`` on the bundled clip, and what they say when something is wrong."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import cv2
 import pytest
 from rich.console import Console
 
+from small_presets import few_points
 from structgstream.cli import main
 from structgstream.cli.experiment import Display, print_sheet
 from structgstream.cli.options import resolved_config
@@ -54,6 +55,12 @@ def contents(folder: Path) -> dict[str, int]:
     """When each stream, log and result was written."""
     files = [path for name in ("first", "streams", "results") for path in (folder / name).iterdir()]
     return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in files}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_presets() -> Iterator[None]:
+    with few_points("tiny"):
+        yield
 
 
 @pytest.fixture(scope="module")
