@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import torch
 
+from backends import quickest_backend
 from peers.captures import moving_capture
-from structgstream.kernels.backend import reference_backend
 from structgstream.peers.additions import AdditionsConfig, spawned_at
 from structgstream.peers.gaussians import GaussiansConfig, fit_gaussians, initial_gaussians, point_colors
 from structgstream.peers.hash_grid import GridConfig
@@ -18,7 +18,7 @@ from structgstream.scene.render import render
 from structgstream.training.result import Step
 from structgstream.training.views import training_views
 
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 CAPTURE = moving_capture(1)
 POINTS = torch.from_numpy(CAPTURE.points)
 CONFIG: GaussiansConfig = TINY_METHODS["3dgs"].config

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from backends import quickest_backend
 from peers.captures import Capture, Watched, moving_capture
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.records import scanned
 from structgstream.errors import ConfigError, StorageError, StreamError
-from structgstream.kernels.backend import reference_backend
 from structgstream.peers.container import is_peer_file
 from structgstream.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream.peers.session import PeerSession
@@ -21,7 +21,7 @@ from structgstream.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig
 from structgstream.scene.render import render
 from structgstream.session import FrameReport
 
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 NAMES = list(TINY_METHODS)
 
 
