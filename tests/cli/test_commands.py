@@ -324,7 +324,7 @@ def test_the_presets_named_in_help_are_those_there_are(capsys: pytest.CaptureFix
 
 
 def test_exit_status_of_the_program(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "structgstream", "inspect", str(tmp_path / "no.sgs")]
+    command = [sys.executable, "-m", "structgstream", "export", str(tmp_path / "no.sgs"), "--format", "html"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert result.stderr.count("\n") == 1

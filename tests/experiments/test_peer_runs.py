@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from backends import quickest_backend
-from small_runs import CLIP
+from small_runs import CLIP as LARGER
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.experiments.peer_runs import PEER_TITLES, PeerRun
@@ -20,6 +20,8 @@ from structgstream.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_p
 from structgstream.peers.threedgs import ThreeDGS
 
 BACKEND = quickest_backend()
+CLIP = replace(LARGER, scale=0.125)
+"""Peers take every point that is found, in every frame."""
 
 
 def quick_methods() -> Mapping[str, AnyMethod]:
