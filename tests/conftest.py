@@ -1,15 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every test shares: one thread unless it says otherwise, torch's generator restored, the GPU marker."""
+"""What every test shares: one thread unless it says otherwise, torch's generator restored, the GPU marker.
+
+Note [Threads of tests]
+~~~~~~~~~~~~~~~~~~~~~~~
+Pictures here are so small that a second thread costs more than it does, and where several processes test at a time
+threads that wait for each other in a loop take the processors from those that work. So there is one thread, threads
+that a test asks for sleep while they wait, and processes that a test starts do the same. OpenMP reads this when it is
+loaded, which is why nothing above the functions imports torch.
+"""
 
 import os
 from collections.abc import Iterator
 
 import pytest
-import torch
+
+
+def pytest_configure() -> None:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 @pytest.fixture(autouse=True)
 def quiet_randomness() -> Iterator[None]:
+    import torch
+
     state, threads = torch.get_rng_state(), torch.get_num_threads()
     torch.manual_seed(0)
     yield
@@ -18,6 +32,8 @@ def quiet_randomness() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    import torch
+
     if torch.cuda.is_available() or os.environ.get("STRUCTGSTREAM_REQUIRE_CUDA"):
         return
     skip = pytest.mark.skip(reason="no NVIDIA GPU on this machine")

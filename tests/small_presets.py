@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Configurations that take seconds."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
-from structgstream.presets import RIG, TINY
+import pytest
+
+from structgstream.data.plane_sweep import SweepConfig
+from structgstream.presets import PRESETS, RIG, TINY
 
 TINY_RIG = replace(
     RIG,
@@ -17,3 +22,23 @@ TINY_RIG = replace(
     online=replace(RIG.online, iterations=10, patching=replace(RIG.online.patching, iteration=5)),
 )
 """Paper mode as small as the preset tiny: float32, everything fitted in every frame, births by gradients."""
+
+FEW_POINTS = replace(TINY.points, max_points=1_500, sweep_levels=(SweepConfig(width=60, planes=(8, 12)),))
+"""Initial points for pictures of 80x60 pixels, in a tenth of the time that the usual sweeps and their points take."""
+
+QUICK = replace(
+    TINY,
+    points=FEW_POINTS,
+    initial=replace(TINY.initial, iterations=3),
+    online=replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1)),
+)
+"""The preset tiny with next to no iterations."""
+
+
+@contextmanager
+def few_points(*names: str) -> Iterator[None]:
+    """Presets of these names begin with :data:`FEW_POINTS`."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in names:
+            patch.setitem(PRESETS, name, replace(PRESETS[name], points=FEW_POINTS))
+        yield

@@ -10,24 +10,18 @@ import pytest
 import torch
 
 import structgstream
+from backends import QUICKEST
+from small_presets import QUICK
 from structgstream.cli import main
 from structgstream.data.clip import bundled_clip_path
 from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import read_log
-from structgstream.kernels._load import native_reason
-from structgstream.kernels.backend import BackendName, select_backend
-from structgstream.presets import TINY
+from structgstream.kernels.backend import select_backend
 
 CLIP = bundled_clip_path()
-BACKEND: BackendName = "cpu" if native_reason() is None else "reference"
-QUICK = replace(
-    TINY,
-    initial=replace(TINY.initial, iterations=3),
-    online=replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1)),
-)
-PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": BACKEND}
+PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": QUICKEST}
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +40,7 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_bytes_are_those_of_the_command(stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(structgstream.PRESETS, "tiny", QUICK)
     arguments = ["reconstruct", str(CLIP), "-o", str(tmp_path / "command.sgs"), "--preset", "tiny"]
-    assert main([*arguments, "--frames", "2", "--scale", "0.25", "--device", BACKEND]) == 0
+    assert main([*arguments, "--frames", "2", "--scale", "0.25", "--device", QUICKEST]) == 0
     assert stream.read_bytes() == (tmp_path / "command.sgs").read_bytes()
     logs = [read_log(path) for path in (stream, tmp_path / "command.sgs")]
     assert [*logs[0]] == [0, 1]
@@ -74,7 +68,7 @@ def test_a_capture_that_is_open(stream: Path, tmp_path: Path) -> None:
     source = structgstream.open_capture(CLIP, frames=1, scale=0.25)
     with pytest.raises(ConfigError, match="open_capture takes them"):
         structgstream.reconstruct(source, tmp_path / "x.sgs", frames=1)
-    structgstream.reconstruct(source, tmp_path / "x.sgs", preset=QUICK, backend=BACKEND)
+    structgstream.reconstruct(source, tmp_path / "x.sgs", preset=QUICK, backend=QUICKEST)
     ours, theirs = structgstream.open_stream(tmp_path / "x.sgs"), structgstream.open_stream(stream)
     assert torch.equal(ours.scene(0).anchors.positions, theirs.scene(0).anchors.positions)
 
@@ -98,22 +92,22 @@ def test_wrong_wishes_are_told_before_anything_is_written(tmp_path: Path, wishes
 
 
 def test_pictures_are_asked_for_in_the_units_of_the_capture(stream: Path) -> None:
-    reader, backend = structgstream.open_stream(stream), select_backend(BACKEND)
+    reader, backend = structgstream.open_stream(stream), select_backend(QUICKEST)
     header, name = reader.header, reader.header.rig.testing[0]
     assert not torch.equal(header.camera(name).viewmat, header.rig[name].viewmat)
     for index in (1, 0):
         wanted = rendered(
             structgstream.open_stream(stream).scene(index), header.similarity.camera(header.rig[name]), backend
         )
-        picture = reader.render(index, name, backend=BACKEND)
+        picture = reader.render(index, name, backend=QUICKEST)
         assert picture.shape == (60, 80, 3)
         assert picture.dtype == np.uint8
         assert np.array_equal(picture, wanted[0])
         assert np.array_equal(picture, reader.render(index, header.rig[name], backend=backend))
     with pytest.raises(ConfigError, match="no camera 'cam77'; it has cam00"):
-        reader.render(0, "cam77", backend=BACKEND)
+        reader.render(0, "cam77", backend=QUICKEST)
     with pytest.raises(StreamError, match="there is no frame 2"):
-        reader.render(2, name, backend=BACKEND)
+        reader.render(2, name, backend=QUICKEST)
 
 
 def test_a_scene_is_decoded_once_for_all_cameras(stream: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,17 +115,17 @@ def test_a_scene_is_decoded_once_for_all_cameras(stream: Path, monkeypatch: pyte
     decoded, scene = [], reader.scene
     monkeypatch.setattr(reader, "scene", lambda index: decoded.append(index) or scene(index))
     for name in [*reader.header.rig][:3]:
-        reader.render(1, name, backend=BACKEND)
+        reader.render(1, name, backend=QUICKEST)
     assert decoded == [1]
 
 
 def test_scores_are_those_of_the_command(stream: Path, tmp_path: Path) -> None:
-    report = structgstream.evaluate(stream, CLIP, metrics="basic", backend=BACKEND)
+    report = structgstream.evaluate(stream, CLIP, metrics="basic", backend=QUICKEST)
     assert isinstance(report, structgstream.Report)
     assert [*report.cameras] == ["cam00"]
     assert all(isinstance(frame, structgstream.FrameScores) and frame.log for frame in report.frames)
     opened = structgstream.open_capture(CLIP, frames=2, scale=0.25)
-    same = structgstream.evaluate(stream, opened, metrics="basic", backend=BACKEND)
+    same = structgstream.evaluate(stream, opened, metrics="basic", backend=QUICKEST)
     timed = {"render_seconds", "seconds"}
     first, second = ({k: v for k, v in as_json(one)["mean"].items() if k not in timed} for one in (report, same))
     assert first == second
@@ -140,12 +134,12 @@ def test_scores_are_those_of_the_command(stream: Path, tmp_path: Path) -> None:
 def test_exports(stream: Path, tmp_path: Path) -> None:
     page = structgstream.export(stream, tmp_path / "clip.html")
     assert "<structgstream-player" in page.read_text()
-    frame = structgstream.export(stream, tmp_path / "one.spz", frame=1, sh_degree=0, backend=BACKEND)
-    folder = structgstream.export(stream, tmp_path / "all", format="spz", sh_degree=0, backend=BACKEND)
+    frame = structgstream.export(stream, tmp_path / "one.spz", frame=1, sh_degree=0, backend=QUICKEST)
+    folder = structgstream.export(stream, tmp_path / "all", format="spz", sh_degree=0, backend=QUICKEST)
     assert [entry.name for entry in sorted(folder.iterdir())] == ["frame_000000.spz", "frame_000001.spz"]
     assert frame.read_bytes() == (folder / "frame_000001.spz").read_bytes()
     with pytest.raises(ConfigError, match="holds one frame"):
-        structgstream.export(stream, tmp_path / "two.ply", backend=BACKEND)
+        structgstream.export(stream, tmp_path / "two.ply", backend=QUICKEST)
     with pytest.raises(ConfigError, match="a page holds the whole stream"):
         structgstream.export(stream, tmp_path / "x.html", frame=0)
     with pytest.raises(ConfigError, match="give one of them"):

@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 import torch
 
+from backends import quickest_backend
 from small_presets import TINY_RIG
 from structgstream import memory
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.data.prefetch import Prefetch
-from structgstream.errors import BackendError
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import Backend, select_backend
 from structgstream.memory import PeakKind, PeakMeter, resident_bytes
 from structgstream.session import Session
 from worlds import World, moving_world
@@ -139,13 +138,6 @@ class Endless:
         for i in range(start, self.frame_count):
             images = self.world.frames[i % 2].images
             yield MultiViewFrame(i, i / self.fps, {name: image.copy() for name, image in images.items()})
-
-
-def quickest_backend() -> Backend:
-    try:
-        return select_backend("cpu")
-    except BackendError:
-        return select_backend("reference")
 
 
 def held() -> tuple[int, int]:

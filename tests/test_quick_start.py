@@ -3,13 +3,13 @@
 
 import re
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from small_presets import QUICK
 from structgstream.data.clip import bundled_clip_path
-from structgstream.presets import PRESETS, TINY
+from structgstream.presets import PRESETS
 
 README = Path(__file__).parents[1] / "README.md"
 SMALLER = {"frames=20": "frames=2, scale=0.25", "render(19,": "render(1,"}
@@ -25,9 +25,7 @@ def test_the_quick_start_runs(
     for printed, small in SMALLER.items():
         assert code.count(printed) == 1, printed
         code = code.replace(printed, small)
-    online = replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1))
-    quick = replace(TINY, initial=replace(TINY.initial, iterations=3), online=online)
-    monkeypatch.setitem(PRESETS, "compact", quick)
+    monkeypatch.setitem(PRESETS, "compact", QUICK)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "basketball").symlink_to(bundled_clip_path())
     names: dict[str, object] = {}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from backends import quickest_backend
 from small_presets import TINY_RIG
 from streams import same
 from structgstream import session
@@ -20,7 +21,6 @@ from structgstream.codec.scene.bins import FREE_STEPS
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import reference_backend
 from structgstream.presets import COMPACT, PRESETS, StreamConfig
 from structgstream.rate_control import RateConfig
 from structgstream.scene.order import space_order
@@ -78,7 +78,7 @@ class Capture:
 
 
 def run(sink, *, config: StreamConfig = CONFIG, resumed=None, frames: int = FRAMES) -> list[FrameReport]:
-    return list(Session(Capture(frames), sink, config, reference_backend(), resumed=resumed).run())
+    return list(Session(Capture(frames), sink, config, quickest_backend(), resumed=resumed).run())
 
 
 @cache

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from backends import quickest_backend
 from small_presets import TINY_RIG
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import reference_backend
 from structgstream.presets import COMPACT
 from structgstream.session import FrameReport, Session
 from worlds import moving_world
@@ -58,7 +58,7 @@ class Capture:
 
 
 def run(sink, *, resumed=None, pictures: list[MultiViewFrame] = WORLD.frames) -> list[FrameReport]:
-    return list(Session(Capture(pictures), sink, CONFIG, reference_backend(), resumed=resumed).run())
+    return list(Session(Capture(pictures), sink, CONFIG, quickest_backend(), resumed=resumed).run())
 
 
 @cache

@@ -8,25 +8,32 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
 import pytest
 
+from backends import QUICKEST
 from drawn import pixels_of
+from small_presets import few_points
 from structgstream import recorder
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.data.clip import bundled_clip_path
-from structgstream.kernels._load import native_reason
 from structgstream.session import FrameReport
 
 CLIP = str(bundled_clip_path())
-DEVICE = "cpu" if native_reason() is None else "reference"
 SMALL = ["--frames", "3", "--scale", "0.25"]
-QUICK = ["--preset", "tiny", "--device", DEVICE, "--initial.iterations", "3", "--online.iterations", "2"]
+QUICK = ["--preset", "tiny", "--device", QUICKEST, "--initial.iterations", "3", "--online.iterations", "2"]
 QUICK += ["--online.patching.iteration", "1"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_presets() -> Iterator[None]:
+    with few_points("tiny", "paper-meetroom"):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +67,7 @@ def test_reconstruct_writes_the_log_beside_the_stream(stream: Path) -> None:
 def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     numbers, folder = tmp_path / "numbers.json", tmp_path / "report"
     arguments = ["evaluate", str(stream), CLIP, "--json", str(numbers), "--report", str(folder)]
-    assert main([*arguments, "--device", DEVICE]) == 0
+    assert main([*arguments, "--device", QUICKEST]) == 0
     content = json.loads(numbers.read_text())
     assert list(content["cameras"]) == ["cam00"]
     assert len(content["frames"]) == 3
@@ -68,7 +75,7 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.Ca
     assert content["mean"]["seconds"] > 0
     assert content["stream"]["total_bytes"] == stream.stat().st_size
     assert content["stream"]["metadata"]["scale"] == 0.25
-    assert content["environment"]["backend"] == DEVICE
+    assert content["environment"]["backend"] == QUICKEST
     assert {entry.name for entry in folder.iterdir()} == {"report.json", "over_time.png", "contact_sheet.png"}
     assert json.loads((folder / "report.json").read_text())["mean"]["psnr"] == content["mean"]["psnr"]
     table = capsys.readouterr().out
@@ -83,7 +90,7 @@ def test_evaluate_says_what_it_could_not_measure(
 ) -> None:
     monkeypatch.delenv("STRUCTGSTREAM_LPIPS_WEIGHTS", raising=False)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    evaluate = ["evaluate", str(stream), CLIP, "--device", DEVICE]
+    evaluate = ["evaluate", str(stream), CLIP, "--device", QUICKEST]
     assert main(evaluate) == 0
     table = " ".join(capsys.readouterr().out.split())
     assert "lpips_alex, t_lpips: the weights of AlexNet were not found" in table
@@ -132,7 +139,7 @@ def test_inspect_of_a_cut_file_says_so(stream: Path, tmp_path: Path, capsys: pyt
 
 
 def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> None:
-    base = ["render", str(stream), "--device", DEVICE, "-o"]
+    base = ["render", str(stream), "--device", QUICKEST, "-o"]
     assert main([*base, str(tmp_path / "v.mp4")]) == 0
     with av.open(str(tmp_path / "v.mp4")) as container:
         assert len(list(container.decode(video=0))) == 3
@@ -146,14 +153,14 @@ def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> 
 def test_render_a_path_beside_the_stream(stream: Path, tmp_path: Path, path: str) -> None:
     copy = tmp_path / "ball.sgs"
     shutil.copy(stream, copy)
-    assert main(["render", str(copy), "--path", path, "--seconds", "0.2", "--device", DEVICE]) == 0
+    assert main(["render", str(copy), "--path", path, "--seconds", "0.2", "--device", QUICKEST]) == 0
     with av.open(str(tmp_path / f"ball-{path}.mp4")) as container:
         assert len(list(container.decode(video=0))) == 6
 
 
 def test_render_beside_the_truth(stream: Path, tmp_path: Path) -> None:
     out = tmp_path / "side.png"
-    arguments = ["render", str(stream), CLIP, "--compare", "--frame", "2", "-o", str(out), "--device", DEVICE]
+    arguments = ["render", str(stream), CLIP, "--compare", "--frame", "2", "-o", str(out), "--device", QUICKEST]
     assert main(arguments) == 0
     assert pixels_of(out).shape == (60, 3 * 80 + 8, 3)
 
@@ -172,7 +179,7 @@ def test_render_beside_the_truth(stream: Path, tmp_path: Path) -> None:
 def test_render_refuses_what_does_not_go_together(
     stream: Path, extra: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert words in error_of(["render", str(stream), *extra, "--device", DEVICE], capsys, status=2)
+    assert words in error_of(["render", str(stream), *extra, "--device", QUICKEST], capsys, status=2)
 
 
 def test_demo_leaves_everything_to_look_at(
@@ -317,7 +324,7 @@ def test_the_presets_named_in_help_are_those_there_are(capsys: pytest.CaptureFix
 
 
 def test_exit_status_of_the_program(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "structgstream", "inspect", str(tmp_path / "no.sgs")]
+    command = [sys.executable, "-m", "structgstream", "export", str(tmp_path / "no.sgs"), "--format", "html"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert result.stderr.count("\n") == 1

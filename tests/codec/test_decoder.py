@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from streams import header_for, same, small_scene
 from structgstream.codec.container.blocks import packed_block
 from structgstream.codec.container.payload import packet_of
@@ -48,7 +49,7 @@ def test_a_packet_whose_sizes_contradict_the_header() -> None:
         SceneDecoder(HEADER).decode(packet)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.integers(0, len(PAYLOAD) - 1), st.integers(1, 255), st.integers(0, len(PAYLOAD)))
 def test_a_mangled_packet_gives_a_scene_or_one_kind_of_error(at: int, xor: int, end: int) -> None:
     """Mostly within heads and shapes, where it matters: the checksum is out of the way here."""

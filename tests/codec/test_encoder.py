@@ -3,9 +3,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from rigs import random_scene
 from streams import header_for, moved, same, small_scene
 from structgstream.codec.container.payload import packet_of
@@ -20,7 +21,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
 NAMES = [row.name for row in STATE_TABLE]
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     st.integers(0, 12),
     st.integers(0, 6),

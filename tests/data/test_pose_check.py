@@ -10,17 +10,20 @@ from planes import room_frame, room_rig
 from structgstream.cameras import CameraRig
 from structgstream.data.clip import bundled_clip
 from structgstream.data.pose_check import check_poses
+from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
+
+CLIP = resized(bundled_clip(), 0.6)
 
 
 @pytest.fixture(scope="module")
 def clip_frame() -> MultiViewFrame:
-    return next(iter(bundled_clip().frames()))
+    return next(iter(CLIP.frames()))
 
 
 def test_right_poses_pass_with_room_to_spare(clip_frame: MultiViewFrame) -> None:
-    check = check_poses(clip_frame, bundled_clip().rig)
+    check = check_poses(clip_frame, CLIP.rig)
     assert check.conclusive
     assert check.share_violating < 0.1
     assert check.median_epipolar_error_pixels < 0.7
@@ -36,7 +39,7 @@ def inverted(rig: CameraRig) -> CameraRig:
 
 def test_camera_to_world_given_as_world_to_camera_is_named(clip_frame: MultiViewFrame) -> None:
     with pytest.raises(CalibrationError, match="camera-to-world matrices given as world-to-camera"):
-        check_poses(clip_frame, inverted(bundled_clip().rig))
+        check_poses(clip_frame, inverted(CLIP.rig))
 
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -44,16 +47,16 @@ FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 def test_opengl_axes_are_named(clip_frame: MultiViewFrame) -> None:
     with pytest.raises(CalibrationError, match="look like OpenGL axes"):
-        check_poses(clip_frame, changed(bundled_clip().rig, lambda viewmat: FLIP @ viewmat))
+        check_poses(clip_frame, changed(CLIP.rig, lambda viewmat: FLIP @ viewmat))
 
 
 def test_camera_to_world_with_opengl_axes_is_named(clip_frame: MultiViewFrame) -> None:
     with pytest.raises(CalibrationError, match="camera-to-world matrices with OpenGL axes"):
-        check_poses(clip_frame, changed(bundled_clip().rig, lambda viewmat: torch.linalg.inv(viewmat) @ FLIP))
+        check_poses(clip_frame, changed(CLIP.rig, lambda viewmat: torch.linalg.inv(viewmat) @ FLIP))
 
 
 def test_pictures_of_the_wrong_cameras_are_refused_without_a_wrong_guess(clip_frame: MultiViewFrame) -> None:
-    rig = bundled_clip().rig
+    rig = CLIP.rig
     names = list(rig)
     mixed = {name: clip_frame.images[names[(i * 3 + 1) % len(names)]] for i, name in enumerate(names)}
     with pytest.raises(CalibrationError, match="each camera's own pictures"):
@@ -77,7 +80,7 @@ def test_inverted_poses_of_a_flat_array_look_backwards() -> None:
 
 
 def test_held_out_pictures_stay_unread(clip_frame: MultiViewFrame) -> None:
-    rig = bundled_clip().rig
+    rig = CLIP.rig
     training = {name: clip_frame.images[name] for name in rig.training}  # A held-out name would be a KeyError.
     check_poses(MultiViewFrame(0, 0.0, training), rig)
     with pytest.raises(CalibrationError):
@@ -85,6 +88,6 @@ def test_held_out_pictures_stay_unread(clip_frame: MultiViewFrame) -> None:
 
 
 def test_too_little_to_judge_by_refuses_nothing() -> None:
-    rig = bundled_clip().rig
-    blank = {name: np.full((240, 320, 3), 128, dtype=np.uint8) for name in rig}
+    rig = CLIP.rig
+    blank = {name: np.full((144, 192, 3), 128, dtype=np.uint8) for name in rig}
     assert not check_poses(MultiViewFrame(0, 0.0, blank), rig).conclusive

@@ -7,31 +7,17 @@ import pytest
 import torch
 
 from rigs import arc_rig, random_scene
+from spheres import fibonacci_sphere
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.environment import background, environment, pixel_directions
-from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.render import draw, render
 
 BACKEND, CAMERA = reference_backend(), arc_rig()["cam01"]
 
 
-def sphere(count: int = 40_000) -> torch.Tensor:
-    """Directions that cover the sphere evenly (Fibonacci's lattice)."""
-    z = 1.0 - (2.0 * torch.arange(count, dtype=torch.float64) + 1.0) / count
-    angle = torch.pi * (3.0 - 5.0**0.5) * torch.arange(count, dtype=torch.float64)
-    ring = (1.0 - z * z).sqrt()
-    return torch.stack([ring * angle.cos(), ring * angle.sin(), z], dim=1)
-
-
-def test_the_harmonics_are_orthonormal() -> None:
-    basis = sh_basis(sphere(), 2)
-    products = basis.T @ basis * (4.0 * torch.pi / len(basis))
-    torch.testing.assert_close(products, torch.eye(9, dtype=torch.float64), atol=1e-6, rtol=0)
-
-
 @pytest.mark.parametrize("rows", [1, 4, 9])
 def test_colours_are_within_bounds_and_constant_without_coefficients(rows: int) -> None:
-    directions = sphere(50)
+    directions = fibonacci_sphere(50)
     none = torch.zeros(rows, 3, dtype=torch.float64)
     assert torch.equal(environment(none, directions), torch.full((50, 3), 0.5, dtype=torch.float64))
     colors = environment(none + 9.0, directions)

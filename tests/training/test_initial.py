@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from backends import quickest_backend
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.state import state_of
 from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.growth import GrowthConfig
@@ -24,16 +26,17 @@ QUICK = InitialConfig(
 )
 
 
-def fit(world, *, config=QUICK, frame=None, points=None):
+def fit(world, *, config=QUICK, frame=None, points=None, backend: Backend | None = None):
     points = world.scene.anchors.positions if points is None else points
     return fit_first_frame(
-        frame or world.frames[0], world.rig, points, config=config, backend=reference_backend(), seed=0
+        frame or world.frames[0], world.rig, points, config=config, backend=backend or quickest_backend(), seed=0
     )
 
 
-def test_a_held_out_camera_is_reproduced() -> None:
+@pytest.mark.parametrize("backend", [quickest_backend, reference_backend])
+def test_a_held_out_camera_is_reproduced(backend: Callable[[], Backend]) -> None:
     world = moving_world(1)
-    result = fit(world)
+    result = fit(world, backend=backend())
     black = psnr(np.zeros_like(world.frames[0].images["cam00"]), world.frames[0].images["cam00"])
     assert psnr(rendered(result.scene, world, "cam00"), world.frames[0].images["cam00"]) > black + 6.0
     assert result.train_psnr > black + 8.0

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames after the first, in a world whose motion is known."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
-from structgstream.kernels.backend import reference_backend
+from backends import quickest_backend
+from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
 from structgstream.training.motion import MotionConfig
@@ -22,23 +24,24 @@ QUICK = OnlineConfig(
 )
 
 
-def fit(scene, world, index, *, config=QUICK, seed=0, on_step=None):
+def fit(scene, world, index, *, config=QUICK, seed=0, on_step=None, backend: Backend | None = None):
     return fit_next_frame(
         scene,
         world.frames[index],
         world.rig,
         config=config,
-        backend=reference_backend(),
+        backend=backend or quickest_backend(),
         seed=seed,
         on_step=on_step,
     )
 
 
-def test_anchors_follow_motion() -> None:
+@pytest.mark.parametrize("backend", [quickest_backend, reference_backend])
+def test_anchors_follow_motion(backend: Callable[[], Backend]) -> None:
     world = moving_world(2)
     truth = world.frames[1].images["cam00"]  # Held out.
     before = psnr(rendered(world.scene, world, "cam00"), truth)
-    result = fit(world.scene, world, 1, config=without_patching(QUICK))
+    result = fit(world.scene, world, 1, config=without_patching(QUICK), backend=backend())
     after = psnr(rendered(result.scene, world, "cam00"), truth)
     assert after > before + 3.0
     moved = (result.scene.anchors.positions - world.scene.anchors.positions).mean(0)
@@ -135,7 +138,7 @@ def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None):
         world.frames[index],
         world.rig,
         config=config,
-        backend=reference_backend(),
+        backend=quickest_backend(),
         seed=seed,
         before=world.frames[index - 1],
         older=older,

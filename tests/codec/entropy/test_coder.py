@@ -3,9 +3,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from structgstream.codec.entropy.bits import fixed, numbers_of, packed_bits
 from structgstream.codec.entropy.coder import Decoder, Encoder, Tables, varint
 from structgstream.errors import StreamError
@@ -22,7 +23,7 @@ def reader(fields: dict[str, bytes]) -> Decoder:
     return Decoder(Tables(), fields, where="Packet 0")  # type: ignore[arg-type]
 
 
-@settings(deadline=None)
+@examples(100)
 @given(st.lists(NATURAL, max_size=30), st.lists(RESIDUAL, max_size=30))
 def test_what_is_written_is_read(naturals: list[int], residuals: list[int]) -> None:
     writer, n = Encoder(Tables()), np.array(naturals, np.int64)
@@ -82,7 +83,7 @@ def test_tables_persist() -> None:
     assert len(again.fields["one"]) < len(first.fields["one"]), "the table is known by then"
 
 
-@settings(deadline=None)
+@examples(100)
 @given(st.lists(st.tuples(st.integers(0, 56), st.integers(0, 2**56 - 1)), max_size=40))
 def test_numbers_are_found_at_any_bit(pairs: list[tuple[int, int]]) -> None:
     values = [value % (1 << width) for width, value in pairs]

@@ -3,9 +3,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from structgstream.codec.entropy import reference_decisions as reference
 from structgstream.codec.entropy.decisions import code_activity, code_numbers, code_residuals
 from structgstream.codec.entropy.models import (
@@ -38,7 +39,7 @@ def contexts_for(values: list[int]) -> np.ndarray:
 
 
 @pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.lists(NUMBER, max_size=40), st.booleans())
 def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> None:
     values = [value & 1 for value in values] if flags else values
@@ -56,7 +57,7 @@ def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> 
 
 
 @pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150))
 def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
     g = np.random.default_rng(seed)

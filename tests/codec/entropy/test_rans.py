@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from structgstream.codec.entropy import rans
 from structgstream.codec.entropy.rans import LANES, decode, encode, has_native, lanes_for, section_bytes
 from structgstream.codec.entropy.tables import FrequencyTables, normalised
@@ -39,7 +40,7 @@ def entropy_bytes(counts: np.ndarray) -> float:
 
 
 @both
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 200),
@@ -56,7 +57,7 @@ def test_symbols_come_back(native, seed, count, contexts, alphabet, lanes, even)
 
 
 @both
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(st.data())
 def test_any_table_codes_what_it_has_a_frequency_for(native, data: st.DataObject) -> None:
     weights = data.draw(st.lists(st.integers(0, 2**20), min_size=1, max_size=32).filter(any))
@@ -200,7 +201,7 @@ def test_every_cut_and_everything_behind_it_is_refused(native) -> None:
 
 
 @both
-@settings(deadline=None, max_examples=150)
+@examples(150)
 @given(
     count=st.integers(1, 80),
     lanes=st.sampled_from(range(3)),
@@ -218,7 +219,7 @@ def test_arbitrary_states_and_words_never_do_harm(native, count: int, lanes: int
 
 
 @both
-@settings(deadline=None, max_examples=150)
+@examples(150)
 @given(st.binary(max_size=60))
 def test_arbitrary_bytes_are_refused_or_decode(native, data: bytes) -> None:
     _, context, tables = drawn(6, count=20)

@@ -4,9 +4,10 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from structgstream.codec.entropy.bits import fixed, packed_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
 from structgstream.codec.entropy.table_choice import chosen_tables
@@ -121,7 +122,7 @@ def test_levels_are_floating_point_numbers(precision: int) -> None:
 # Table sets.
 
 
-@settings(deadline=None, max_examples=80)
+@examples(80)
 @given(st.data())
 def test_chosen_tables_come_back_and_can_code_what_was_counted(data: st.DataObject) -> None:
     contexts, alphabet = data.draw(st.integers(1, 6)), data.draw(st.integers(2, 32))
@@ -136,7 +137,7 @@ def test_chosen_tables_come_back_and_can_code_what_was_counted(data: st.DataObje
     assert (tables.rows[counts > 0] > 0).all()
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(st.integers(0, 2**31), st.integers(1, 5000))
 def test_a_choice_is_never_longer_than_keeping_what_there_is(seed: int, count: int) -> None:
     counts = laplace_counts(count=count, contexts=8, low=0.2, high=2, seed=seed)
@@ -252,7 +253,7 @@ def test_the_family_written_from_the_document_agrees(alphabet: int) -> None:
     assert rows.tolist() == [plain_geometric(g, alphabet) for g in range(256)]
 
 
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(st.integers(0, 2**31), st.integers(2, 32), st.integers(1, 7))
 def test_a_decoder_written_from_the_document_agrees(seed: int, alphabet: int, size: int) -> None:
     g = np.random.default_rng(seed)
@@ -297,7 +298,7 @@ def test_a_damaged_set_is_refused(data: bytes, problem: str) -> None:
         decoded_tables(data, FrequencyTables(np.array([[3072, 512, 512, 0]], np.uint16)))
 
 
-@settings(deadline=None, max_examples=200)
+@examples(200)
 @given(st.binary(max_size=60))
 def test_arbitrary_bytes_are_refused_or_are_tables(data: bytes) -> None:
     with suppress(StreamError):

@@ -4,9 +4,10 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from rigs import random_scene
 from streams import STEPS
 from structgstream.codec.scene.bins import LARGEST, anchor_fields, binned, valued
@@ -35,7 +36,7 @@ def test_bins_of_the_values_of_bins_are_the_same_bins(dynamic: frozenset[FieldNa
         assert ((values[name] - state[name]).abs() <= 0.5001 * AWKWARD[name]).all(), name
 
 
-@settings(deadline=None)
+@examples(100)
 @given(st.integers(-LARGEST, LARGEST), st.floats(2.0**-64, 2.0**64, width=32))
 def test_a_value_is_one_product_of_two_float32(bin: int, step: float) -> None:
     """What any decoder computes: two float32, one multiplication, rounded to nearest."""

@@ -10,9 +10,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from rigs import random_scene
 from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 from structgstream.codec.container.blocks import coded_fields
@@ -116,7 +117,7 @@ def test_a_reader_sees_what_the_encoder_says(dynamic: frozenset[FieldName], anch
         assert torch.equal(state_of(seen[-1])[name], state_of(seen[0])[name]), name
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.lists(st.integers(0, 4), max_size=8))
 def test_frames_in_any_order(order: list[int]) -> None:
     _, data, seen, _ = small()
@@ -326,7 +327,7 @@ def test_every_byte_of_an_init_record_changed_gives_a_decoder_or_one_kind_of_err
     assert header.codec == "compact"
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.data())
 def test_a_mangled_file_gives_scenes_or_one_kind_of_error(data: st.DataObject) -> None:
     _, whole, seen, _ = small()
@@ -345,7 +346,7 @@ def test_a_mangled_file_gives_scenes_or_one_kind_of_error(data: st.DataObject) -
             continue
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.data())
 def test_a_mangled_packet_gives_a_scene_or_one_kind_of_error(data: st.DataObject) -> None:
     header, _, _, packets = small()

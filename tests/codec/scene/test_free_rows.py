@@ -5,9 +5,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.scene import free_rows
@@ -49,7 +50,7 @@ def exchange(after: FreeBins, before: FreeBins, models: tuple[Models, Models] | 
     return back
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(0, 4), st.sampled_from([0.0, 0.5, 1.0])), max_size=6))
 def test_a_life_comes_back(seed: int, frames: list[tuple[int, float]]) -> None:
     """In every frame some die, some change and some are born, several at once, with gaps in their numbers."""

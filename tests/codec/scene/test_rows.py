@@ -3,10 +3,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import documented
+from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.scene.change import Change
@@ -38,7 +39,7 @@ def written(models: Models, residuals: np.ndarray, before: Change) -> tuple[dict
     return NOTHING | writer.fields(), change
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(stories())
 def test_changes_come_back_and_the_documents_say_the_same(frames: list[np.ndarray]) -> None:
     rows = len(frames[0])

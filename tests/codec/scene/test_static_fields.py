@@ -8,9 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from properties import examples
 from streams import small_scene
 from structgstream.codec.entropy.coder import Encoder, Tables, varint
 from structgstream.codec.scene.bins import on_bins
@@ -79,7 +80,7 @@ def test_without_appearance() -> None:
     check({name: value for name, value in fields.items() if not name.startswith("appearance")})
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(st.lists(st.lists(st.integers(-(2**19), 2**19 - 1), min_size=3, max_size=3), max_size=12), st.booleans())
 def test_positions_in_any_order(cells: list[list[int]], ordered: bool) -> None:
     bins = torch.tensor(cells, dtype=torch.int32).reshape(-1, 3)
@@ -262,7 +263,7 @@ def test_every_byte_changed_or_missing_gives_fields_or_one_kind_of_error(name: F
         decoded_fields({**coded, name: coded[name] + b"\0"}, STEPS)
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(st.data())
 def test_any_bytes_give_fields_or_one_kind_of_error(data: st.DataObject) -> None:
     coded = three_anchors()

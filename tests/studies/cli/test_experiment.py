@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ablate`` and ``compare`` on the bundled clip, and what they say when something is wrong."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +9,12 @@ import cv2
 import pytest
 from rich.console import Console
 
+from backends import QUICKEST
+from small_presets import few_points
 from structgstream.cli import main
 from structgstream.cli.options import resolved_config
 from structgstream.data.clip import bundled_clip, bundled_clip_path
 from structgstream.data.wrappers import WithRig
-from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import select_backend
 from structgstream.presets import PRESETS, StreamConfig
 from structgstream_studies.cli.experiment import Display, print_sheet
@@ -26,8 +27,7 @@ from structgstream_studies.experiments.tasks import Variation
 from structgstream_studies.experiments.worker import Task
 
 CLIP = str(bundled_clip_path())
-DEVICE = "cpu" if native_reason() is None else "reference"
-SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", DEVICE, "--jobs", "2"]
+SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", QUICKEST, "--jobs", "2"]
 QUICK = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2"]
 QUICK += ["--online.patching.iteration", "1"]
 
@@ -56,10 +56,16 @@ def contents(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in files}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def quick_presets() -> Iterator[None]:
+    with few_points("tiny"):
+        yield
+
+
 @pytest.fixture(scope="module")
 def ablated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The table of the distance regularisation, of which all but one step was done before."""
-    folder, backend = tmp_path_factory.mktemp("ablate") / "out", select_backend(DEVICE)
+    folder, backend = tmp_path_factory.mktemp("ablate") / "out", select_backend(QUICKEST)
     config, _ = resolved_config(QUICK[1], QUICK[2:], command="ablate", seed=None)
     part = CapturePart(bundled_clip_path(), scale=0.25, frames=2)
     *tasks, last = needed(ablation_runs(["distance"], config, part, frames=2, seeds=(0,), folder=folder))
@@ -127,7 +133,7 @@ def test_wrong_options_are_told_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, extra: list[str], status: int, words: str
 ) -> None:
     out = tmp_path / "out"
-    error = error_of([command, CLIP, "-o", str(out), "--device", DEVICE, *extra], capsys, status=status)
+    error = error_of([command, CLIP, "-o", str(out), "--device", QUICKEST, *extra], capsys, status=status)
     assert words in error
     assert not out.exists()
 

@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 
-from small_presets import TINY_RIG
+from small_presets import FEW_POINTS, TINY_RIG
 from structgstream.data.clip import bundled_clip_path
 from structgstream.presets import COMPACT, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
@@ -15,9 +15,8 @@ def quick(*, seed: int = 0) -> StreamConfig:
     """Paper mode with next to no iterations."""
     patching = replace(TINY_RIG.online.patching, iteration=1)
     initial = replace(TINY_RIG.initial, iterations=3)
-    return replace(
-        TINY_RIG, seed=seed, initial=initial, online=replace(TINY_RIG.online, iterations=2, patching=patching)
-    )
+    online = replace(TINY_RIG.online, iterations=2, patching=patching)
+    return replace(TINY_RIG, seed=seed, points=FEW_POINTS, initial=initial, online=online)
 
 
 def compact(*, seed: int = 0) -> StreamConfig:
@@ -25,4 +24,4 @@ def compact(*, seed: int = 0) -> StreamConfig:
     few = quick(seed=seed)
     patching = replace(COMPACT.online.patching, iteration=few.online.patching.iteration)
     online = replace(COMPACT.online, iterations=few.online.iterations, patching=patching)
-    return replace(COMPACT, seed=seed, initial=few.initial, online=online)
+    return replace(COMPACT, seed=seed, points=few.points, initial=few.initial, online=online)

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from small_runs import CLIP
+from backends import quickest_backend
+from small_runs import CLIP as LARGER
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
-from structgstream.kernels.backend import Backend, select_backend
 from structgstream_studies.experiments.peer_runs import PEER_TITLES, PeerRun
 from structgstream_studies.experiments.results import read_result
 from structgstream_studies.experiments.studies import comparison_runs, fits_frames_alone, needed, write_methods
@@ -19,7 +19,9 @@ from structgstream_studies.peers import methods
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream_studies.peers.threedgs import ThreeDGS
 
-BACKEND: Backend = select_backend("reference")
+BACKEND = quickest_backend()
+CLIP = replace(LARGER, scale=0.125)
+"""Peers take every point that is found, in every frame."""
 
 
 def quick_methods() -> Mapping[str, AnyMethod]:
@@ -54,7 +56,7 @@ def test_a_peer_is_scored_by_the_same_evaluator(run: PeerRun) -> None:
     assert 5 < result.mean["psnr"] < 40
     assert result.mean["online_bytes"] > 1000
     assert result.frames[1]["cpu_seconds"] > 0
-    assert result.trained_by["backend"] == "reference"
+    assert result.trained_by["backend"] == BACKEND.name
     assert run.done()
     assert run.needs == ()
 

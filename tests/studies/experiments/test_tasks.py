@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 import torch
 
+from backends import quickest_backend
 from small_runs import CLIP, compact, quick
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import ExperimentError
 from structgstream.evaluation.run_log import log_path, read_log
-from structgstream.kernels.backend import Backend, select_backend
+from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
 from structgstream.session import Session
@@ -40,7 +41,7 @@ class Runs:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
-    folder, backend = tmp_path_factory.mktemp("runs"), select_backend("reference")
+    folder, backend = tmp_path_factory.mktemp("runs"), quickest_backend()
     full = Variation("full", CLIP, quick(), folder, 3)
     held = Variation("held", CLIP, variants(quick())["held"].config, folder, 3)
     for task in (full.first, full, held):
@@ -122,7 +123,7 @@ def test_a_result_says_what_was_asked_of_what_and_by_whom(runs: Runs) -> None:
     assert (result.key, result.seed, result.capture) == ("held", 0, "clip")
     assert result.identity["config"]["online"]["iterations"] == 0
     assert result.identity["capture"]["scored"] == ["cam00"]
-    assert result.trained_by["backend"] == result.environment["backend"] == "reference"
+    assert result.trained_by["backend"] == result.environment["backend"] == runs.backend.name
     assert len(result.frames) == 3
     assert 5 < result.mean["psnr"] < 40
     assert result.mean["online_cpu_seconds"] > 0

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import torch
 
+from backends import quickest_backend
 from peers.captures import moving_capture
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render
 from structgstream.training.result import Step
 from structgstream.training.views import training_views
@@ -18,7 +18,7 @@ from structgstream_studies.peers.plain import Y0, PlainGaussians
 from structgstream_studies.peers.threedgstream import box_of, in_box, transformed
 from structgstream_studies.peers.warm_up import WarmUpConfig, identity_loss, warmed_up
 
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 CAPTURE = moving_capture(1)
 POINTS = torch.from_numpy(CAPTURE.points)
 CONFIG: GaussiansConfig = TINY_METHODS["3dgs"].config

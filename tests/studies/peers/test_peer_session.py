@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from backends import quickest_backend
 from peers.captures import Capture, Watched, moving_capture
 from structgstream.codec.container.records import scanned
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError, StreamError
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render
 from structgstream.session import FrameReport
 from structgstream_studies.peers.container import is_peer_file
@@ -21,7 +21,7 @@ from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod
 from structgstream_studies.peers.session import PeerSession
 from structgstream_studies.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig
 
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 NAMES = list(TINY_METHODS)
 
 

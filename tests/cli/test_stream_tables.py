@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of numbers that are given here. How they look for real streams is in ``test_inspect.py``."""
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from structgstream.cli.stream_tables import facts, header_table, packet_table, rate
+from structgstream.cli.tables import SHOWN_FRAMES
+from structgstream.evaluation.byte_count import Row
+
+HEADER: dict[str, Any] = {
+    "metadata": {"capture": "hall [1]"},
+    "codec": "compact",
+    "fps": 25.0,
+    "cameras": {
+        "a": {"held_out": True, "width": 64, "height": 48},
+        "b": {"held_out": False, "width": 32, "height": 48},
+    },
+    "total_bytes": 5000,
+    "header_bytes": 1000,
+    "fields": {"free": {"bytes": 0, "shape": [0, 14]}, "offset_scales": {"bytes": 240, "shape": [20, 3]}},
+    "dynamic": ["free"],
+    "damage": [],
+    "complete": True,
+    "cut_reason": None,
+}
+
+
+def rows(count: int, *, bytes: int = 100) -> list[Row]:
+    sizes = {"free": bytes - 10}
+    return [Row(i, "delta" if i else "key", i / 25, 1000 + i * bytes, bytes, sizes) for i in range(count)]
+
+
+def shown(table: Table) -> list[str]:
+    console = Console(file=io.StringIO(), width=100, color_system=None)
+    console.print(table)
+    assert isinstance(console.file, io.StringIO)
+    return [" ".join(line.split()) for line in console.file.getvalue().splitlines() if line.strip()]
+
+
+def packet(changes: dict[str, int], counts: dict[str, int]) -> dict[str, Any]:
+    return {"changes": changes, "counts": counts}
+
+
+def test_what_a_stream_is_in_a_line_for_each_fact() -> None:
+    packets = [
+        packet({"grown": 5, "removed": 2}, {"lifted": 3}),
+        packet({"spawned": 4}, {"lifted": 4, "jumps": 0}),
+    ]
+    lines = shown(facts(HEADER, rows(2), packets=packets))
+    for line in (
+        "capture hall [1]",
+        "frames 2 at 25 a second, 0.08 s",
+        "cameras 2 of 32x48, 64x48; held out: a",
+        "size 5.0 kB, header 1.0 kB",
+        "rate 0.02 Mbit/s without the header",
+        "came, went anchors (+5 -2), free Gaussians (+4 -0), says the log",
+        "acts lifted 7, jumps 0",
+        "state complete",
+    ):
+        assert line in lines
+
+
+@pytest.mark.parametrize(("damage", "state"), [([], "not finished"), ([{"offset": 1}], "damaged")])
+def test_a_stream_that_is_not_whole_says_why(damage: list[dict[str, int]], state: str) -> None:
+    header = HEADER | {"damage": damage, "complete": False, "cut_reason": "it ends in frame 3"}
+    lines = shown(facts(header, [], packets=[]))
+    assert f"state {state}: it ends in frame 3" in lines
+    assert not [line for line in lines if line.startswith(("rate ", "came, ", "acts "))]
+
+
+def test_the_rate_by_hand() -> None:
+    """50 kB a frame, 30 times a second, 8 bits each."""
+    assert rate(rows(3, bytes=50_000), 30.0) == "12.00 Mbit/s without the header"
+
+
+def test_the_header_by_field_the_largest_first() -> None:
+    lines = shown(header_table(HEADER))
+    assert lines[-3:] == ["offset scales 20 x 3 240 24.0% 32.00", "free 0 x 14 0 0.0% -", "the rest 760 76.0%"]
+
+
+def test_a_long_stream_is_listed_in_part_unless_every_packet_is_asked_for() -> None:
+    many = rows(2 * SHOWN_FRAMES)
+    part, every = packet_table(many, every=False), packet_table(many, every=True)
+    assert "1 in 2 is listed" in str(part.title)
+    assert "listed" not in str(every.title)
+    assert every.row_count - part.row_count == SHOWN_FRAMES
+    assert packet_table([], every=False).row_count == 0
+
+
+def test_large_packets_are_told_in_kilobytes() -> None:
+    assert "packets, bytes" in shown(packet_table(rows(2), every=True))[0]
+    large = shown(packet_table(rows(2, bytes=250_000), every=True))
+    assert "packets, kB" in large[0]
+    assert any(line.startswith("1 delta 250.0") for line in large)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known of a recording before a picture is looked at, in numbers that are worked out here."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from rigs import arc_rig
+from streams import header_for, small_scene
+from structgstream.cameras import CameraRig
+from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.reader import PacketInfo
+from structgstream.data.wrappers import section
+from structgstream.errors import CaptureError, ConfigError
+from structgstream.evaluation.facts import (
+    check_same_frames,
+    check_same_rig,
+    scored_cameras,
+    start_of,
+    stream_facts,
+    training_facts,
+)
+from structgstream.evaluation.recording import Recording
+from structgstream.frames import MultiViewFrame
+
+HEADER = header_for(small_scene())
+
+
+@dataclass
+class Source:
+    """A capture of a kind that does not say where it begins."""
+
+    rig: CameraRig
+    length: int = 4
+    fps: float = 30.0
+    name: str = "hall"
+    points: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return self.length
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        raise AssertionError("no picture is looked at")
+
+
+@dataclass
+class Packets:
+    """The numbers of an opened file."""
+
+    header: StreamHeader
+    sizes: list[dict[Any, int]]
+    header_bytes: int = 500
+    complete: bool = True
+    packets: list[PacketInfo] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for i, sizes in enumerate(self.sizes):
+            kind = PacketKind.DELTA if i % 2 else PacketKind.KEY
+            self.packets.append(PacketInfo(kind, i, i / 30, 0, 10 + sum(sizes.values()), sizes))
+
+    @property
+    def total_bytes(self) -> int:
+        return self.header_bytes + sum(info.bytes for info in self.packets) + 40
+
+
+def recording(sizes: list[dict[str, int]], header: StreamHeader = HEADER) -> Recording:
+    return cast("Recording", Packets(header, sizes))
+
+
+def test_cameras_to_score_are_the_named_or_the_held_out() -> None:
+    assert scored_cameras(HEADER, None) == ("cam00",)
+    assert scored_cameras(HEADER, ("cam02", "cam01")) == ("cam02", "cam01")
+    with pytest.raises(ConfigError, match="no camera 'cam9'; it has cam00, cam01, cam02"):
+        scored_cameras(HEADER, ("cam00", "cam9"))
+    with pytest.raises(ConfigError, match="no held-out camera to score"):
+        scored_cameras(replace(HEADER, rig=HEADER.rig.with_held_out(frozenset())), None)
+
+
+def without(rig: CameraRig, name: str) -> CameraRig:
+    return CameraRig({key: camera for key, camera in rig.cameras.items() if key != name}, frozenset())
+
+
+def with_camera(rig: CameraRig, name: str, **change: Any) -> CameraRig:
+    return rig.mapped({**rig.cameras, name: replace(rig[name], **change)})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda rig: without(rig, "cam01"),
+            "has no camera 'cam01', which the stream has; its cameras are cam00, cam02",
+        ),
+        (lambda _: arc_rig(3, width=96, height=64), "96x64 pixels in the capture hall and 48x32 in the stream"),
+        (lambda rig: with_camera(rig, "cam01", K=rig["cam01"].K * 1.01), "another calibration"),
+        (lambda rig: with_camera(rig, "cam01", viewmat=rig["cam02"].viewmat), "another calibration"),
+    ],
+)
+def test_another_rig_is_told(change: Callable[[CameraRig], CameraRig], words: str) -> None:
+    check_same_rig(HEADER, Source(HEADER.rig), ("cam00", "cam01"))
+    other = Source(change(HEADER.rig))
+    with pytest.raises(CaptureError, match=words):
+        check_same_rig(HEADER, other, ("cam01",))
+
+
+def test_a_camera_that_is_not_scored_may_differ() -> None:
+    check_same_rig(HEADER, Source(without(HEADER.rig, "cam01")), ("cam00", "cam02"))
+
+
+def test_a_capture_that_is_too_short_or_begins_elsewhere_is_told() -> None:
+    source, four = Source(HEADER.rig), [{"free": 1}] * 4
+    check_same_frames(recording(four), source)
+    with pytest.raises(CaptureError, match="5 frames and this part of the capture hall only 4"):
+        check_same_frames(recording([*four, {}]), source)
+    late = recording(four, replace(HEADER, metadata={"start": 7}))
+    check_same_frames(late, source)
+    assert start_of(source) is start_of(section(source, start=2, frames=2)) is None
+
+
+def test_sizes_and_rates_by_hand() -> None:
+    """Packets of 110, 60 and 110 bytes, heads of 10 each, in a tenth of a second."""
+    facts = stream_facts(
+        recording([{"free": 100}, {"free": 20, "offset_scales": 30}, {"free": 100}]), ("cam00", "cam02")
+    )
+    assert (facts["frames"], facts["key_frames"], facts["training_cameras"]) == (3, 2, 2)
+    assert (facts["header_bytes"], facts["packet_bytes"], facts["total_bytes"]) == (500, 280, 820)
+    assert facts["field_bytes"] == {"free": 220, "offset_scales": 30}
+    assert facts["megabits_per_second"] == pytest.approx(280 * 8 / 1e6 / 0.1)
+    assert facts["megabits_per_second_with_header"] == pytest.approx(820 * 8 / 1e6 / 0.1)
+    assert facts["cameras"] == {"cam00": "held out", "cam02": "training"}
+    assert facts["metadata"] == {"capture": "test"}
+
+
+def log(index: int, seconds: float, peak: int | None, **stages: int) -> dict[str, Any]:
+    return {
+        "index": index,
+        "total_seconds": seconds,
+        "peak_memory_bytes": peak,
+        "peak_memory_bytes_by_stage": stages,
+    }
+
+
+def test_what_training_took_is_told_of_frame_0_and_of_the_others_apart() -> None:
+    facts = training_facts(
+        [log(0, 9.0, 50, fit=50), log(1, 1.0, 70, fit=70, store=5), {}, log(2, 3.0, 60, fit=60, store=6)]
+    )
+    assert facts == {
+        "seconds_first": 9.0,
+        "seconds_online_mean": 2.0,
+        "peak_memory_bytes": 70,
+        "peak_memory_bytes_by_stage": {"first frame, fit": 50, "online, fit": 70, "online, store": 6},
+    }
+    assert training_facts([{}, {}]) == {}
+    resumed = training_facts([log(5, 1.0, None)])
+    assert (resumed["seconds_first"], resumed["peak_memory_bytes"]) == (None, None)
+    assert training_facts([log(0, 1.0, 5)])["seconds_online_mean"] is None

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has no anchors is counted as free Gaussians, and drawn where it can be."""
+
+import pytest
+import torch
+
+from streams import small_scene
+from structgstream.cameras import Camera
+from structgstream.errors import BackendError
+from structgstream.evaluation.recording import counts, placed
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend
+
+CPU, ELSEWHERE = torch.device("cpu"), torch.device("meta")
+
+
+class Fixed:
+    """Drawable, and bound to the CPU."""
+
+    def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
+        raise NotImplementedError
+
+    def __len__(self) -> int:
+        return 17
+
+
+class Roaming(Fixed):
+    """As well on another device."""
+
+    def on_device(self, device: torch.device) -> Fixed:
+        self.device = device
+        return self
+
+
+def test_a_scene_has_anchors_and_free_gaussians_and_others_are_free_altogether() -> None:
+    assert counts(small_scene(4, free=2)) == {"anchors": 4, "free": 2}
+    assert counts(Fixed()) == {"anchors": 0, "free": 17}
+
+
+def test_a_drawable_goes_to_a_device_if_it_can() -> None:
+    scene, fixed, roaming = small_scene(), Fixed(), Roaming()
+    found = placed(scene, ELSEWHERE)
+    assert found.anchors.positions.device == ELSEWHERE  # type: ignore[attr-defined]
+    assert placed(fixed, CPU) is fixed
+    assert placed(roaming, ELSEWHERE) is roaming
+    assert roaming.device == ELSEWHERE
+    with pytest.raises(BackendError, match="A Fixed cannot be drawn on meta; choose --device cpu"):
+        placed(fixed, ELSEWHERE)

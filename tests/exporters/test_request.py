@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where an export goes and which frames it has, for every way to say it; refusals are in ``cli/test_export.py``."""
+
+from pathlib import Path
+
+import pytest
+
+from structgstream.errors import ConfigError
+from structgstream.exporters.formats import Format, PageFormat
+from structgstream.exporters.request import check_page, checked_degree, chosen_frames, destination, is_one_file
+
+STREAM = Path("/videos/ball.sgs")
+
+
+@pytest.mark.parametrize(
+    ("output", "format", "frame", "expected"),
+    [
+        (None, None, None, ("/videos/ball-ply", "ply")),
+        (None, "splat", 3, ("/videos/ball-3.splat", "splat")),
+        (None, "html", None, ("/videos/ball.html", "html")),
+        (None, "site", None, ("/videos/ball-site", "site")),
+        ("out", None, None, ("out", "ply")),
+        ("out", "spz", None, ("out", "spz")),
+        ("one.SPZ", None, 2, ("one.SPZ", "spz")),
+        ("page.html", None, None, ("page.html", "html")),
+        ("my.obj", "ply", None, ("my.obj", "ply")),
+        ("my.site", "site", None, ("my.site", "site")),
+    ],
+)
+def test_the_place_and_the_format(
+    output: str | None, format: Format | PageFormat | None, frame: int | None, expected: tuple[str, str]
+) -> None:
+    place = None if output is None else Path(output)
+    assert destination(STREAM, place, format=format, frame=frame, frames=None) == (Path(expected[0]), expected[1])
+
+
+def test_a_folder_that_is_there_is_a_folder_whatever_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "set.ply"
+    folder.mkdir()
+    assert destination(STREAM, folder, format="spz", frame=None, frames=None) == (folder, "spz")
+    assert not is_one_file(folder)
+    assert is_one_file(tmp_path / "other.PLY")
+    assert not is_one_file(tmp_path / "page.html")
+
+
+def test_frames_of_a_stream_with_a_gap() -> None:
+    runs, folder = [range(4), range(6, 8)], Path("out")
+    assert chosen_frames(runs, folder, frame=None, frames=None) == [0, 1, 2, 3, 6, 7]
+    assert chosen_frames(runs, folder, frame=None, frames=(1, 3)) == [1, 2, 3]
+    assert chosen_frames(runs, Path("x.ply"), frame=6, frames=None) == [6]
+    assert chosen_frames(runs, Path("x.ply"), frame=0, frames=None) == [0]
+    for frame, frames in ((5, None), (None, (3, 6))):
+        with pytest.raises(ConfigError, match="the stream has frames 0 to 3 and 6 to 7; there is no"):
+            chosen_frames(runs, folder, frame=frame, frames=frames)
+    with pytest.raises(ConfigError, match="no whole frame"):
+        chosen_frames([], folder, frame=None, frames=None)
+
+
+def test_a_degree_is_what_the_format_can_hold() -> None:
+    assert [checked_degree(degree, "ply") for degree in (None, 0, 2)] == [None, 0, 2]
+    assert [checked_degree(degree, "splat") for degree in (None, 0)] == [0, 0]
+    for degree in (-1, 3):
+        with pytest.raises(ConfigError, match=f"--sh-degree {degree} is not one of 0 to 2"):
+            checked_degree(degree, "spz")
+
+
+def test_a_page_has_no_wishes() -> None:
+    check_page(frame=None, frames=None, sh_degree=None)
+    for wish in ({"frame": 0}, {"frames": (0, 0)}, {"sh_degree": 0}):
+        with pytest.raises(ConfigError, match="a page holds the whole stream"):
+            check_page(**{"frame": None, "frames": None, "sh_degree": None, **wish})
