@@ -4,7 +4,7 @@
 import pytest
 import torch
 
-from structgstream.kernels.raster_types import TILE_PIXELS, count_pixels, pixels_of_tiles, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles_of
 
 SIZES = [(16, 16), (17, 16), (1, 1), (48, 33), (50, 47)]
 
@@ -19,9 +19,10 @@ def test_the_pixels_of_tiles_are_counted_without_being_made(width: int, height: 
     for place in range(rows * columns):
         tiles = torch.zeros(rows, columns, dtype=torch.bool)
         tiles.view(-1)[place] = True
-        pixels = pixels_of_tiles(tiles, width, height)
+        selection = TileSelection(tiles, width, height)
+        pixels = selection.pixels()
         assert pixels.shape == (height, width)
-        assert count_pixels(tiles, width, height) == int(pixels.sum())
+        assert selection.count_pixels() == int(pixels.sum())
         y, x = (int(axis.min()) for axis in torch.nonzero(pixels, as_tuple=True))
         assert (y // TILE_PIXELS, x // TILE_PIXELS) == divmod(place, columns)
-    assert count_pixels(torch.ones(rows, columns, dtype=torch.bool), width, height) == width * height
+    assert TileSelection(torch.ones(rows, columns, dtype=torch.bool), width, height).count_pixels() == width * height

@@ -3,7 +3,7 @@
 
 import pytest
 
-from structgstream.codec.models import AHEAD, HALF, Arithmetic, Model, Models, carry, residual_contexts
+from structgstream.codec.entropy.models import AHEAD, HALF, Arithmetic, Model, Models, carry, residual_contexts
 
 
 def test_a_new_model_expects_nothing() -> None:

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from structgstream.codec.reference_rans import LOW, decode_lanes, encode_lanes
-from structgstream.codec.tables import FrequencyTables
+from structgstream.codec.entropy.reference_rans import LOW, decode_lanes, encode_lanes
+from structgstream.codec.entropy.tables import FrequencyTables
 
 # Symbol 0 three times as often as symbol 1: frequencies 3072 and 1024 of 4096, starts 0 and 3072.
 TABLES = FrequencyTables(np.array([[3072, 1024]], np.uint16))

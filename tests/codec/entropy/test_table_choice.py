@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from structgstream.codec.table_choice import chosen_tables
-from structgstream.codec.tables import TOTAL, FrequencyTables, geometric, normalised
+from structgstream.codec.entropy.table_choice import chosen_tables
+from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, geometric, normalised
 from structgstream.errors import StreamError
 
 EVEN = FrequencyTables(np.full((2, 4), TOTAL // 4, np.uint16))

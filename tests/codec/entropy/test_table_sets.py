@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from structgstream.codec.bits import fixed, packed_bits
-from structgstream.codec.table_sets import decoded_tables, levels_of, top_level, weights_of
-from structgstream.codec.tables import TOTAL, FrequencyTables, geometric
+from structgstream.codec.entropy.bits import fixed, packed_bits
+from structgstream.codec.entropy.table_sets import decoded_tables, levels_of, top_level, weights_of
+from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, geometric
 from structgstream.errors import StreamError
 
 EVEN = FrequencyTables(np.full((2, 4), TOTAL // 4, np.uint16))

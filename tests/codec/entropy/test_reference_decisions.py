@@ -5,8 +5,16 @@ import math
 
 import numpy as np
 
-from structgstream.codec.models import HALF, Arithmetic, Model
-from structgstream.codec.reference_decisions import FAR, LEAST, MOST, code_numbers, size_class, squashed, stretched
+from structgstream.codec.entropy.models import HALF, Arithmetic, Model
+from structgstream.codec.entropy.reference_decisions import (
+    FAR,
+    LEAST,
+    MOST,
+    code_numbers,
+    size_class,
+    squashed,
+    stretched,
+)
 
 
 def test_a_chance_is_the_logistic_function_of_its_logit() -> None:
