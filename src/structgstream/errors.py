@@ -12,7 +12,6 @@
     |-- ConfigError             an option has a value that cannot work
     |-- OutOfMemoryError        memory does not suffice for a kernel; a MemoryError too
     |-- PlayerError             the player cannot be served, or does not fit in a page
-    |-- ExperimentError         a step of a sweep failed; the others are done
     `-- MissingExtraError       an optional dependency is not installed
 
 Each message is one sentence or two that say what was got, what was expected, and what to do. The command line prints it
@@ -57,10 +56,6 @@ class OutOfMemoryError(StructGStreamError, MemoryError):
 
 class PlayerError(StructGStreamError):
     """The player cannot be served here, or a stream does not fit in a page."""
-
-
-class ExperimentError(StructGStreamError):
-    """Steps of a sweep failed; what the others gave is stored."""
 
 
 class MissingExtraError(StructGStreamError):

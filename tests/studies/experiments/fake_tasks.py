@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.errors import ExperimentError
 from structgstream.evaluation.run_log import append_log, read_log
 from structgstream.kernels.backend import Backend
+from structgstream_studies.errors import ExperimentError
 
 PATIENCE_SECONDS = 120.0
 

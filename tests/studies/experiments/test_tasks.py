@@ -17,12 +17,12 @@ from backends import quickest_backend
 from small_runs import CLIP, compact, quick
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.errors import ExperimentError
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
 from structgstream.session import Session
+from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.results import Result, read_result
 from structgstream_studies.experiments.tasks import FirstFrame, Variation
 from structgstream_studies.experiments.variants import variants

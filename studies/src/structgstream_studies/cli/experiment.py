@@ -14,7 +14,7 @@ from rich.text import Text
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import CaptureOptions, Device, Folder
 from structgstream.cli.tables import columns, plain
-from structgstream.errors import ExperimentError
+from structgstream_studies.errors import ExperimentError
 
 if TYPE_CHECKING:
     from structgstream_studies.experiments.captures import CapturePart
