@@ -1,22 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a stream begins: where points come from, and what the header says of the scene that goes on."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from memory_captures import MemoryCapture
 from rigs import random_scene
 from small_presets import TINY_RIG
 from streams import same
 from structgstream import beginning
 from structgstream.beginning import begun, frame_seed, initial_points_of
-from structgstream.cameras import CameraRig
 from structgstream.codec.packets import StreamHeader
 from structgstream.data.points import PointsConfig
-from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import TINY, StreamConfig, to_json
 from structgstream.scene.scene import Scene
@@ -28,26 +26,14 @@ WORLD = moving_world(1, cameras=4)
 SIMILARITY = Similarity((0.0, 0.1, 0.0), 2.0)
 
 
-@dataclass
-class Source:
-    """The world, with points of its own or without."""
-
-    points: np.ndarray | None = None
-    rig: CameraRig = WORLD.rig
-    fps: float = 25.0
-    name: str = "world"
-
-    def __len__(self) -> int:
-        return 1
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        yield from WORLD.frames[start:]
+def source(points: np.ndarray | None = None) -> MemoryCapture:
+    return MemoryCapture(WORLD.rig, WORLD.frames, fps=25.0, points=points)
 
 
 def begin(config: StreamConfig, scene: Scene) -> tuple[Scene, StreamHeader]:
     return begun(
         scene,
-        Source(),
+        source(),
         frame=WORLD.frames[0],
         config=config,
         metadata={"capture": "world"},
@@ -72,10 +58,10 @@ def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.Monk
     monkeypatch.setattr(beginning, "initial_points", found)
     given = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, -1.0]])
     options = {"config": PointsConfig(), "seed": 5, "similarity": SIMILARITY}
-    points = initial_points_of(Source(given), WORLD.frames[0], **options)
+    points = initial_points_of(source(given), WORLD.frames[0], **options)
     torch.testing.assert_close(points.double(), torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, -2.0]]).double())
     assert not asked
-    points = initial_points_of(Source(), WORLD.frames[0], **options)
+    points = initial_points_of(source(), WORLD.frames[0], **options)
     torch.testing.assert_close(points.double(), torch.tensor([[2.0, 1.8, 2.0]]).double().expand(4, 3))
     assert asked == [5]
 

@@ -6,34 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.packets import PacketKind
+from reports import frame_report
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, log_path, read_log
 from structgstream.recorder import check_output, logged
 from structgstream.session import FrameReport
 
 
-def report(index: int) -> FrameReport:
-    return FrameReport(
-        index=index,
-        pts_seconds=index / 30,
-        kind=PacketKind.DELTA if index else PacketKind.KEY,
-        bytes=9,
-        field_bytes={},
-        train_psnr=20.0,
-        anchors=1,
-        moving=1,
-        free=0,
-        spawned=0,
-        pruned=0,
-        seconds={"total": 1.0},
-    )
-
-
 def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]:
     try:
         for index in range(start, 3):
-            yield report(index)
+            yield frame_report(index)
     finally:
         closed.append("session")
 

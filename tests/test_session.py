@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 import errno
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
 from streams import moved, same, small_scene
 from structgstream import session
@@ -29,31 +29,15 @@ from structgstream.training.result import FitResult
 from worlds import moving_world
 
 WORLD = moving_world(1)
+POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
 
 
-@dataclass
-class Rig:
-    """A capture in memory."""
-
-    rig: CameraRig
-    pictures: list[MultiViewFrame]
-    fps: float = 30.0
-    name: str = "world"
-    points: np.ndarray | None = field(default_factory=lambda: np.random.default_rng(0).normal(size=(60, 3)) * 0.4)
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        yield from self.pictures[start:]
-
-
-def capture(frames: int = 5) -> Rig:
+def capture(frames: int = 5) -> MemoryCapture:
     """Three cameras, the first held out; the same picture at every time."""
     names = [*WORLD.rig][:3]
     rig = CameraRig({name: WORLD.rig[name] for name in names}, frozenset(names[:1]))
     images = {name: WORLD.frames[0].images[name] for name in names}
-    return Rig(rig, [MultiViewFrame(i, i / 30.0, images) for i in range(frames)])
+    return MemoryCapture(rig, [MultiViewFrame(i, i / 30.0, images) for i in range(frames)], points=POINTS)
 
 
 @pytest.fixture
@@ -75,7 +59,7 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def run(
-    source: Rig, sink, *, resumed=None, config: StreamConfig = TINY_RIG, metadata=None
+    source: MemoryCapture, sink, *, resumed=None, config: StreamConfig = TINY_RIG, metadata=None
 ) -> list[session.FrameReport]:
     return list(Session(source, sink, config, reference_backend(), resumed=resumed, metadata=metadata).run())
 
@@ -157,7 +141,7 @@ def test_a_longer_part_of_the_capture_continues_a_complete_file(quick_fits: list
     assert path.read_bytes() == uninterrupted()
 
 
-def other_camera(source: Rig) -> Rig:
+def other_camera(source: MemoryCapture) -> MemoryCapture:
     camera = source.rig["cam01"]
     return replace(source, rig=source.rig.mapped({**source.rig.cameras, "cam01": replace(camera, K=camera.K * 1.01)}))
 
@@ -275,7 +259,7 @@ def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[in
 
 def test_the_real_fit_resumes_exactly_and_keeps_static_fields(tmp_path: Path) -> None:
     world = moving_world(3, emerges_at=1)
-    source = Rig(world.rig, world.frames)
+    source = MemoryCapture(world.rig, world.frames, points=POINTS)
     config = replace(
         TINY_RIG,
         initial=replace(TINY_RIG.initial, iterations=12, schedule_iterations=12, coarse_iterations=4, voxel_size=0.1),

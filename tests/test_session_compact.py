@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stream with codec ``compact`` of a world in which everything is known."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,16 +10,15 @@ import pytest
 import torch
 
 from backends import quickest_backend
+from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
 from streams import same
 from structgstream import session
-from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.scene.bins import FREE_STEPS
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
-from structgstream.frames import MultiViewFrame
 from structgstream.presets import COMPACT, PRESETS, StreamConfig
 from structgstream.rate_control import RateConfig
 from structgstream.scene.order import space_order
@@ -54,31 +52,9 @@ CONFIG = replace(
 )
 
 
-@dataclass
-class Capture:
-    """The world's pictures."""
-
-    length: int = FRAMES
-    fps: float = 30.0
-    name: str = "world"
-
-    @property
-    def rig(self) -> CameraRig:
-        return WORLD.rig
-
-    @property
-    def points(self) -> np.ndarray:
-        return WORLD.scene.anchors.positions.numpy()
-
-    def __len__(self) -> int:
-        return self.length
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        yield from WORLD.frames[start : self.length]
-
-
 def run(sink, *, config: StreamConfig = CONFIG, resumed=None, frames: int = FRAMES) -> list[FrameReport]:
-    return list(Session(Capture(frames), sink, config, quickest_backend(), resumed=resumed).run())
+    capture = MemoryCapture(WORLD.rig, WORLD.frames[:frames], points=WORLD.scene.anchors.positions.numpy())
+    return list(Session(capture, sink, config, quickest_backend(), resumed=resumed).run())
 
 
 @cache
@@ -184,7 +160,7 @@ def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Pa
 def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
     """The target is half of what frame 2 takes without one; the pressure after it is a matter of record."""
     free = whole()[1]
-    config = replace(CONFIG, rate=RateConfig(free[2].bytes * 8 * Capture.fps / 2e6, 2 / Capture.fps))
+    config = replace(CONFIG, rate=RateConfig(free[2].bytes * 8 * MemoryCapture.fps / 2e6, 2 / MemoryCapture.fps))
     sink = MemorySink()
     reports = run(sink, config=config)
     assert [r.bytes for r in reports[:2]] == [r.bytes for r in free[:2]]

@@ -2,13 +2,11 @@
 """A stream that follows motion: each frame looks at the one before, also after a pause."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
+from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
-from structgstream.cameras import CameraRig
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
 from structgstream.frames import MultiViewFrame
@@ -31,42 +29,33 @@ CONFIG = replace(
 
 
 @dataclass
-class Capture:
-    """The world's pictures; remembers which frames were asked for."""
+class Capture(MemoryCapture):
+    """Remembers which frames were asked for."""
 
-    length: int
-    asked: list[int]
-    fps: float = 30.0
-    name: str = "world"
-
-    @property
-    def rig(self) -> CameraRig:
-        return WORLD.rig
-
-    @property
-    def points(self) -> np.ndarray:
-        return WORLD.scene.anchors.positions.numpy()
-
-    def __len__(self) -> int:
-        return self.length
+    asked: list[int] = field(default_factory=list)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        for frame in WORLD.frames[start : self.length]:
+        for frame in super().frames(start):
             self.asked.append(frame.index)
             yield frame
 
 
-def run(capture: Capture, sink: FileSink, *, resumed: StreamReader | None = None) -> list[FrameReport]:
-    return list(Session(capture, sink, CONFIG, reference_backend(), resumed=resumed).run())
+def capture(length: int) -> Capture:
+    """The world's pictures."""
+    return Capture(WORLD.rig, WORLD.frames[:length], points=WORLD.scene.anchors.positions.numpy())
+
+
+def run(source: Capture, sink: FileSink, *, resumed: StreamReader | None = None) -> list[FrameReport]:
+    return list(Session(source, sink, CONFIG, reference_backend(), resumed=resumed).run())
 
 
 def test_a_resumed_stream_is_the_uninterrupted_one_byte_for_byte(tmp_path: Path) -> None:
-    reports = run(Capture(4, []), FileSink(tmp_path / "whole.sgs"))
+    reports = run(capture(4), FileSink(tmp_path / "whole.sgs"))
     assert all(0 < report.moving < report.anchors for report in reports[1:])
 
-    run(Capture(2, []), FileSink(tmp_path / "begun.sgs"))
+    run(capture(2), FileSink(tmp_path / "begun.sgs"))
     sink, resumed = FileSink.resume(tmp_path / "begun.sgs")
-    capture = Capture(4, [])
-    run(capture, sink, resumed=resumed)
-    assert capture.asked == [1, 2, 3]  # Frame 1 once more: what moves in frame 2 shows against it.
+    whole = capture(4)
+    run(whole, sink, resumed=resumed)
+    assert whole.asked == [1, 2, 3]  # Frame 1 once more: what moves in frame 2 shows against it.
     assert (tmp_path / "begun.sgs").read_bytes() == (tmp_path / "whole.sgs").read_bytes()

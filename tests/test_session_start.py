@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams whose frames begin by flow and births: they act, they repeat, and they resume bit for bit."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 
 from backends import quickest_backend
+from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
-from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
@@ -22,6 +21,7 @@ from worlds import moving_world
 
 FRAMES = 4
 WORLD = moving_world(FRAMES, cameras=6, speed=0.06, movers=20, emerges_at=2, width=96, height=64)
+POINTS = WORLD.scene.anchors.positions.numpy().astype(float)
 CONFIG = replace(
     COMPACT,
     initial=replace(TINY_RIG.initial, iterations=60, random_background=True),
@@ -34,31 +34,9 @@ CONFIG = replace(
 )
 
 
-@dataclass
-class Capture:
-    """The world's pictures, some of them spoiled: ``(frame, camera)`` to what is shown instead."""
-
-    pictures: list[MultiViewFrame]
-    fps: float = 30.0
-    name: str = "world"
-    points: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        self.points = WORLD.scene.anchors.positions.numpy().astype(float)
-
-    @property
-    def rig(self) -> CameraRig:
-        return WORLD.rig
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        yield from self.pictures[start:]
-
-
 def run(sink, *, resumed=None, pictures: list[MultiViewFrame] = WORLD.frames) -> list[FrameReport]:
-    return list(Session(Capture(pictures), sink, CONFIG, quickest_backend(), resumed=resumed).run())
+    capture = MemoryCapture(WORLD.rig, pictures, points=POINTS)
+    return list(Session(capture, sink, CONFIG, quickest_backend(), resumed=resumed).run())
 
 
 @cache

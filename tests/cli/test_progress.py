@@ -7,18 +7,14 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
+from reports import frame_report
 from structgstream.cli import progress
 from structgstream.cli.progress import Bars, Lines, display, human_bytes
-from structgstream.codec.packets import PacketKind
-from structgstream.session import FrameReport
 from structgstream.training.result import Step
 
-REPORT = FrameReport(
-    index=1,
-    pts_seconds=1 / 30,
-    kind=PacketKind.DELTA,
+REPORT = frame_report(
+    1,
     bytes=812_345,
-    field_bytes={},
     train_psnr=31.204,
     anchors=34_512,
     moving=34_512,

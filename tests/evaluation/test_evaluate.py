@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from memory_captures import MemoryCapture
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
@@ -68,23 +69,6 @@ class Reader:
         yield from zip(self.packets[start:], self.decoded[start:])
 
 
-@dataclass
-class Source:
-    """A capture in memory."""
-
-    rig: CameraRig
-    pictures: list[MultiViewFrame]
-    fps: float = 30.0
-    name: str = "world"
-    points: None = None
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        yield from self.pictures[start:]
-
-
 def in_the_stream(world: World, *, similarity: Similarity, follow: bool) -> Reader:
     """The world as a stream: every frame's own scene, or the first one for ever."""
     scenes = []
@@ -135,7 +119,7 @@ def run(reader: Any, source: Any, **options: Any):
 
 
 def test_a_perfect_stream_scores_as_equal(world: World) -> None:
-    report = run(in_the_stream(world, similarity=Similarity(), follow=True), Source(world.rig, world.frames))
+    report = run(in_the_stream(world, similarity=Similarity(), follow=True), MemoryCapture(world.rig, world.frames))
     assert report.mean.psnr == PSNR_OF_EQUALS
     assert report.mean.ssim == pytest.approx(1.0)
     assert report.stream["drift_db_per_frame"] == pytest.approx(0.0)
@@ -144,7 +128,7 @@ def test_a_perfect_stream_scores_as_equal(world: World) -> None:
 
 
 def test_a_stream_that_stands_still_loses_the_changed_pixels(world: World) -> None:
-    report = run(in_the_stream(world, similarity=Similarity(), follow=False), Source(world.rig, world.frames))
+    report = run(in_the_stream(world, similarity=Similarity(), follow=False), MemoryCapture(world.rig, world.frames))
     psnrs = [frame.mean.psnr for frame in report.frames]
     assert psnrs == sorted(psnrs, reverse=True)
     assert report.stream["drift_db_per_frame"] < -1
@@ -162,7 +146,7 @@ def test_cameras_pass_through_the_similarity_of_the_header(world: World) -> None
     blind = replace(world.scene, mlps=replace_distance(world.scene))
     plain = World(world.rig, blind, drawn(blind, world))
     similarity = Similarity(center=(0.3, -0.2, 0.1), scale=2.5)
-    report = run(in_the_stream(plain, similarity=similarity, follow=True), Source(plain.rig, plain.frames))
+    report = run(in_the_stream(plain, similarity=similarity, follow=True), MemoryCapture(plain.rig, plain.frames))
     assert report.mean.psnr > 60  # float32 of another scale: a level here and there
 
 
@@ -202,7 +186,7 @@ def exposed(frames: list[MultiViewFrame], *, gains: list[float]) -> list[MultiVi
 
 def test_a_cameras_exposure_is_set_aside_once_and_then_held(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    report = run(reader, Source(world.rig, exposed(world.frames, gains=[0.7, 0.7, 0.7, 0.5])))
+    report = run(reader, MemoryCapture(world.rig, exposed(world.frames, gains=[0.7, 0.7, 0.7, 0.5])))
     held = [value for frame in report.frames if (value := frame.mean.psnr_camera_color) is not None]
     assert len(held) == 4
     assert min(held[:3]) > 50
@@ -216,7 +200,7 @@ def test_a_cameras_exposure_is_set_aside_once_and_then_held(world: World) -> Non
 
 def test_sizes_and_rates_are_those_of_the_file(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    report = run(reader, Source(world.rig, world.frames))
+    report = run(reader, MemoryCapture(world.rig, world.frames))
     facts = report.stream
     assert facts["packet_bytes"] == 4006
     assert facts["total_bytes"] == 9006
@@ -238,7 +222,7 @@ def test_the_log_of_the_trainer_is_merged(world: World) -> None:
         }
         for i in range(4)
     }
-    report = run(reader, Source(world.rig, world.frames), log=log)
+    report = run(reader, MemoryCapture(world.rig, world.frames), log=log)
     assert report.stream["seconds_first"] == 10.0
     assert report.stream["seconds_online_mean"] == 2.0
     assert report.stream["peak_memory_bytes"] == 103
@@ -267,7 +251,7 @@ def test_the_evaluations_own_memory_is_reported(world: World) -> None:
     assert before is not None
     report = run(
         reader,
-        Source(world.rig, world.frames),
+        MemoryCapture(world.rig, world.frames),
         observer=lambda index, compared: held.append(new_pages(2**24)),
     )
     assert report.environment["peak_memory_bytes"] > before + 0.5 * len(held) * 2**24
@@ -280,7 +264,7 @@ def test_the_observer_sees_every_picture(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     run(
         reader,
-        Source(world.rig, world.frames),
+        MemoryCapture(world.rig, world.frames),
         cameras=("cam01", "cam00"),
         observer=lambda index, compared: seen.append((index, compared.camera, compared.picture.shape)),
     )
@@ -290,7 +274,7 @@ def test_the_observer_sees_every_picture(world: World) -> None:
 
 def test_compared_frames_are_truth_and_rendering(world: World) -> None:
     reader: Any = in_the_stream(world, similarity=Similarity(), follow=True)
-    source: Any = Source(world.rig, world.frames)
+    source: Any = MemoryCapture(world.rig, world.frames)
     pairs = list(compared_frames(reader, source, backend=reference_backend(), camera="cam00"))
     assert len(pairs) == 4
     for truth, picture in pairs:
@@ -306,7 +290,7 @@ def test_every_pixel_changed_leaves_no_still_one() -> None:
 
 def test_every_score_over_time_is_wired(world: World) -> None:
     """A world that moves, followed and not: what changes from frame to frame, and what is said of what is missing."""
-    source = Source(world.rig, world.frames)
+    source = MemoryCapture(world.rig, world.frames)
     follows = run(in_the_stream(world, similarity=Similarity(), follow=True), source)
     stays = run(in_the_stream(world, similarity=Similarity(), follow=False), source)
     assert follows.mean.flip == follows.mean.temporal_flip == 0.0
@@ -337,14 +321,14 @@ def test_exact_flow_takes_the_place_of_the_estimate(world: World) -> None:
         return FlowField(np.zeros((height, width, 2), np.float32), np.ones((height, width), bool))
 
     stays: Any = in_the_stream(world, similarity=Similarity(), follow=False)
-    report = run(stays, Source(world.rig, world.frames), flow=nowhere)
+    report = run(stays, MemoryCapture(world.rig, world.frames), flow=nowhere)
     assert asked == [("cam00", index, True) for index in (1, 2, 3)]
     assert report.mean.e_warp == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_basic_scores_are_those_of_before(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=False)
-    basic, every = (run(reader, Source(world.rig, world.frames), metrics=which) for which in ("basic", "all"))
+    basic, every = (run(reader, MemoryCapture(world.rig, world.frames), metrics=which) for which in ("basic", "all"))
     assert basic.stream["metrics"] == "basic"
     assert basic.stream["not_available"] == {}
     assert (basic.mean.psnr, basic.mean.ssim) == (every.mean.psnr, every.mean.ssim)
@@ -352,7 +336,7 @@ def test_the_basic_scores_are_those_of_before(world: World) -> None:
 
 
 def test_keys_of_the_stream_are_documented(world: World) -> None:
-    report = run(in_the_stream(world, similarity=Similarity(), follow=True), Source(world.rig, world.frames))
+    report = run(in_the_stream(world, similarity=Similarity(), follow=True), MemoryCapture(world.rig, world.frames))
     text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
     assert not [key for key in as_json(report)["stream"] if f"`{key}`" not in text]
     assert report.stream["render_fps"] > report.stream["decode_and_render_fps"] > 0
@@ -376,13 +360,13 @@ def test_pictures_of_different_sizes_are_told() -> None:
 def test_another_capture_is_refused(world: World, spoil: Any, words: str) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     with pytest.raises(CaptureError, match=words):
-        run(reader, spoil(Source(world.rig, world.frames)))
+        run(reader, spoil(MemoryCapture(world.rig, world.frames)))
 
 
 def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     reader.header = replace(reader.header, metadata={"start": 2})
-    whole: Any = Source(world.rig, world.frames * 2)
+    whole: Any = MemoryCapture(world.rig, world.frames * 2)
     assert start_of(whole) is None
     assert start_of(section(whole, start=1)) is None
     pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 8 for name in world.rig})
@@ -407,14 +391,14 @@ class Ball:
 def test_another_methods_file_is_scored_alike(world: World) -> None:
     reader: Any = in_the_stream(world, similarity=Similarity(), follow=True)
     reader.decoded = [Ball(1.0), Ball(1.0), Ball(0.5), Ball(0.5)]
-    report = run(reader, Source(world.rig, world.frames))
+    report = run(reader, MemoryCapture(world.rig, world.frames))
     assert [(frame.anchors, frame.free) for frame in report.frames] == [(0, 1)] * 4
     assert 5 < report.mean.psnr < 40
     with pytest.raises(BackendError, match="Ball cannot be drawn on meta"):
         placed(Ball(1.0), torch.device("meta"))
 
 
-def replace_camera(source: Source, camera: Any) -> Source:
+def replace_camera(source: MemoryCapture, camera: Any) -> MemoryCapture:
     """The source with another first camera, or none."""
     cameras = dict(source.rig.cameras) | {"cam00": camera}
     if camera is None:
@@ -425,7 +409,7 @@ def replace_camera(source: Source, camera: Any) -> Source:
 def test_a_stream_without_held_out_cameras_says_what_to_do(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     reader.header = replace(reader.header, rig=world.rig.with_held_out(frozenset()))
-    source = Source(world.rig, world.frames)
+    source = MemoryCapture(world.rig, world.frames)
     with pytest.raises(ConfigError, match="--cameras"):
         run(reader, source)
     report = run(reader, source, cameras=("cam02",))

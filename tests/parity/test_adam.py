@@ -3,22 +3,13 @@
 
 import pytest
 import torch
-from torch import Tensor
 
+from parity.adam_steps import OPTIONS, steps
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_adam, reference_adam
 from structgstream.kernels._load import native_reason
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
-
-OPTIONS = {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-15}
-
-
-def steps(module, param: Tensor, gradients: list[Tensor], rows: Tensor | None = None) -> list[Tensor]:
-    state = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
-    for n, gradient in enumerate(gradients, start=1):
-        module.adam_step(state[0], gradient.to(param), state[1], state[2], step=n, rows=rows, **OPTIONS)
-    return state
 
 
 @pytest.mark.parametrize("shape", [(1,), (7, 3), (50, 5, 3), (9001, 4)])

@@ -3,19 +3,11 @@
 
 import pytest
 import torch
-from torch import Tensor
 
+from parity.adam_steps import OPTIONS, steps
 from structgstream.kernels import cuda_adam, reference_adam
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
-OPTIONS = {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-15}
-
-
-def steps(module, param: Tensor, gradients: list[Tensor], rows: Tensor | None = None) -> list[Tensor]:
-    state = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
-    for n, gradient in enumerate(gradients, start=1):
-        module.adam_step(state[0], gradient.to(param), state[1], state[2], step=n, rows=rows, **OPTIONS)
-    return state
 
 
 @pytest.mark.parametrize("device", DEVICES)

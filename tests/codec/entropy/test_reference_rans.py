@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The oracle of interleaved rANS by numbers that are worked out here, step by step."""
 
+import struct
+
 import numpy as np
 import pytest
 
+from structgstream.codec.entropy.rans import decode, encode, has_native
 from structgstream.codec.entropy.reference_rans import LOW, decode_lanes, encode_lanes
 from structgstream.codec.entropy.tables import FrequencyTables
 
@@ -33,6 +36,20 @@ def test_a_state_that_would_overflow_gives_a_word_first() -> None:
     assert states.tolist() == [x]
     assert found.tolist() == words[::-1]
     assert len(words) == 1
+
+
+@pytest.mark.parametrize(
+    "native", [False, pytest.param(True, marks=pytest.mark.skipif(not has_native(), reason="no C++"))]
+)
+def test_a_state_at_the_very_limit_gives_its_word(native: bool) -> None:
+    """With a frequency of 2048 the state 2^16 doubles with every symbol and stands at its limit, 2^31, after 15."""
+    halves = FrequencyTables(np.array([[2048, 2048]], np.uint16))
+    symbols, contexts = np.zeros(16, np.uint8), np.zeros(16, np.uint16)
+    states, words = encode_lanes(symbols, contexts, halves, lanes=1)
+    assert (states.tolist(), words.tolist()) == ([LOW], [0])
+    data = encode(symbols, contexts, halves, lanes=1, native=native)
+    assert data.endswith(struct.pack("<IH", LOW, 0))
+    assert not decode(data, contexts, halves, native=native).any()
 
 
 def test_lanes_are_apart_but_for_their_words() -> None:

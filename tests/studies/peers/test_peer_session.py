@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from backends import quickest_backend
-from peers.captures import Capture, Watched, moving_capture
+from memory_captures import MemoryCapture
+from peers.captures import Watched, moving_capture
 from structgstream.codec.container.records import scanned
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError, StreamError
@@ -42,7 +43,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     return {name: Run(name, folder) for name in NAMES}
 
 
-def psnr_held_out(drawable, capture: Capture, index: int, path: Path) -> float:
+def psnr_held_out(drawable, capture: MemoryCapture, index: int, path: Path) -> float:
     """Mean PSNR over the held-out cameras."""
     similarity = open_peer(path).header.similarity
     found = []

@@ -11,7 +11,8 @@ import { mkdirSync, readdirSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { readStream } from "@structgstream/core";
 import type { MlpPath } from "../src/index.js";
-import { chromiumPath, openStage } from "../test/support/browser.js";
+import { openStage } from "../test/support/browser.js";
+import { chromiumPath } from "../test/support/chromium.js";
 import { magnified } from "../test/support/compare.js";
 import { compared, viewsOf } from "../test/support/references.js";
 

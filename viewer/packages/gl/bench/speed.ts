@@ -4,7 +4,8 @@
  * browser that this starts, its figures say nothing about a GPU; those of the page's thread and of the sorter hold.
  */
 
-import { chromiumPath, openStage } from "../test/support/browser.js";
+import { openStage } from "../test/support/browser.js";
+import { chromiumPath } from "../test/support/chromium.js";
 
 const [stream, camera] = process.argv.slice(2);
 const executable = chromiumPath();

@@ -5,7 +5,8 @@ import { readdirSync } from "node:fs";
 import { fileURLToPath } from "node:url";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
 import type { MlpPath } from "../src/index.ts";
-import { chromiumPath, openStage, type Stage } from "./support/browser.ts";
+import { openStage, type Stage } from "./support/browser.ts";
+import { chromiumPath } from "./support/chromium.ts";
 import type { Lesser } from "./support/page.ts";
 import { compared } from "./support/references.ts";
 

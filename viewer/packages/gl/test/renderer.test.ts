@@ -3,7 +3,8 @@
 
 import { fileURLToPath } from "node:url";
 import { afterAll, afterEach, beforeAll, describe, expect, test } from "vitest";
-import { chromiumPath, openStage, type Stage } from "./support/browser.ts";
+import { openStage, type Stage } from "./support/browser.ts";
+import { chromiumPath } from "./support/chromium.ts";
 import { bytesOf, difference } from "./support/compare.ts";
 import { viewsOf } from "./support/references.ts";
 

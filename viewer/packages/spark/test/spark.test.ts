@@ -3,7 +3,8 @@
 
 import { fileURLToPath } from "node:url";
 import { afterAll, beforeAll, describe, expect, test } from "vitest";
-import { chromiumPath, openStage, type Stage } from "../../gl/test/support/browser.ts";
+import { openStage, type Stage } from "../../gl/test/support/browser.ts";
+import { chromiumPath } from "../../gl/test/support/chromium.ts";
 import { bytesOf, difference } from "../../gl/test/support/compare.ts";
 import type { Beside } from "./page.ts";
 

@@ -1,37 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 /** A headless browser with WebGL2 in software, and a server on this machine for what it shows. */
 
-import { existsSync } from "node:fs";
 import { readFile } from "node:fs/promises";
 import { createServer, type Server } from "node:http";
 import type { AddressInfo } from "node:net";
 import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
-import { type Browser, chromium, type Page } from "playwright-core";
-
-const USUAL_PLACES = [
-  "/usr/bin/chromium",
-  "/usr/bin/chromium-browser",
-  "/usr/bin/google-chrome",
-  "/usr/bin/chromium-headless-shell",
-  "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-];
-/** Software GL, and no warning that it is. */
-const FLAGS = [
-  "--no-sandbox",
-  "--use-angle=swiftshader",
-  "--enable-unsafe-swiftshader",
-  "--ignore-gpu-blocklist",
-  "--enable-gpu",
-];
-
-/** Where a browser is: the variable CHROMIUM, or one of the usual places; undefined says that tests must skip. */
-export function chromiumPath(): string | undefined {
-  const named = process.env.CHROMIUM;
-  const found = named || USUAL_PLACES.find(existsSync);
-  if (!found) console.warn("Browser tests are skipped: no Chromium; set CHROMIUM to its path.");
-  return found;
-}
+import type { Browser, Page } from "playwright-core";
+import { launched } from "./chromium.ts";
 
 /** One page with the renderer in it, and what went wrong on it. */
 export interface Stage {
@@ -69,7 +45,7 @@ export async function openStage(
   await new Promise<void>((resolve) => server.listen(0, "127.0.0.1", resolve));
   let browser: Browser | undefined;
   try {
-    browser = await chromium.launch({ executablePath, args: FLAGS });
+    browser = await launched(executablePath);
     const opened = await browser.newPage();
     const complaints: string[] = [];
     opened.on("pageerror", (error) => complaints.push(error.message));

@@ -5,9 +5,10 @@ import { readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import type { Page } from "playwright-core";
 import { afterAll, afterEach, beforeAll, describe, expect, test, vi } from "vitest";
+import { chromiumPath } from "../../../gl/test/support/chromium.ts";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
-import { ask, chromiumPath, type Opened, pageWith, Stage, shows } from "./stage.ts";
+import { ask, type Opened, pageWith, Stage, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 

@@ -1,28 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 /** A headless browser with WebGL2 in software, with pages that hold the built player. */
 
-import { existsSync, readFileSync } from "node:fs";
-import { type Browser, type BrowserContextOptions, chromium, type Page } from "playwright-core";
+import { readFileSync } from "node:fs";
+import type { Browser, BrowserContextOptions, Page } from "playwright-core";
+import { launched } from "../../../gl/test/support/chromium.ts";
 import type { StructgstreamPlayer } from "../../src/element.ts";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
-
-const USUAL_PLACES = [
-  "/usr/bin/chromium",
-  "/usr/bin/chromium-browser",
-  "/usr/bin/google-chrome",
-  "/usr/bin/chromium-headless-shell",
-  "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-];
-/** Software GL without a window; garbage can be collected when a test asks for it. */
-const FLAGS = [
-  "--no-sandbox",
-  "--use-angle=swiftshader",
-  "--enable-unsafe-swiftshader",
-  "--ignore-gpu-blocklist",
-  "--enable-gpu",
-  "--js-flags=--expose-gc",
-];
 
 declare global {
   /** What `pageWith` gathers in the page. */
@@ -30,13 +14,6 @@ declare global {
   interface HTMLElementTagNameMap {
     "structgstream-player": StructgstreamPlayer;
   }
-}
-
-/** Where a browser is: the variable CHROMIUM, or one of the usual places; undefined says that tests must skip. */
-export function chromiumPath(): string | undefined {
-  const found = process.env.CHROMIUM || USUAL_PLACES.find((path) => existsSync(path));
-  if (!found) console.warn("SKIPPED: the browser tests of the player: no Chromium; set CHROMIUM to its path.");
-  return found;
 }
 
 export function builtPlayer(): string {
@@ -49,7 +26,7 @@ export interface Opened {
   readonly complaints: string[];
 }
 
-/** One browser and one server for a file of tests. */
+/** One browser, whose garbage can be collected when a test asks for it, and one server for a file of tests. */
 export class Stage {
   private constructor(
     readonly browser: Browser,
@@ -58,7 +35,7 @@ export class Stage {
 
   static async opened(executablePath: string): Promise<Stage> {
     const [browser, server] = await Promise.all([
-      chromium.launch({ executablePath, args: FLAGS }),
+      launched(executablePath, "--js-flags=--expose-gc"),
       TestServer.started(),
     ]);
     server.put("/player.js", builtPlayer(), { type: "text/javascript" });
