@@ -7,14 +7,13 @@ from dataclasses import replace
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS
-from structgstream.codec.compact import quantised
+from structgstream.codec.compact import FREE_FIELDS, quantised
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
 from structgstream.codec.sinks import MemorySink
-from structgstream.codec.static_fields import AS_THEY_ARE, on_bins
+from structgstream.codec.static_fields import UNCODED_FIELDS, on_bins
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
+from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, parameters_of, scene_of, state_of
 from structgstream.similarity import Similarity
 
 
@@ -33,8 +32,7 @@ def header_for(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -
     )
 
 
-_STEPPED: list[str] = [*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS]
-STEPS = dict.fromkeys(_STEPPED, 2.0**-6)
+STEPS: dict[str, float] = {p.name: 2.0**-6 for row in STATE_TABLE for p in row.parameters if p.step}
 STATIC_STEP = 2.0**-7
 
 
@@ -42,12 +40,12 @@ def compact_header(
     scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC, steps: Mapping[str, float] = STEPS
 ) -> StreamHeader:
     """As :func:`header_for`, with codec ``compact``; ``scene`` is the reference."""
-    rows = dynamic.difference(["free", "free_births"])
-    used = {name: step for name, step in steps.items() if name in rows or (name in FREE_STEPS and "free" in dynamic)}
+    rows = dynamic - FREE_FIELDS
+    used = {p.name: steps[p.name] for p in parameters_of(dynamic) if p.name in steps}
     state = state_of(scene)
     reference = quantised(state, used, rows)
     init_steps: dict[FieldName, float] = {
-        name: used.get(name, STATIC_STEP) for name in state if name not in AS_THEY_ARE
+        name: used.get(name, STATIC_STEP) for name in state if name not in UNCODED_FIELDS
     }
     header = header_for(scene, dynamic=dynamic)
     static = on_bins(header.static, init_steps)

@@ -11,22 +11,15 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from structgstream.codec.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
-from structgstream.codec.bins import (
-    ANCHOR_ROWS,
-    FREE_STEPS,
-    WEIGHTS,
-    SceneBins,
-    anchor_fields,
-    binned,
-    coded_scene,
-    valued,
-)
+from structgstream.codec.bins import SceneBins, binned, coded_scene, rounded_fields, valued
 from structgstream.codec.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.errors import StreamError
-from structgstream.scene.state import FieldName
+from structgstream.scene.state import FieldName, fields_of, parameters_of
 
-CODABLE: frozenset[FieldName] = frozenset({*ANCHOR_ROWS, *WEIGHTS, "free", "free_births"})
+FREE_FIELDS: frozenset[FieldName] = frozenset(fields_of("free"))
+"""What becomes of free Gaussians is coded as a whole: all of these are dynamic, or none."""
+CODABLE: frozenset[FieldName] = frozenset(rounded_fields("anchor") + rounded_fields("shared")) | FREE_FIELDS
 """Fields that may be dynamic."""
 
 
@@ -54,10 +47,10 @@ class _Compact:
             )
         if beyond := header.dynamic - CODABLE:
             raise StreamError(f"The compact codec has no coding for {', '.join(sorted(beyond))}; keep it static.")
-        if ("free" in header.dynamic) != ("free_births" in header.dynamic):
+        if header.dynamic & FREE_FIELDS not in (frozenset(), FREE_FIELDS):
             raise StreamError("The header announces free Gaussians without their births, or births without them.")
-        rows = header.dynamic - {"free", "free_births"}
-        needed = {*rows, *(FREE_STEPS if "free" in header.dynamic else ())}
+        rows = header.dynamic - FREE_FIELDS
+        needed = {parameter.name for parameter in parameters_of(header.dynamic) if parameter.step}
         if missing := needed - header.steps.keys():
             raise StreamError(f"The header states no step for {', '.join(sorted(missing))}.")
         if header.reference.keys() != rows:
@@ -76,14 +69,8 @@ class _Compact:
         return self.state.bins, Models(self.state.models)
 
     def _coded(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
-        return coded_scene(
-            coder,
-            after,
-            before,
-            fields=anchor_fields(self._header.dynamic),
-            has_free="free" in self._header.dynamic,
-            where=f"Packet {index}",
-        )
+        has_free = not FREE_FIELDS.isdisjoint(self._header.dynamic)
+        return coded_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
 
     def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
         # What a key packet changes is everything since the reference, and tells nothing of what comes next.
