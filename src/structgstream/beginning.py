@@ -17,7 +17,7 @@ from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of
+from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
 from structgstream.similarity import Similarity
 from structgstream.training.environment import fitted_environment
 from structgstream.training.first_bins import Sensitivity, first_bins, float32, regauged, sensitivity_of
@@ -79,6 +79,7 @@ def begun(
         scene, worth = regauged(scene, worth)
     if "appearance" in dynamic:
         scene = with_appearance(scene, config.online.appearance_rank)
+    scene = with_dynamic_fields(scene, dynamic)
     steps: dict[str, float] = {}
     init_steps: dict[FieldName, float] = {}
     if worth is not None:

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from structgstream.errors import ConfigError
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
@@ -284,6 +285,22 @@ def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) 
     for holder, kind in _PARTS_OF_SCENE.items():
         found[holder] = kind(**found[holder])
     return Scene(**found, distance_input=distance_input)
+
+
+def with_dynamic_fields(scene: Scene, dynamic: Iterable[FieldName]) -> Scene:
+    """``scene``, with zeros for the optional fields of anchors that are to change and that it does without so far.
+
+    Raises:
+        ConfigError: a field is not one of anchors, or the table does not tell how many columns it has.
+    """
+    state = state_of(scene)
+    missing = [FIELDS[name] for name in dynamic if name not in state]
+    for row in missing:
+        columns = [size for size in row.shape[1:] if isinstance(size, int)]
+        if row.granularity != "anchor" or len(columns) < len(row.shape) - 1:
+            raise ConfigError(f"The dynamic set has {row.name}, which the scene does without; take it out of the set.")
+        state[row.name] = scene.anchors.positions.new_zeros(len(scene.anchors), *columns)
+    return scene_of(state, distance_input=scene.distance_input) if missing else scene
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:

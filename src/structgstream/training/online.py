@@ -101,7 +101,7 @@ class OnlineConfig:
 
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
-    """Learning rate of every parameter after ``share`` (0 to 1) of its iterations."""
+    """Learning rate of every parameter after ``share`` (0 to 1) of a frame's iterations."""
     falling = config.rates.final_share**share
     rates: dict[ParameterName, float] = {}
     for row in STATE_TABLE:

@@ -33,10 +33,10 @@ def rounded(value: Tensor, step: float) -> Tensor:
     return _Rounded.apply(value, step)
 
 
-# How many times the quality a field of RoundingConfig is halved; 1 unless it says otherwise. What frame 0 loses every
-# later frame lacks, and its bytes come once: it follows by half. What is no step does not follow as one.
-_FOLLOWS_BY_HALF = {"quality": 0.5}
-_NO_STEP = {"quality": 0.0}
+# The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. What frame 0
+# loses every later frame lacks, and its bytes come once: it follows by half. What is no step has a share of 0.
+_HALF_SHARE = {"quality_share": 0.5}
+_NO_STEP = {"quality_share": 0.0}
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class RoundingConfig:
     free_quat_step: float = 1 / 64
     free_logit_opacity_step: float = 0.125
     free_color_step: float = 1 / 128
-    first_noise_levels: float = field(default=0.5, metadata=_FOLLOWS_BY_HALF)
+    first_noise_levels: float = field(default=0.5, metadata=_HALF_SHARE)
     """Noise that rounding frame 0 may add to the pictures: root of the mean square, in 8-bit levels."""
-    first_weight_step: float = field(default=1 / 1024, metadata=_FOLLOWS_BY_HALF)
+    first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
     """Of the weights of MLPs in frame 0."""
     rate_weight: float = field(default=1.8e-4, metadata=_NO_STEP)
     """Weight in the loss of the bits of a moving anchor."""
@@ -68,8 +68,8 @@ class RoundingConfig:
 
     def resolved(self) -> "RoundingConfig":
         """The same, with the quality put into the other fields and itself 0."""
-        exponents = {f.name: f.metadata.get("quality", 1.0) for f in fields(self)}
-        finer = {n: getattr(self, n) * 2.0 ** (-self.quality * e) for n, e in exponents.items() if e}
+        shares = {f.name: f.metadata.get("quality_share", 1.0) for f in fields(self)}
+        finer = {name: getattr(self, name) * 2.0 ** (-self.quality * share) for name, share in shares.items() if share}
         # Errors grow with the square of a step.
         return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
 
