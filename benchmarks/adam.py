@@ -11,7 +11,7 @@ from benchmarks.benchmark import Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import wall_scene
 from structgstream.kernels import cpu_adam, reference_adam
-from structgstream.scene.state import PAPER_DYNAMIC, state_of
+from structgstream.scene.state import PAPER_DYNAMIC, fields_of, state_of
 from structgstream.training.optim import BETAS, EPS
 
 Trained = Literal["all", "online"]
@@ -24,7 +24,7 @@ def parameters(anchors: int, trained: Trained) -> tuple[list[Tensor], list[Tenso
     values = [
         value
         for name, value in state.items()
-        if not name.startswith(("free", "camera")) and (trained == "all" or name in PAPER_DYNAMIC)
+        if name in fields_of("anchor", "shared") and (trained == "all" or name in PAPER_DYNAMIC)
     ]
     g = torch.Generator().manual_seed(2)
     return [value.clone() for value in values], [torch.randn(value.shape, generator=g) for value in values]

@@ -71,12 +71,10 @@ def wall_scene(anchors: int, *, cameras: int, seed: int = 2) -> Scene:
             log_base_scales=torch.full((anchors, 3), log_spacing) + 0.2 * torch.randn(anchors, 3, generator=g),
             offsets=0.5 * torch.randn(anchors, OFFSETS_PER_ANCHOR, 3, generator=g),
             features=features,
-            appearance=torch.zeros(anchors, 0),
         ),
         mlps=mlps,
         free=FreeGaussians.empty(),
         camera_color=CameraColor.identity(cameras),
-        appearance_basis=torch.zeros(0, FEATURES),
         distance_input=True,
     )
 

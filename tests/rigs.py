@@ -54,7 +54,6 @@ def random_scene(anchors: int = 40, *, free: int = 0, cameras: int = 3, seed: in
             log_base_scales=torch.randn(anchors, 3, generator=g) * 0.1 - 2.0,
             offsets=torch.randn(anchors, k, 3, generator=g),
             features=torch.randn(anchors, width, generator=g),
-            appearance=torch.zeros(anchors, 0),
         ),
         mlps=MLPWeights(opacity=head(k), color=head(3 * k), covariance=head(7 * k)),
         free=FreeGaussians(
@@ -66,6 +65,5 @@ def random_scene(anchors: int = 40, *, free: int = 0, cameras: int = 3, seed: in
             births=births,
         ),
         camera_color=CameraColor.identity(cameras),
-        appearance_basis=torch.zeros(0, width),
         distance_input=True,
     )

@@ -9,11 +9,12 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
-from structgstream.codec.scene.bins import ANCHOR_ROWS, FREE_STEPS, WEIGHTS, binned, on_bins, valued
-from structgstream.codec.scene.static_fields import AS_THEY_ARE
+from structgstream.codec.scene.bins import binned, on_bins, valued
+from structgstream.codec.scene.compact import FREE_FIELDS
+from structgstream.codec.scene.static_fields import UNCODED_FIELDS
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
+from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, parameters_of, scene_of, state_of
 from structgstream.similarity import Similarity
 
 
@@ -32,8 +33,7 @@ def header_for(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -
     )
 
 
-_STEPPED: list[str] = [*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS]
-STEPS = dict.fromkeys(_STEPPED, 2.0**-6)
+STEPS: dict[str, float] = {p.name: 2.0**-6 for row in STATE_TABLE for p in row.parameters if p.step}
 STATIC_STEP = 2.0**-7
 
 
@@ -41,12 +41,12 @@ def compact_header(
     scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC, steps: Mapping[str, float] = STEPS
 ) -> StreamHeader:
     """As :func:`header_for`, with codec ``compact``; ``scene`` is the reference."""
-    rows = dynamic.difference(["free", "free_births"])
-    used = {name: step for name, step in steps.items() if name in rows or (name in FREE_STEPS and "free" in dynamic)}
+    rows = dynamic - FREE_FIELDS
+    used = {p.name: steps[p.name] for p in parameters_of(dynamic) if p.name in steps}
     state = state_of(scene)
     reference = valued(binned(state, rows, used), rows, used)
     init_steps: dict[FieldName, float] = {
-        name: used.get(name, STATIC_STEP) for name in state if name not in AS_THEY_ARE
+        name: used.get(name, STATIC_STEP) for name in state if name not in UNCODED_FIELDS
     }
     header = header_for(scene, dynamic=dynamic)
     static = on_bins(header.static, init_steps)

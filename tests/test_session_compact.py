@@ -16,14 +16,13 @@ from streams import same
 from structgstream import session
 from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.scene.bins import FREE_STEPS
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
 from structgstream.presets import COMPACT, PRESETS, StreamConfig
 from structgstream.rate_control import RateConfig
 from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import PAPER_DYNAMIC, state_of
+from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
 from structgstream.session import FrameReport, Session
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.motion import MotionConfig
@@ -102,7 +101,7 @@ def test_it_moves_and_static_fields_stay() -> None:
 def test_steps_are_float32_and_come_from_a_pixel() -> None:
     header = StreamReader(whole()[0]).header
     dynamic = CONFIG.online.dynamic
-    assert header.steps.keys() == {*dynamic.difference(["free", "free_births"]), *FREE_STEPS}
+    assert header.steps.keys() == {p.name for p in parameters_of(dynamic) if p.step}
     assert all(float(np.float32(step)) == step for step in header.steps.values())
     pixel = pixel_size(header.reference["anchor_positions"], header.similarity.rig(header.rig))
     assert header.steps["anchor_positions"] == pytest.approx(0.02 * pixel, rel=1e-2)

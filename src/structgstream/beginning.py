@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.scene.bins import FREE_STEPS, on_bins
+from structgstream.codec.scene.bins import on_bins
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
 from structgstream.frames import MultiViewFrame
@@ -17,7 +17,7 @@ from structgstream.presets import StreamConfig, to_json
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, scene_of, state_of
+from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
 from structgstream.similarity import Similarity
 from structgstream.training.environment import fitted_environment
 from structgstream.training.first_bins import Sensitivity, first_bins, float32, regauged, sensitivity_of
@@ -79,11 +79,12 @@ def begun(
         scene, worth = regauged(scene, worth)
     if "appearance" in dynamic:
         scene = with_appearance(scene, config.online.appearance_rank)
+    scene = with_dynamic_fields(scene, dynamic)
     steps: dict[str, float] = {}
     init_steps: dict[FieldName, float] = {}
     if worth is not None:
         known = rounding.steps(pixel_size(scene.anchors.positions, rig))
-        used = {*dynamic, *(FREE_STEPS if "free" in dynamic else ())}
+        used = {parameter.name for parameter in parameters_of(dynamic)}
         steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
         voxel_size = config.initial.voxel_size
         scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
@@ -92,7 +93,7 @@ def begun(
         rounded = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
         scene = scene_of(rounded, distance_input=scene.distance_input)
     state = state_of(scene)
-    reference = dynamic.difference(["free", "free_births"]) if steps else ()
+    reference = dynamic.difference(fields_of("free")) if steps else ()
     header = StreamHeader(
         rig=source.rig,
         similarity=similarity,

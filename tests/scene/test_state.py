@@ -1,11 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from typing import get_args
 
+import pytest
 import torch
 
 from rigs import random_scene
+from structgstream.errors import ConfigError
 from structgstream.scene.appearance import with_appearance
-from structgstream.scene.state import FREE_COLUMNS, PAPER_DYNAMIC, STATE_TABLE, scene_of, state_of
+from structgstream.scene.state import (
+    FREE_COLUMNS,
+    PAPER_DYNAMIC,
+    PARAMETERS,
+    STATE_TABLE,
+    FieldName,
+    fields_of,
+    parameters_of,
+    scene_of,
+    state_of,
+    tensor_of,
+    with_dynamic_fields,
+)
 
 
 def test_state_and_scene_are_inverse() -> None:
@@ -17,9 +32,38 @@ def test_state_and_scene_are_inverse() -> None:
         assert torch.equal(again[name], value), name
 
 
-def test_codes_are_never_shared() -> None:
-    codes = [f.code for f in STATE_TABLE]
+def test_codes_and_names_are_never_shared() -> None:
+    codes, names = [f.code for f in STATE_TABLE], [parameter.name for parameter in PARAMETERS]
     assert len(set(codes)) == len(codes)
+    assert len(set(names)) == len(names)
+    assert [row.name for row in STATE_TABLE] == list(get_args(FieldName))
+
+
+def test_parameters_are_the_columns_of_their_field() -> None:
+    scene = replace(with_appearance(random_scene(free=4), 3), environment=torch.rand(9, 3))
+    for row in STATE_TABLE:
+        found = [tensor_of(scene, parameter) for parameter in row.parameters]
+        joined = [value.reshape(len(value), -1) for value in found if value is not None]
+        assert torch.equal(torch.cat(joined, dim=1), state_of(scene)[row.name].reshape(len(joined[0]), -1))
+        assert not row.parts or row.shape[-1] == sum(parameter.columns for parameter in row.parts)
+
+
+def test_every_field_has_rows_of_one_kind() -> None:
+    assert fields_of("free") == ("free", "free_births")
+    assert {*fields_of("anchor", "free", "camera", "shared")} == {row.name for row in STATE_TABLE}
+    assert [p.name for p in parameters_of(["camera_color", "environment"])] == [
+        "camera_gains",
+        "camera_biases",
+        "environment",
+    ]
+
+
+def test_a_dynamic_field_that_nothing_begins_is_refused() -> None:
+    scene = random_scene()
+    assert with_dynamic_fields(scene, PAPER_DYNAMIC) is scene
+    for name in ("appearance", "environment"):
+        with pytest.raises(ConfigError, match=f"dynamic set has {name}, which the scene does without"):
+            with_dynamic_fields(scene, {*PAPER_DYNAMIC, name})
 
 
 def test_the_papers_lifetimes() -> None:

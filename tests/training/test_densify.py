@@ -5,16 +5,18 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.state import ParameterName
 from structgstream.training.densify import Densifier
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import ANCHOR_ROWS, ParameterName, Parameters
+from structgstream.training.parameters import ANCHOR_ROWS, Parameters
 
 CONFIG = GrowthConfig(collect_from=0, start=0, interval=5, eligible_count=0, prune_visits=0)
 
 
 def prepared():
-    scene = random_scene(30)
+    scene = with_appearance(random_scene(30), 2)
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
     densifier = Densifier.of(scene, config=CONFIG, iterations=1000, voxel_size=0.01)
     adam = Adam(reference_backend())
@@ -67,6 +69,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
     assert densifier.gradients.count.shape == (rows * 5,)
     assert (densifier.gradients.count == 0).all()  # All were eligible, so all start again.
     assert (parameters.values["anchor_offsets"][26:] == 0).all()
+    assert (parameters.values["appearance"][26:] == 0).all()
 
 
 def test_base_scales_are_bounded() -> None:

@@ -7,8 +7,9 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
+from structgstream.scene.state import ParameterName
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import FREE_ROWS, ParameterName, Parameters, parameters_of_fields
+from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.population import patched
 from structgstream.training.statistics import GradientStatistics

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.scene.bins import ANCHOR_ROWS, FREE_STEPS, LARGEST, WEIGHTS, binned, valued
+from structgstream.codec.scene.bins import LARGEST, binned, valued
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.scene.appearance import with_appearance
-from structgstream.scene.state import FieldName, state_of
+from structgstream.scene.state import FieldName, ParameterName, parameters_of, state_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.rounding import RoundingConfig, pixel_size, rounded
 
@@ -37,19 +37,21 @@ def test_a_value_of_a_bin_stays_where_it_is(step: float) -> None:
 def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
     """Both round in float32: the scene of a fit has no other values than those that its bins stand for."""
     scene = with_appearance(random_scene(300, free=40, seed=8), 8)
-    steps = {name: float(np.float32(step)) for name, step in RoundingConfig().steps(0.0123).items()}
-    parameters = Parameters.of(scene, trained=parameters_of_fields(CODABLE), steps=steps)  # type: ignore[arg-type]
+    known = RoundingConfig().steps(0.0123)
+    steps: dict[ParameterName, float] = {name: float(np.float32(step)) for name, step in known.items()}
+    parameters = Parameters.of(scene, trained=parameters_of_fields(CODABLE), steps=steps)
     drawn: dict[FieldName, torch.Tensor] = {
         name: value.detach() for name, value in state_of(parameters.scene(scene)).items()
     }
-    sent = valued(binned(drawn, CODABLE, steps), CODABLE, steps)
+    of_codec: dict[str, float] = {**steps}
+    sent = valued(binned(drawn, CODABLE, of_codec), CODABLE, of_codec)
     for name, value in sent.items():
         assert torch.equal(value, drawn[name]), name
 
 
 def test_there_is_a_step_for_everything_that_can_change() -> None:
     steps = RoundingConfig(position_pixels=0.5).steps(0.01)
-    assert steps.keys() == {*ANCHOR_ROWS, *WEIGHTS, *FREE_STEPS}
+    assert steps.keys() == {p.name for p in parameters_of(CODABLE) if p.step}
     assert steps["anchor_positions"] == steps["free_means"] == 0.005
     assert all(step > 0 for step in steps.values())
 
@@ -73,8 +75,7 @@ def test_every_field_follows_the_quality() -> None:
     assert resolved.quality == 0.0
     assert resolved.resolved() == resolved
     others = {field.name for field in fields(plain)} - {"quality", "rate_weight", "free_priced"}
-    first = {name for name in others if name.startswith("first_")}
-    assert len(first) == 2
+    first = {"first_noise_levels", "first_weight_step"}
     assert all(getattr(resolved, name) == getattr(plain, name) / 2 for name in others - first)
     assert all(getattr(resolved, name) == pytest.approx(getattr(plain, name) / 2**0.5) for name in first)
 

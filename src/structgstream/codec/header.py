@@ -14,9 +14,9 @@ from structgstream.codec.container.blocks import coded_block, mixed_blocks, pack
 from structgstream.codec.container.init_record import description_of, first_block, packed_init
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.scene.shapes import check_shapes
-from structgstream.codec.scene.static_fields import AS_THEY_ARE, decoded_fields, encoded_fields
+from structgstream.codec.scene.static_fields import UNCODED_FIELDS, decoded_fields, encoded_fields
 from structgstream.errors import CalibrationError, StreamError
-from structgstream.scene.state import REQUIRED, STATE_TABLE, FieldName
+from structgstream.scene.state import STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
 
 MAX_IMAGE_SIDE = 65_535
@@ -87,8 +87,8 @@ def unpacked_header(payload: bytes) -> StreamHeader:
 
 
 def _complete(names: Set[FieldName]) -> bool:
-    optional = names - REQUIRED - {"environment"}
-    return names >= REQUIRED and (not optional or optional == {"appearance", "appearance_basis"})
+    begun = {row.optional for row in STATE_TABLE if row.name in names}
+    return names == {row.name for row in STATE_TABLE if row.optional is None or row.optional in begun}
 
 
 def _fields(
@@ -98,7 +98,7 @@ def _fields(
         if coded:
             raise StreamError(f"The init record holds field {next(iter(coded))} coded, which its codec does not know.")
         return values
-    if plain := sorted(values.keys() - AS_THEY_ARE):
+    if plain := sorted(values.keys() - UNCODED_FIELDS):
         raise StreamError(f"The init record holds field {plain[0]} as it is, where it should be coded.")
     return values | decoded_fields(coded, _steps(description.get("init_steps", {})))
 

@@ -17,7 +17,7 @@ class AnchorCloud:
         offsets: ``[M, K, 3]`` the paper's O_v, in units of l_v.
         features: ``[M, D]`` the paper's f_v.
         appearance: ``[M, R]`` how far the features have left f_v since frame 0, along the rows of the scene's
-            ``appearance_basis``. R is 0 unless a configuration lets appearance change.
+            ``appearance_basis``; None unless a configuration lets appearance change.
 
     Note [Two scales]
     ~~~~~~~~~~~~~~~~~
@@ -31,7 +31,7 @@ class AnchorCloud:
     log_base_scales: Tensor
     offsets: Tensor
     features: Tensor
-    appearance: Tensor
+    appearance: Tensor | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -43,11 +43,14 @@ class AnchorCloud:
 
     def select(self, rows: Tensor) -> "AnchorCloud":
         """The anchors of a mask or of indices ``[m]``, contiguous."""
-        return AnchorCloud(**{f.name: getattr(self, f.name)[rows].contiguous() for f in fields(self)})
+        return AnchorCloud(**{name: column[rows].contiguous() for name, column in self._columns().items()})
 
     def with_rows(self, rows: Tensor, other: "AnchorCloud") -> "AnchorCloud":
         """The same, those of the mask ``rows`` ``[M]`` replaced by ``other``; nothing is written in place."""
-        columns = {f.name: getattr(self, f.name).clone() for f in fields(self)}
+        columns = {name: column.clone() for name, column in self._columns().items()}
         for name, column in columns.items():
             column[rows] = getattr(other, name)
         return AnchorCloud(**columns)
+
+    def _columns(self) -> dict[str, Tensor]:
+        return {f.name: column for f in fields(self) if (column := getattr(self, f.name)) is not None}

@@ -26,8 +26,9 @@ class Scene:
         mlps: F_alpha, F_c and F_Sigma.
         free: the free part.
         camera_color: one row for each training camera of the rig, in rig order.
-        appearance_basis: ``[R, D]`` directions in which the anchors' features may change after frame 0.
         distance_input: whether the MLPs see the distance to the camera (the paper: yes; Scaffold-GS: no).
+        appearance_basis: ``[R, D]`` directions in which the anchors' features may change after frame 0; None with no
+            ``appearance``.
         environment: ``[(degree + 1)^2, 3]`` what is behind everything (``scene/environment.py``); None for black.
     """
 
@@ -35,29 +36,24 @@ class Scene:
     mlps: MLPWeights
     free: FreeGaussians
     camera_color: CameraColor
-    appearance_basis: Tensor
     distance_input: bool = True
+    appearance_basis: Tensor | None = None
     environment: Tensor | None = None
 
     @property
     def features(self) -> Tensor:
         """What the MLPs see of each anchor now, ``[M, D]``."""
         anchors = self.anchors
-        if not len(self.appearance_basis):
+        if anchors.appearance is None or self.appearance_basis is None:
             return anchors.features
         return anchors.features + anchors.appearance @ self.appearance_basis
 
     def baked(self) -> "Scene":
         """The same looks, with the appearance in the features: for many looks at a scene that stays as it is."""
-        anchors = self.anchors
-        if not len(self.appearance_basis):
+        if self.appearance_basis is None:
             return self
-        none = anchors.appearance[:, :0].contiguous()
-        return replace(
-            self,
-            anchors=replace(anchors, features=self.features, appearance=none),
-            appearance_basis=self.appearance_basis[:0],
-        )
+        anchors = replace(self.anchors, features=self.features, appearance=None)
+        return replace(self, anchors=anchors, appearance_basis=None)
 
     def background(self, camera: Camera) -> Tensor | None:
         """The colour ``[3]`` of the environment where ``camera`` looks; None for black."""

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state table: every piece of a scene, and whether it lives for a stream or for a frame.
+"""The state table: every piece of a scene, where it is, how long it lives, how it is learned and how it is sent.
 
 Note [State table]
 ~~~~~~~~~~~~~~~~~~
-Four subsystems read this one table instead of each keeping a list: the optimiser trains the dynamic fields, the
-stream's init record carries the static ones, packets carry the dynamic ones, and size accounting sums over both. Half
-of the paper's ablations are edits of the dynamic set.
+Nobody else keeps a list of fields. The optimiser trains the parameters of the dynamic fields at the rates that rows
+name, the quantiser rounds them to the steps that rows name, the stream's init record carries the static fields and
+packets the dynamic ones in the coding that rows state, and size accounting sums over both. Half of the paper's
+ablations are edits of the dynamic set. The order of rows is the order of fields in a stream.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from operator import attrgetter
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from structgstream.errors import ConfigError
 from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
@@ -37,6 +40,53 @@ FieldName = Literal[
     "appearance_basis",
     "environment",
 ]
+ParameterName = (
+    FieldName
+    | Literal[
+        "free_means",
+        "free_log_scales",
+        "free_quats",
+        "free_logit_opacities",
+        "free_colors",
+        "camera_gains",
+        "camera_biases",
+    ]
+)
+Granularity = Literal["anchor", "free", "camera", "shared"]
+"""What there is one of for each row of a field; a shared field holds for the whole scene."""
+InitCoding = Literal["uncoded", "positions", "rows", "numbers"]
+"""How the init record of a compact stream holds a field (docs/bitstream.md, section Coded init fields)."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A tensor of the scene that is trained and rounded by itself: a field, or some columns of one.
+
+    Args:
+        name: its name in configurations and in the header's steps.
+        path: of the attribute in a :class:`Scene`.
+        columns: how many of its field's columns it has; one column is a vector in the scene. 0: the whole field.
+        step: the field of ``RoundingConfig`` by which it is sent rounded after frame 0; None for what never is.
+        online_rate: the field of ``OnlineRates`` at which it is trained after frame 0; None for not at all.
+        first_rate: the field of ``InitialRates`` at which frame 0 trains it; None for not at all.
+    """
+
+    name: ParameterName
+    path: str
+    columns: int = 0
+    step: str | None = None
+    online_rate: str | None = None
+    first_rate: str | None = None
+
+    @property
+    def trainable(self) -> bool:
+        """Whether there is a rate for it."""
+        return self.online_rate is not None or self.first_rate is not None
+
+    @property
+    def attribute(self) -> str:
+        """The last part of the path: the attribute's name in the part of the scene that holds it."""
+        return self.path.rpartition(".")[2]
 
 
 @dataclass(frozen=True)
@@ -47,37 +97,135 @@ class StateField:
         name: the field's name in streams, reports and configurations.
         code: its number in a stream; never reused.
         symbol: the paper's symbol.
+        granularity: what it has a row for.
+        shape: numbers, and letters that are the same size wherever they stand (docs/bitstream.md, section Fields).
+        path: of the attribute in a :class:`Scene`; empty for a field with ``parts``.
+        parts: the parameters whose columns the field is made of, if it is not one parameter itself.
         dynamic: whether the paper changes it after frame 0.
-        optional: whether a scene may do without it.
+        optional: what a scene may do without: fields of the same word come together or not at all. None: required.
+        integers: whether it holds int64 instead of float32.
+        outputs: of an MLP, the numbers that it gives for each of an anchor's Gaussians; 0 for other fields.
+        init_coding: how the init record of a compact stream holds it.
+        step, online_rate, first_rate: as of :class:`Parameter`.
+        init_step: the field of ``RoundingConfig`` by which frame 0 is sent rounded; ``sensitivity`` where what the
+            cameras see decides, ``own`` where the code that makes the field does. Without one it is ``step``.
     """
 
     name: FieldName
     code: int
     symbol: str
-    dynamic: bool
-    optional: bool = False
+    granularity: Granularity
+    shape: tuple[str | int, ...]
+    path: str = ""
+    parts: tuple[Parameter, ...] = ()
+    dynamic: bool = False
+    optional: str | None = None
+    integers: bool = False
+    outputs: int = 0
+    init_coding: InitCoding = "uncoded"
+    step: str | None = None
+    online_rate: str | None = None
+    first_rate: str | None = None
+    init_step: str | None = None
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parts, or the field itself as the only one."""
+        return self.parts or (Parameter(self.name, self.path, 0, self.step, self.online_rate, self.first_rate),)
+
+    @property
+    def rounded(self) -> bool:
+        """Whether packets of a compact stream can carry the field, as bins."""
+        return all(parameter.step for parameter in self.parameters)
 
 
 STATE_TABLE: tuple[StateField, ...] = (
-    StateField("anchor_positions", 1, "x_v", True),
-    StateField("offset_scales", 2, "l_v", True),
-    StateField("base_scales", 3, "l_v (second half)", False),
-    StateField("anchor_offsets", 4, "O_v", False),
-    StateField("anchor_features", 5, "f_v", False),
-    StateField("opacity_mlp", 6, "F_alpha", False),
-    StateField("color_mlp", 7, "F_c", False),
-    StateField("covariance_mlp", 8, "F_Sigma", True),
-    StateField("free", 9, "free 3DGs", True),
-    StateField("free_births", 10, "free 3DGs", True),
-    StateField("camera_color", 11, "-", False),
-    StateField("appearance", 12, "-", False, optional=True),
-    StateField("appearance_basis", 13, "-", False, optional=True),
-    StateField("environment", 14, "-", False, optional=True),
-)
+    StateField(
+        "anchor_positions", 1, "x_v", "anchor", ("M", 3), "anchors.positions", dynamic=True,
+        init_coding="positions", init_step="own",
+        step="position_pixels", online_rate="anchor_positions", first_rate="positions",
+    ),
+    StateField(
+        "offset_scales", 2, "l_v", "anchor", ("M", 3), "anchors.log_offset_scales", dynamic=True,
+        init_coding="rows", step="log_scale_step", online_rate="offset_scales", first_rate="scales",
+    ),
+    StateField(
+        "base_scales", 3, "l_v (second half)", "anchor", ("M", 3), "anchors.log_base_scales",
+        init_coding="rows", init_step="sensitivity",
+        step="log_scale_step", online_rate="base_scales", first_rate="scales",
+    ),
+    StateField(
+        "anchor_offsets", 4, "O_v", "anchor", ("M", "K", 3), "anchors.offsets",
+        init_coding="rows", init_step="sensitivity", online_rate="anchor_offsets", first_rate="offsets",
+    ),
+    StateField(
+        "anchor_features", 5, "f_v", "anchor", ("M", "D"), "anchors.features",
+        init_coding="rows", init_step="sensitivity", online_rate="anchor_features", first_rate="features",
+    ),
+    StateField(
+        "opacity_mlp", 6, "F_alpha", "shared", ("P_alpha",), "mlps.opacity", outputs=1,
+        init_coding="numbers", init_step="first_weight_step",
+        step="weight_step", online_rate="opacity_mlp", first_rate="opacity_mlp",
+    ),
+    StateField(
+        "color_mlp", 7, "F_c", "shared", ("P_c",), "mlps.color", outputs=3,
+        init_coding="numbers", init_step="first_weight_step",
+        step="weight_step", online_rate="color_mlp", first_rate="color_mlp",
+    ),
+    StateField(
+        "covariance_mlp", 8, "F_Sigma", "shared", ("P_Sigma",), "mlps.covariance", dynamic=True, outputs=7,
+        init_coding="numbers", init_step="first_weight_step",
+        step="weight_step", online_rate="covariance_mlp", first_rate="covariance_mlp",
+    ),
+    StateField(
+        "free", 9, "free 3DGs", "free", ("F", 14), dynamic=True,
+        parts=(
+            Parameter("free_means", "free.means", 3, "position_pixels", "free_means"),
+            Parameter("free_log_scales", "free.log_scales", 3, "free_log_scale_step", "free_log_scales"),
+            Parameter("free_quats", "free.quats", 4, "free_quat_step", "free_quats"),
+            Parameter("free_logit_opacities", "free.logit_opacities", 1, "free_logit_opacity_step",
+                      "free_logit_opacities"),
+            Parameter("free_colors", "free.colors", 3, "free_color_step", "free_colors"),
+        ),
+    ),
+    StateField("free_births", 10, "free 3DGs", "free", ("F",), "free.births", dynamic=True, integers=True),
+    StateField(
+        "camera_color", 11, "-", "camera", ("V", 6),
+        parts=(
+            Parameter("camera_gains", "camera_color.gains", 3, first_rate="camera_color"),
+            Parameter("camera_biases", "camera_color.biases", 3, first_rate="camera_color"),
+        ),
+    ),
+    StateField(
+        "appearance", 12, "-", "anchor", ("M", "R"), "anchors.appearance", optional="appearance",
+        init_coding="rows", step="appearance_step", online_rate="appearance",
+    ),
+    StateField(
+        "appearance_basis", 13, "-", "shared", ("R", "D"), "appearance_basis", optional="appearance",
+        init_coding="numbers", init_step="own",
+    ),
+    StateField(
+        "environment", 14, "-", "shared", ("E", 3), "environment", optional="environment",
+        init_coding="numbers", init_step="own",
+    ),
+)  # fmt: skip
 
-REQUIRED: frozenset[FieldName] = frozenset(f.name for f in STATE_TABLE if not f.optional)
-PAPER_DYNAMIC: frozenset[FieldName] = frozenset(f.name for f in STATE_TABLE if f.dynamic)
-FREE_COLUMNS = 14  # mean 3, log-scale 3, quaternion 4, logit opacity 1, colour 3
+FIELDS: Mapping[FieldName, StateField] = {row.name: row for row in STATE_TABLE}
+PARAMETERS: tuple[Parameter, ...] = tuple(parameter for row in STATE_TABLE for parameter in row.parameters)
+REQUIRED: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if not row.optional)
+PAPER_DYNAMIC: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if row.dynamic)
+FREE_COLUMNS = sum(parameter.columns for parameter in FIELDS["free"].parts)
+_PARTS_OF_SCENE = {"anchors": AnchorCloud, "mlps": MLPWeights, "free": FreeGaussians, "camera_color": CameraColor}
+
+
+def fields_of(*granularities: Granularity) -> tuple[FieldName, ...]:
+    """The fields that have a row for each anchor, free Gaussian or camera, or are shared, in the table's order."""
+    return tuple(row.name for row in STATE_TABLE if row.granularity in granularities)
+
+
+def parameters_of(names: Iterable[FieldName]) -> tuple[Parameter, ...]:
+    """What fields are made of, in the order of ``names``."""
+    return tuple(parameter for name in names for parameter in FIELDS[name].parameters)
 
 
 def flatten_head(head: HeadWeights) -> Tensor:
@@ -85,66 +233,74 @@ def flatten_head(head: HeadWeights) -> Tensor:
     return torch.cat([weight.reshape(-1) for weight in head])
 
 
-def unflatten_head(vector: Tensor, inputs: int, outputs: int, hidden: int) -> HeadWeights:
+def unflatten_head(vector: Tensor, inputs: int, outputs: int) -> HeadWeights:
     """The inverse of :func:`flatten_head` for a head of the given widths."""
-    sizes = (hidden * inputs, hidden, outputs * hidden, outputs)
-    w1, b1, w2, b2 = vector.split(sizes)
+    hidden = (len(vector) - outputs) // (inputs + 1 + outputs)
+    w1, b1, w2, b2 = vector.split((hidden * inputs, hidden, outputs * hidden, outputs))
     return HeadWeights(w1.reshape(hidden, inputs), b1, w2.reshape(outputs, hidden), b2)
+
+
+def tensor_of(scene: Scene, parameter: Parameter) -> Tensor | None:
+    """A parameter's tensor in ``scene``, an MLP as one vector; None where the scene does without it."""
+    value = attrgetter(parameter.path)(scene)
+    return flatten_head(value) if isinstance(value, HeadWeights) else value
 
 
 def state_of(scene: Scene) -> dict[FieldName, Tensor]:
     """The scene as named tensors, one for each row of the table that it has."""
-    anchors, free, color = scene.anchors, scene.free, scene.camera_color
-    state: dict[FieldName, Tensor] = {
-        "anchor_positions": anchors.positions,
-        "offset_scales": anchors.log_offset_scales,
-        "base_scales": anchors.log_base_scales,
-        "anchor_offsets": anchors.offsets,
-        "anchor_features": anchors.features,
-        "opacity_mlp": flatten_head(scene.mlps.opacity),
-        "color_mlp": flatten_head(scene.mlps.color),
-        "covariance_mlp": flatten_head(scene.mlps.covariance),
-        "free": torch.cat([free.means, free.log_scales, free.quats, free.logit_opacities[:, None], free.colors], dim=1),
-        "free_births": free.births,
-        "camera_color": torch.cat([color.gains, color.biases], dim=1),
-    }
-    if len(scene.appearance_basis):
-        state |= {"appearance": anchors.appearance, "appearance_basis": scene.appearance_basis}
-    if scene.environment is not None:
-        state["environment"] = scene.environment
+    state: dict[FieldName, Tensor] = {}
+    for row in STATE_TABLE:
+        found = [(p, value) for p in row.parameters if (value := tensor_of(scene, p)) is not None]
+        if row.parts:
+            state[row.name] = torch.cat([value.reshape(len(value), p.columns) for p, value in found], dim=1)
+        elif found:
+            state[row.name] = found[0][1]
     return state
 
 
 def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scene:
     """The inverse of :func:`state_of`; nothing is copied that a view can give."""
-    features, offsets = state["anchor_features"], state["anchor_offsets"]
-    k = offsets.shape[1]
-    inputs = features.shape[1] + 3 + int(distance_input)
-    hidden = state["opacity_mlp"].shape[0] - k
-    hidden //= inputs + 1 + k
-    means, log_scales, quats, logits, colors = state["free"].split((3, 3, 4, 1, 3), dim=1)
-    gains, biases = state["camera_color"].split((3, 3), dim=1)
-    anchors = AnchorCloud(
-        positions=state["anchor_positions"],
-        log_offset_scales=state["offset_scales"],
-        log_base_scales=state["base_scales"],
-        offsets=offsets,
-        features=features,
-        appearance=state.get("appearance", features[:, :0]),
-    )
-    return Scene(
-        anchors=anchors,
-        mlps=MLPWeights(
-            opacity=unflatten_head(state["opacity_mlp"], inputs, k, hidden),
-            color=unflatten_head(state["color_mlp"], inputs, 3 * k, hidden),
-            covariance=unflatten_head(state["covariance_mlp"], inputs, 7 * k, hidden),
-        ),
-        free=FreeGaussians(means, log_scales, quats, logits[:, 0], colors, state["free_births"]),
-        camera_color=CameraColor(gains, biases),
-        appearance_basis=state.get("appearance_basis", features[:0]),
-        distance_input=distance_input,
-        environment=state.get("environment"),
-    )
+    values: dict[ParameterName, Tensor] = {}
+    for name, value in state.items():
+        row = FIELDS[name]
+        columns = value.split([p.columns for p in row.parts], dim=1) if row.parts else (value,)
+        for parameter, tensor in zip(row.parameters, columns, strict=True):
+            values[parameter.name] = tensor[:, 0] if parameter.columns == 1 else tensor
+    return scene_from(values, distance_input=distance_input)
+
+
+def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) -> Scene:
+    """The scene of which ``values`` are the parameters' tensors (:func:`tensor_of`)."""
+    k, inputs = values["anchor_offsets"].shape[1], values["anchor_features"].shape[1] + 3 + int(distance_input)
+    found: dict[str, Any] = {holder: {} for holder in _PARTS_OF_SCENE}
+    for row in STATE_TABLE:
+        for parameter in row.parameters:
+            value: Any = values.get(parameter.name)
+            if value is None:
+                continue
+            if row.outputs:
+                value = unflatten_head(value, inputs, row.outputs * k)
+            holder = parameter.path.rpartition(".")[0]
+            (found[holder] if holder else found)[parameter.attribute] = value
+    for holder, kind in _PARTS_OF_SCENE.items():
+        found[holder] = kind(**found[holder])
+    return Scene(**found, distance_input=distance_input)
+
+
+def with_dynamic_fields(scene: Scene, dynamic: Iterable[FieldName]) -> Scene:
+    """``scene``, with zeros for the optional fields of anchors that are to change and that it does without so far.
+
+    Raises:
+        ConfigError: a field is not one of anchors, or the table does not tell how many columns it has.
+    """
+    state = state_of(scene)
+    missing = [FIELDS[name] for name in dynamic if name not in state]
+    for row in missing:
+        columns = [size for size in row.shape[1:] if isinstance(size, int)]
+        if row.granularity != "anchor" or len(columns) < len(row.shape) - 1:
+            raise ConfigError(f"The dynamic set has {row.name}, which the scene does without; take it out of the set.")
+        state[row.name] = scene.anchors.positions.new_zeros(len(scene.anchors), *columns)
+    return scene_of(state, distance_input=scene.distance_input) if missing else scene
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.scene import Scene
+from structgstream.scene.state import ParameterName
 from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import ANCHOR_ROWS, ParameterName, Parameters
+from structgstream.training.parameters import ANCHOR_ROWS, Parameters, values_of_rows
 from structgstream.training.statistics import GradientStatistics
 
 
@@ -71,15 +73,10 @@ class Densifier:
         self.opacities.visits[judged] = 0.0
         keep = ~remove
         log_cells = new.cell_sizes.log()[:, None].expand(-1, 3)
-        added: dict[ParameterName, Tensor] = {
-            "anchor_positions": new.positions,
-            "offset_scales": log_cells,
-            "base_scales": log_cells,
-            "anchor_offsets": new.positions.new_zeros(len(new), k, 3),
-            "anchor_features": new.features,
-            "appearance": new.positions.new_zeros(len(new), 0),
-        }
-        self._replace(parameters, adam, keep=keep, added=added, count=len(new))
+        anchors = AnchorCloud(
+            new.positions, log_cells, log_cells, new.positions.new_zeros(len(new), k, 3), new.features
+        )
+        self._replace(parameters, adam, keep=keep, added=values_of_rows(anchors, ANCHOR_ROWS), count=len(new))
         parameters.values["base_scales"].detach().clamp_(max=0.05)
         return len(new), int(remove.sum())
 
@@ -90,10 +87,7 @@ class Densifier:
     def judge(self, contributions: Tensor, parameters: Parameters, adam: Adam) -> int:
         """Remove the anchors whose ``contributions`` ``[M]`` (shares of the mean) are too small; tells how many."""
         keep = contributions >= self.config.least_contribution
-        added: dict[ParameterName, Tensor] = {
-            name: values.detach()[:0] for name, values in parameters.values.items() if name in ANCHOR_ROWS
-        }
-        self._replace(parameters, adam, keep=keep, added=added, count=0)
+        self._replace(parameters, adam, keep=keep, added={}, count=0)
         return int((~keep).sum())
 
     def _replace(
@@ -107,7 +101,7 @@ class Densifier:
     ) -> None:
         """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor."""
         k = self.offsets_per_anchor
-        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
+        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added, count=count)
         adam.replace_rows(ANCHOR_ROWS, keep=keep, added=count)
         for statistics in (self.gradients, self.opacities):
             rows = keep.repeat_interleave(k) if statistics is self.gradients else keep

@@ -27,10 +27,10 @@ from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, scene_of, state_of
+from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, scene_of, state_of
 from structgstream.training.rounding import RoundingConfig, rounded
 
-MEASURED: tuple[FieldName, ...] = ("base_scales", "anchor_offsets", "anchor_features")
+MEASURED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
 FINEST, COARSEST = -1, 2
 """Of an anchor's step, as powers of two times that of an average one: what is hidden now may come to light."""
 _LEAST_SHARE = 1e-4  # of the largest eigenvalue: directions of features are not stretched further than by 100
@@ -165,16 +165,15 @@ def first_bins(
     state["anchor_offsets"] = torch.where(used, state["anchor_offsets"] + lost[:, None], 0.0)
     for name, worth in sensitivity.fields.items():
         found[name], state[name] = _coarsened(state[name], worth, most, counted=counted.get(name))
-    for name in ("opacity_mlp", "color_mlp", "covariance_mlp"):
-        found[name] = float32(plain.first_weight_step)
-        state[name] = rounded(state[name], found[name])
-    found["offset_scales"] = float32(steps.get("offset_scales", plain.log_scale_step))
-    state["offset_scales"] = rounded(state["offset_scales"], found["offset_scales"])
-    if "appearance" in state:
-        found["appearance"] = float32(steps.get("appearance", plain.appearance_step))
-        shortest = float(state["appearance_basis"].norm(dim=1).min())
+    if scene.appearance_basis is not None:
+        shortest = float(scene.appearance_basis.norm(dim=1).min())
         found["appearance_basis"] = float32(max(shortest / 64, 1e-9))
-        for name in ("appearance", "appearance_basis"):
+        state["appearance_basis"] = rounded(state["appearance_basis"], found["appearance_basis"])
+    for name in state.keys() - found.keys():
+        row = FIELDS[name]
+        if row.init_coding != "uncoded" and (key := row.init_step or row.step) not in (None, "own"):
+            step = getattr(plain, key) if row.init_step else steps.get(name, getattr(plain, key))
+            found[name] = float32(step)
             state[name] = rounded(state[name], found[name])
     return scene_of(state, distance_input=scene.distance_input), found
 

@@ -9,13 +9,14 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
 from structgstream.training.disturbance import DisturbanceConfig, disturbance_at, disturbed_center
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, Rate, constant
-from structgstream.training.parameters import ParameterName, Parameters, detached
+from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
 from structgstream.training.result import FitResult, Step, StepListener
 from structgstream.training.seeding import seeded_scene
 from structgstream.training.solidity import SolidityConfig
@@ -82,20 +83,13 @@ class InitialConfig:
 
 
 def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[ParameterName, float]:
-    """Learning rate of every parameter after ``iteration`` steps; ``extent`` is 1.1 rig radii in scene units."""
+    """Rate of every parameter of frame 0 after ``iteration`` steps; ``extent`` is 1.1 rig radii in scene units."""
     share = iteration / config.schedule_iterations
-    r = config.rates
+    units = {"offsets": extent}
     return {
-        "anchor_positions": r.positions.at(share),
-        "anchor_offsets": r.offsets.at(share) * extent,
-        "anchor_features": r.features.at(share),
-        "offset_scales": r.scales.at(share),
-        "base_scales": r.scales.at(share),
-        "opacity_mlp": r.opacity_mlp.at(share),
-        "covariance_mlp": r.covariance_mlp.at(share),
-        "color_mlp": r.color_mlp.at(share),
-        "camera_gains": r.camera_color.at(share),
-        "camera_biases": r.camera_color.at(share),
+        parameter.name: getattr(config.rates, parameter.first_rate).at(share) * units.get(parameter.first_rate, 1.0)
+        for parameter in PARAMETERS
+        if parameter.first_rate
     }
 
 
@@ -143,7 +137,7 @@ def fit_first_frame(
     )
     trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
     if not config.camera_color:
-        trained -= {"camera_gains", "camera_biases"}
+        trained.difference_update(CAMERA_ROWS)
     parameters = Parameters.of(template, trained=frozenset(trained))
     adam = Adam(backend)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)

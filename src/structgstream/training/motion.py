@@ -16,7 +16,7 @@ from torch.nn.functional import max_pool2d
 
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName
+from structgstream.scene.state import FieldName, Granularity, fields_of, parameters_of
 from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
 from structgstream.training.picture_change import PictureChange, picture_changes
 from structgstream.training.residuals import ResidualFloor, residual_of
@@ -61,7 +61,7 @@ class MotionConfig:
     """Draw only the tiles that moving Gaussians reach. Off: whole pictures, for the same result at their cost."""
 
 
-SHARED_FIELDS: frozenset[FieldName] = frozenset({"opacity_mlp", "color_mlp", "covariance_mlp", "camera_color"})
+SHARED_FIELDS: frozenset[FieldName] = frozenset(fields_of("shared", "camera"))
 """What all anchors share changes only in frames in which everything may move: what stands still depends on it."""
 
 FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS = 0.3, 20.0
@@ -103,17 +103,17 @@ class Moving:
 def changed_since(older: Scene, scene: Scene) -> Tensor:
     """Mask ``[M + F]``, anchors before free Gaussians, of what ``scene`` has otherwise than ``older`` or not at all."""
 
-    def differs(name: str, now: object, then: object) -> Tensor:
-        changed = getattr(now, name) != getattr(then, name)
-        return changed if changed.dim() == 1 else changed.any(1)
+    def differs(granularity: Granularity, now: object, then: object) -> Tensor:
+        names = [p.attribute for p in parameters_of(fields_of(granularity)) if p.step]
+        pairs = [(getattr(now, name), getattr(then, name)) for name in names]
+        changes = [one != other for one, other in pairs if one is not None and other is not None]
+        return torch.stack([change if change.dim() == 1 else change.any(1) for change in changes]).any(0)
 
-    rows = ("positions", "log_offset_scales", "log_base_scales", "appearance")
-    anchors = torch.stack([differs(name, scene.anchors, older.anchors) for name in rows]).any(0)
+    anchors = differs("anchor", scene.anchors, older.anchors)
     free = torch.ones_like(scene.free.births, dtype=torch.bool)
     was = torch.isin(scene.free.births, older.free.births)
     now, then = scene.free.select(was), older.free.select(torch.isin(older.free.births, scene.free.births))
-    columns = ("means", "log_scales", "quats", "logit_opacities", "colors")
-    free[was] = torch.stack([differs(name, now, then) for name in columns]).any(0)
+    free[was] = differs("free", now, then)
     return torch.cat([anchors, free])
 
 

@@ -22,7 +22,7 @@ from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import PAPER_DYNAMIC, FieldName
+from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.births import BirthConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
@@ -31,11 +31,10 @@ from structgstream.training.observation import slots_of
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import (
     FREE_ROWS,
-    ParameterName,
     Parameters,
     detached,
-    free_rows,
     parameters_of_fields,
+    values_of_rows,
 )
 from structgstream.training.partition import Partition
 from structgstream.training.patching import PatchingConfig
@@ -103,26 +102,13 @@ class OnlineConfig:
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
     """Learning rate of every parameter after ``share`` (0 to 1) of a frame's iterations."""
-    r = config.rates
-    falling = r.final_share**share
-    return {
-        "anchor_positions": r.anchor_positions * falling,
-        "offset_scales": r.offset_scales * falling,
-        "base_scales": r.base_scales * falling,
-        "anchor_offsets": r.anchor_offsets * falling,
-        "anchor_features": r.anchor_features * falling,
-        "appearance": r.appearance * falling,
-        "opacity_mlp": r.opacity_mlp * falling,
-        "color_mlp": r.color_mlp * falling,
-        "covariance_mlp": r.covariance_mlp * falling,
-        "free_means": r.free_means,
-        "free_log_scales": r.free_log_scales,
-        "free_quats": r.free_quats,
-        "free_logit_opacities": r.free_logit_opacities,
-        "free_colors": r.free_colors,
-        "camera_gains": 0.0,
-        "camera_biases": 0.0,
-    }
+    falling = config.rates.final_share**share
+    rates: dict[ParameterName, float] = {}
+    for row in STATE_TABLE:
+        for parameter in row.parameters:
+            rate = getattr(config.rates, parameter.online_rate) if parameter.online_rate else 0.0
+            rates[parameter.name] = rate if row.granularity == "free" else rate * falling
+    return rates
 
 
 def fit_next_frame(
@@ -273,7 +259,7 @@ class _Fit:
         if born is not None and "free_means" in trained:
             keep = torch.ones(len(scene.free), dtype=torch.bool, device=born.means.device)
             parameters.births = torch.cat([parameters.births, born.births])
-            parameters.replace_rows(FREE_ROWS, keep=keep, added=free_rows(born))
+            parameters.replace_rows(FREE_ROWS, keep=keep, added=values_of_rows(born, FREE_ROWS), count=len(born))
         adam = Adam(self.backend)
         statistics = GradientStatistics(slots_of(scene) + (0 if born is None else len(born)), self.backend.device)
         last_pass = LastPass()

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.training.parameters import ParameterName, Parameters
+from structgstream.scene.state import ParameterName
+from structgstream.training.parameters import Parameters
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.

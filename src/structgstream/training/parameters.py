@@ -1,79 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene taken apart into the tensors that an optimiser moves, and put together again."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from structgstream.scene.color import CameraColor
+from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, flatten_head, scene_of, state_of, unflatten_head
+from structgstream.scene.state import (
+    PARAMETERS,
+    FieldName,
+    Granularity,
+    ParameterName,
+    fields_of,
+    parameters_of,
+    scene_from,
+    scene_of,
+    state_of,
+    tensor_of,
+)
 from structgstream.training.rounding import rounded
 
-ParameterName = Literal[
-    "anchor_positions",
-    "offset_scales",
-    "base_scales",
-    "anchor_offsets",
-    "anchor_features",
-    "appearance",
-    "opacity_mlp",
-    "color_mlp",
-    "covariance_mlp",
-    "free_means",
-    "free_log_scales",
-    "free_quats",
-    "free_logit_opacities",
-    "free_colors",
-    "camera_gains",
-    "camera_biases",
-]
 
-ANCHOR_ROWS: tuple[ParameterName, ...] = (
-    "anchor_positions",
-    "offset_scales",
-    "base_scales",
-    "anchor_offsets",
-    "anchor_features",
-    "appearance",
-)
-FREE_ROWS: tuple[ParameterName, ...] = (
-    "free_means",
-    "free_log_scales",
-    "free_quats",
-    "free_logit_opacities",
-    "free_colors",
-)
-_OF_FIELD: dict[FieldName, tuple[ParameterName, ...]] = {
-    "free": FREE_ROWS,
-    "camera_color": ("camera_gains", "camera_biases"),
-}
+def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
+    """What an optimiser can move of the fields of ``granularities``, in the order of the state table."""
+    return tuple(p.name for p in parameters_of(fields_of(*granularities)) if p.trainable)
+
+
+ANCHOR_ROWS, FREE_ROWS, CAMERA_ROWS = trainable("anchor"), trainable("free"), trainable("camera")
 
 
 def parameters_of_fields(names: Iterable[FieldName]) -> frozenset[ParameterName]:
-    """The parameters behind rows of the state table (``free_births`` is an identity, not a parameter)."""
-    found: set[ParameterName] = set()
-    for name in names:
-        if name in _OF_FIELD:
-            found.update(_OF_FIELD[name])
-        elif name != "free_births":
-            found.add(name)  # type: ignore[arg-type]
-    return frozenset(found)
+    """What an optimiser can move of the fields ``names``."""
+    return frozenset(p.name for p in parameters_of(names) if p.trainable)
 
 
-def free_rows(free: FreeGaussians) -> dict[ParameterName, Tensor]:
-    """The rows of :data:`FREE_ROWS` that stand for ``free``."""
-    return {
-        "free_means": free.means,
-        "free_log_scales": free.log_scales,
-        "free_quats": free.quats,
-        "free_logit_opacities": free.logit_opacities,
-        "free_colors": free.colors,
-    }
+def values_of_rows(rows: AnchorCloud | FreeGaussians, names: Collection[ParameterName]) -> dict[ParameterName, Tensor]:
+    """The parameters ``names``, of anchors or of free Gaussians, that ``rows`` have."""
+    found: dict[ParameterName, Tensor] = {}
+    for parameter in PARAMETERS:
+        if parameter.name in names and (value := getattr(rows, parameter.attribute)) is not None:
+            found[parameter.name] = value
+    return found
 
 
 @dataclass
@@ -85,7 +56,6 @@ class Parameters:
 
     values: dict[ParameterName, Tensor]
     births: Tensor
-    distance_input: bool
     steps: Mapping[ParameterName, float] = field(default_factory=dict)
 
     @classmethod
@@ -93,77 +63,39 @@ class Parameters:
         cls, scene: Scene, *, trained: frozenset[ParameterName], steps: Mapping[ParameterName, float] | None = None
     ) -> "Parameters":
         """Copies of a scene's tensors; those in ``trained`` collect gradients, those in ``steps`` are drawn rounded."""
-        free = scene.free
-        values: dict[ParameterName, Tensor] = {
-            "anchor_positions": scene.anchors.positions,
-            "offset_scales": scene.anchors.log_offset_scales,
-            "base_scales": scene.anchors.log_base_scales,
-            "anchor_offsets": scene.anchors.offsets,
-            "anchor_features": scene.anchors.features,
-            "appearance": scene.anchors.appearance,
-            "opacity_mlp": flatten_head(scene.mlps.opacity),
-            "color_mlp": flatten_head(scene.mlps.color),
-            "covariance_mlp": flatten_head(scene.mlps.covariance),
-            "free_means": free.means,
-            "free_log_scales": free.log_scales,
-            "free_quats": free.quats,
-            "free_logit_opacities": free.logit_opacities,
-            "free_colors": free.colors,
-            "camera_gains": scene.camera_color.gains,
-            "camera_biases": scene.camera_color.biases,
-        }
         copies: dict[ParameterName, Tensor] = {
-            name: value.detach().clone().contiguous().requires_grad_(name in trained) for name, value in values.items()
+            p.name: value.detach().clone().contiguous().requires_grad_(p.name in trained)
+            for p in PARAMETERS
+            if p.trainable and (value := tensor_of(scene, p)) is not None
         }
-        return cls(copies, free.births.clone(), scene.distance_input, dict(steps or {}))
+        known: dict[ParameterName, float] = {name: step for name, step in (steps or {}).items() if name in copies}
+        return cls(copies, scene.free.births.clone(), known)
 
     @property
     def trained(self) -> list[ParameterName]:
         """Names that collect gradients, in a fixed order, without those that are empty."""
         return [name for name, value in self.values.items() if value.requires_grad and value.numel()]
 
-    def replace_rows(self, names: Iterable[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor]) -> None:
-        """Keep the rows ``keep`` (mask) of each name and append ``added[name]``."""
+    def replace_rows(
+        self, names: Iterable[ParameterName], *, keep: Tensor, added: Mapping[ParameterName, Tensor], count: int
+    ) -> None:
+        """Keep the rows ``keep`` (mask) of each name that there is and append ``added``, ``count`` zeros by default."""
         for name in names:
-            old = self.values[name]
-            rows = torch.cat([old.detach()[keep], added[name]])
-            self.values[name] = rows.contiguous().requires_grad_(old.requires_grad)
+            if (old := self.values.get(name)) is not None:
+                more = added[name] if name in added else old.new_zeros(count, *old.shape[1:])
+                rows = torch.cat([old.detach()[keep], more])
+                self.values[name] = rows.contiguous().requires_grad_(old.requires_grad)
 
     def scene(self, template: Scene) -> Scene:
-        """The scene these parameters stand for; differentiable. ``template`` gives the MLPs' widths."""
-        v = self.values | {name: rounded(self.values[name], step) for name, step in self.steps.items()}
-
-        def head(name: Literal["opacity", "color", "covariance"], vector: Tensor):
-            like = getattr(template.mlps, name)
-            return unflatten_head(vector, like.w1.shape[1], like.w2.shape[0], like.w1.shape[0])
-
-        color = CameraColor(v["camera_gains"], v["camera_biases"])
-        return replace(
-            template,
-            anchors=replace(
-                template.anchors,
-                positions=v["anchor_positions"],
-                log_offset_scales=v["offset_scales"],
-                log_base_scales=v["base_scales"],
-                offsets=v["anchor_offsets"],
-                features=v["anchor_features"],
-                appearance=v["appearance"],
-            ),
-            mlps=template.mlps._replace(
-                opacity=head("opacity", v["opacity_mlp"]),
-                color=head("color", v["color_mlp"]),
-                covariance=head("covariance", v["covariance_mlp"]),
-            ),
-            free=FreeGaussians(
-                v["free_means"],
-                v["free_log_scales"],
-                v["free_quats"],
-                v["free_logit_opacities"],
-                v["free_colors"],
-                self.births,
-            ),
-            camera_color=color.gauged() if v["camera_gains"].requires_grad else color,
-        )
+        """The scene these parameters stand for; differentiable. ``template`` has what is not trained."""
+        values: dict[ParameterName, Tensor] = {
+            p.name: value for p in PARAMETERS if not p.trainable and (value := tensor_of(template, p)) is not None
+        }
+        values |= {**self.values, "free_births": self.births}
+        values |= {name: rounded(self.values[name], step) for name, step in self.steps.items()}
+        found = scene_from(values, distance_input=template.distance_input)
+        gauged = any(self.values[name].requires_grad for name in CAMERA_ROWS)
+        return replace(found, camera_color=found.camera_color.gauged()) if gauged else found
 
 
 def detached(scene: Scene) -> Scene:

@@ -7,7 +7,7 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import FREE_ROWS, Parameters, free_rows
+from structgstream.training.parameters import FREE_ROWS, Parameters, values_of_rows
 from structgstream.training.patching import (
     BIRTHS_PER_FRAME,
     PatchingConfig,
@@ -66,8 +66,7 @@ def patched(
     if len(parameters.births):  # Some may have been born in this frame already.
         first_birth = max(first_birth, int(parameters.births.max()) + 1)
     children = children_of(parents, first_birth=first_birth, config=config, generator=generator)
-    added = free_rows(children)
     parameters.births = torch.cat([parameters.births[keep], children.births])
-    parameters.replace_rows(FREE_ROWS, keep=keep, added=added)
+    parameters.replace_rows(FREE_ROWS, keep=keep, added=values_of_rows(children, FREE_ROWS), count=len(children))
     adam.replace_rows(FREE_ROWS, keep=keep, added=len(children))
     return keep, len(children)

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from structgstream.training.parameters import FREE_ROWS, ParameterName, Parameters
-
-ANCHOR_FIELDS: tuple[ParameterName, ...] = ("anchor_positions", "offset_scales", "base_scales", "appearance")
+from structgstream.scene.state import ParameterName
+from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 
 
 @dataclass(frozen=True)
@@ -36,8 +35,10 @@ class Rate:
 
         With ``free`` a free Gaussian's bit costs what an anchor's does, else nothing.
         """
-        names = (*ANCHOR_FIELDS, *FREE_ROWS) if free else ANCHOR_FIELDS
-        paid: dict[ParameterName, float] = {name: steps[name] for name in names if name in steps}
+        names = (*ANCHOR_ROWS, *FREE_ROWS) if free else ANCHOR_ROWS
+        paid: dict[ParameterName, float] = {
+            name: steps[name] for name in names if name in steps and name in parameters.values
+        }
         if not paid or weight <= 0.0:
             return None
         rows = len(parameters.values["anchor_positions"])

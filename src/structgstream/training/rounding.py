@@ -8,13 +8,14 @@ passes the rounding as if it were not there (straight-through). Bins are absolut
 bins is exact and nothing drifts.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
+from structgstream.scene.state import PARAMETERS, ParameterName
 
 
 class _Rounded(torch.autograd.Function):
@@ -32,6 +33,12 @@ def rounded(value: Tensor, step: float) -> Tensor:
     return _Rounded.apply(value, step)
 
 
+# The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. What frame 0
+# loses every later frame lacks, and its bytes come once: it follows by half. What is no step has a share of 0.
+_HALF_SHARE = {"quality_share": 0.5}
+_NO_STEP = {"quality_share": 0.0}
+
+
 @dataclass(frozen=True)
 class RoundingConfig:
     """How fine what is sent is, for a stream with the codec ``compact``."""
@@ -47,45 +54,30 @@ class RoundingConfig:
     free_quat_step: float = 1 / 64
     free_logit_opacity_step: float = 0.125
     free_color_step: float = 1 / 128
-    first_noise_levels: float = 0.5
+    first_noise_levels: float = field(default=0.5, metadata=_HALF_SHARE)
     """Noise that rounding frame 0 may add to the pictures: root of the mean square, in 8-bit levels."""
-    first_weight_step: float = 1 / 1024
+    first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
     """Of the weights of MLPs in frame 0."""
-    rate_weight: float = 1.8e-4
+    rate_weight: float = field(default=1.8e-4, metadata=_NO_STEP)
     """Weight in the loss of the bits of a moving anchor."""
-    free_priced: bool = False
+    free_priced: bool = field(default=False, metadata=_NO_STEP)
     """Whether a bit of a free Gaussian that was there before costs as much."""
-    quality: float = 0.0
+    quality: float = field(default=0.0, metadata=_NO_STEP)
     """One knob over all of the above: 1 more makes every step half as large, and a bit a quarter as dear. Frame 0
     follows by half of that."""
 
     def resolved(self) -> "RoundingConfig":
         """The same, with the quality put into the other fields and itself 0."""
-        kept = ("rate_weight", "free_priced", "quality")
-        steps = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in kept}
-        # What frame 0 loses every later frame lacks, and its bytes come once: it follows by half.
-        share = {name: 0.5 if name.startswith("first_") else 1.0 for name in steps}
-        finer = {name: step * 2.0 ** (-self.quality * share[name]) for name, step in steps.items()}
+        shares = {f.name: f.metadata.get("quality_share", 1.0) for f in fields(self)}
+        finer = {name: getattr(self, name) * 2.0 ** (-self.quality * share) for name, share in shares.items() if share}
         # Errors grow with the square of a step.
         return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
 
-    def steps(self, pixel: float) -> dict[str, float]:
+    def steps(self, pixel: float) -> dict[ParameterName, float]:
         """The step of everything that can change, by name; ``pixel`` is what one covers, in units of the scene."""
         plain = self.resolved()
-        return {
-            "anchor_positions": plain.position_pixels * pixel,
-            "offset_scales": plain.log_scale_step,
-            "base_scales": plain.log_scale_step,
-            "appearance": plain.appearance_step,
-            "opacity_mlp": plain.weight_step,
-            "color_mlp": plain.weight_step,
-            "covariance_mlp": plain.weight_step,
-            "free_means": plain.position_pixels * pixel,
-            "free_log_scales": plain.free_log_scale_step,
-            "free_quats": plain.free_quat_step,
-            "free_logit_opacities": plain.free_logit_opacity_step,
-            "free_colors": plain.free_color_step,
-        }
+        units = {"position_pixels": pixel}
+        return {p.name: getattr(plain, p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
 
 
 def pixel_size(positions: Tensor, rig: CameraRig) -> float:

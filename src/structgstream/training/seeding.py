@@ -94,11 +94,9 @@ def seeded_scene(
             log_base_scales=log_scales.clone(),
             offsets=positions.new_zeros(m, k, 3),
             features=positions.new_zeros(m, feature_width),
-            appearance=positions.new_zeros(m, 0),
         ),
         mlps=MLPWeights(opacity=opacity, color=color, covariance=covariance),
         free=FreeGaussians.empty(positions),
         camera_color=CameraColor.identity(cameras, positions),
-        appearance_basis=positions.new_zeros(0, feature_width),
         distance_input=distance_input,
     )

@@ -14,8 +14,9 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
+from structgstream.scene.state import ParameterName
 from structgstream.training.losses import LossWeights, offset_distance, volume
-from structgstream.training.parameters import ParameterName, Parameters
+from structgstream.training.parameters import Parameters
 from structgstream.training.solidity import depth_spread
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from streams import small_scene
-from structgstream.codec.scene.shapes import SHAPES, check_shapes
+from structgstream.codec.scene.shapes import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
@@ -13,10 +13,6 @@ from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
 def check(fields: dict[FieldName, torch.Tensor], *, cameras: int = 2) -> None:
     check_shapes(fields, distance_input=True, training_cameras=cameras, where="Packet 1")
-
-
-def test_every_field_has_a_shape() -> None:
-    assert [row.name for row in STATE_TABLE] == list(SHAPES)
 
 
 @pytest.mark.parametrize(("anchors", "free"), [(0, 0), (3, 0), (0, 2), (3, 2)])

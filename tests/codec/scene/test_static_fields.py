@@ -16,20 +16,20 @@ from streams import small_scene
 from structgstream.codec.entropy.coder import Encoder, Tables, varint
 from structgstream.codec.scene.bins import on_bins
 from structgstream.codec.scene.static_fields import (
-    AS_THEY_ARE,
     FREE_NUMBERS,
     MOST_ANCHORS,
-    MOST_COLUMNS,
     MOST_WEIGHTS,
+    UNCODED_FIELDS,
     decoded_fields,
     encoded_fields,
+    most_columns,
 )
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import space_order
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
-CODED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.name not in AS_THEY_ARE)
+CODED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.name not in UNCODED_FIELDS)
 STEPS: dict[FieldName, float] = {name: float(np.float32(0.01 + i / 100)) for i, name in enumerate(CODED)}
 
 
@@ -172,13 +172,15 @@ def test_fields_without_a_coding() -> None:
     with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_positions"):
         decoded_fields(less, STEPS)
     less = {name: data for name, data in coded.items() if name != "appearance"}
-    with pytest.raises(StreamError, match="directions of an appearance without the appearance"):
+    with pytest.raises(StreamError, match="holds appearance_basis without appearance, which tells its shape"):
         decoded_fields(less, STEPS)
 
 
 def test_more_numbers_than_allowed_are_refused() -> None:
     coded = encoded_fields(fields_of(), STEPS)
-    limits: dict[FieldName, int] = {"anchor_positions": MOST_ANCHORS, "color_mlp": MOST_WEIGHTS, **MOST_COLUMNS}
+    limits: dict[FieldName, int] = {"anchor_positions": MOST_ANCHORS, "color_mlp": MOST_WEIGHTS}
+    limits |= {row.name: most_columns(row.name) for row in STATE_TABLE if row.init_coding == "rows"}
+    assert [*limits.values()][2:] == [3, 3, 3 * 64, 256, 256]
     for name, most in limits.items():
         rest = coded[name][1:]
         with pytest.raises(StreamError, match=f"has {most + 1} .*at most {most} are allowed"):

@@ -6,6 +6,7 @@ The value of a bin is the product of two float32 numbers, rounded as IEEE 754 ro
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -15,13 +16,9 @@ from torch import Tensor
 from structgstream.codec.arrays import Bins
 from structgstream.codec.scene.change import Change
 from structgstream.errors import StreamError
-from structgstream.scene.state import FREE_COLUMNS, FieldName
+from structgstream.scene.state import FIELDS, FREE_COLUMNS, FieldName, Granularity, fields_of
 
-ANCHOR_ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales", "appearance")
-"""Fields of an anchor, which change together."""
-WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
-FREE_STEPS = ("free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors")
-_FREE_WIDTHS = (3, 3, 4, 1, 3)
+FREE_PARAMETERS = FIELDS["free"].parameters
 LARGEST = 2**22
 """Of bins: with their products rounded to float32, the nearest bin of a value is still the one it was made of."""
 
@@ -56,6 +53,7 @@ class SceneBins:
 
     Args:
         anchors: ``[M, columns of the dynamic anchor fields]``.
+        columns: ``(name, first column, end)`` of each of these fields.
         change: of the anchors.
         weights: by field, ``[P, 1]``.
         weight_changes: by field.
@@ -63,6 +61,7 @@ class SceneBins:
     """
 
     anchors: Bins
+    columns: Sequence[tuple[FieldName, int, int]]
     change: Change
     weights: Mapping[FieldName, Bins]
     weight_changes: Mapping[FieldName, Change]
@@ -78,20 +77,9 @@ class SceneBins:
         )
 
 
-def anchor_fields(dynamic: frozenset[FieldName]) -> tuple[FieldName, ...]:
-    """The dynamic fields of anchors, in the order of their columns."""
-    return tuple(name for name in ANCHOR_ROWS if name in dynamic)
-
-
-def anchor_columns(fields: Sequence[FieldName], total: int) -> list[tuple[FieldName, int, int]]:
-    """``(name, first column, end)`` of each field: three columns, and for the appearance what remains of ``total``."""
-    found: list[tuple[FieldName, int, int]] = []
-    first = 0
-    for name in fields:
-        end = total if name == "appearance" else first + 3
-        found.append((name, first, end))
-        first = end
-    return found
+def rounded_fields(granularity: Granularity) -> tuple[FieldName, ...]:
+    """The fields that can change as bins: the anchors' as rows, shared ones as weights, in the order of the table."""
+    return tuple(name for name in fields_of(granularity) if FIELDS[name].rounded)
 
 
 def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> SceneBins:
@@ -100,11 +88,16 @@ def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], ste
     Raises:
         StreamError: a value is too many steps from zero.
     """
-    rows = [nearest_bins(state[name], steps[name]) for name in anchor_fields(dynamic)]
+    names: list[FieldName] = [name for name in rounded_fields("anchor") if name in dynamic]
+    rows = [nearest_bins(state[name], steps[name]) for name in names]
     count = len(state["anchor_positions"])
     anchors = np.concatenate(rows, axis=1) if rows else np.zeros((count, 0), np.int32)
+    ends = accumulate(found.shape[1] for found in rows)
+    columns: list[tuple[FieldName, int, int]] = [
+        (name, end - found.shape[1], end) for name, found, end in zip(names, rows, ends, strict=True)
+    ]
     weights: dict[FieldName, Bins] = {
-        name: nearest_bins(state[name], steps[name])[:, None] for name in WEIGHTS if name in dynamic
+        name: nearest_bins(state[name], steps[name])[:, None] for name in rounded_fields("shared") if name in dynamic
     }
     free = FreeBins.none()
     if "free" in dynamic:
@@ -112,13 +105,13 @@ def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], ste
         bins = nearest_bins(state["free"], _free_steps(steps))
         free = FreeBins(births, bins, Change.none(len(births), FREE_COLUMNS))
     changes: dict[FieldName, Change] = {name: Change.none(*bins.shape) for name, bins in weights.items()}
-    return SceneBins(anchors, Change.none(*anchors.shape), weights, changes, free)
+    return SceneBins(anchors, columns, Change.none(*anchors.shape), weights, changes, free)
 
 
 def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> dict[FieldName, Tensor]:
     """The dynamic fields that bins stand for."""
     state: dict[FieldName, Tensor] = {}
-    for name, first, end in anchor_columns(anchor_fields(dynamic), bins.anchors.shape[1]):
+    for name, first, end in bins.columns:
         state[name] = values_of(bins.anchors[:, first:end], steps[name])
     for name, weights in bins.weights.items():
         state[name] = values_of(weights[:, 0], steps[name])
@@ -141,7 +134,8 @@ def on_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float])
 
 
 def _free_steps(steps: Mapping[str, float]) -> NDArray[np.float32]:
-    return np.repeat(np.array([steps[name] for name in FREE_STEPS], np.float32), _FREE_WIDTHS)
+    widths = [parameter.columns for parameter in FREE_PARAMETERS]
+    return np.repeat(np.array([steps[parameter.name] for parameter in FREE_PARAMETERS], np.float32), widths)
 
 
 def nearest_bins(value: Tensor, step: float | NDArray[np.float32]) -> Bins:

@@ -5,7 +5,7 @@ A key packet follows the header's reference state instead, with models that have
 does the group of packets up to the next one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -14,44 +14,29 @@ from structgstream.codec.arrays import Bins
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import (
-    ANCHOR_ROWS,
-    FREE_STEPS,
-    LARGEST,
-    WEIGHTS,
-    SceneBins,
-    anchor_columns,
-    anchor_fields,
-    binned,
-    valued,
-)
+from structgstream.codec.scene.bins import LARGEST, SceneBins, binned, rounded_fields, valued
 from structgstream.codec.scene.change import Change
 from structgstream.codec.scene.free_rows import coded_free
 from structgstream.codec.scene.rows import coded_change
 from structgstream.errors import StreamError
-from structgstream.scene.state import FieldName
+from structgstream.scene.state import FieldName, fields_of, parameters_of
 
-CODABLE: frozenset[FieldName] = frozenset({*ANCHOR_ROWS, *WEIGHTS, "free", "free_births"})
+FREE_FIELDS: frozenset[FieldName] = frozenset(fields_of("free"))
+"""What becomes of free Gaussians is coded as a whole: all of these are dynamic, or none."""
+CODABLE: frozenset[FieldName] = frozenset(rounded_fields("anchor") + rounded_fields("shared")) | FREE_FIELDS
 """Fields that may be dynamic."""
 
 
 def coded_scene(
-    coder: AdaptiveCoder,
-    after: SceneBins | None,
-    before: SceneBins,
-    *,
-    fields: Sequence[FieldName],
-    has_free: bool,
-    where: str,
+    coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, *, has_free: bool, where: str
 ) -> SceneBins:
-    """Codes the bins of a frame after those of ``before``; ``fields`` are the anchors'.
+    """Codes the bins of a frame after those of ``before``.
 
     Raises:
         StreamError: what is decoded contradicts itself.
     """
-    groups = anchor_columns(fields, before.anchors.shape[1])
     given = None if after is None else Change.of(after.anchors - before.anchors)
-    change = coded_change(coder, given, before.change, groups=groups)
+    change = coded_change(coder, given, before.change, groups=before.columns)
     anchors = before.anchors + change.residuals
     weights: dict[FieldName, Bins] = {}
     changes: dict[FieldName, Change] = {}
@@ -65,7 +50,7 @@ def coded_scene(
     for found in (anchors, *weights.values(), free.bins):
         if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
             raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
-    return SceneBins(anchors, change, weights, changes, free)
+    return SceneBins(anchors, before.columns, change, weights, changes, free)
 
 
 @dataclass(frozen=True)
@@ -92,10 +77,10 @@ class _Compact:
             )
         if beyond := header.dynamic - CODABLE:
             raise StreamError(f"The compact codec has no coding for {', '.join(sorted(beyond))}; keep it static.")
-        if ("free" in header.dynamic) != ("free_births" in header.dynamic):
+        if header.dynamic & FREE_FIELDS not in (frozenset(), FREE_FIELDS):
             raise StreamError("The header announces free Gaussians without their births, or births without them.")
-        rows = header.dynamic - {"free", "free_births"}
-        needed = {*rows, *(FREE_STEPS if "free" in header.dynamic else ())}
+        rows = header.dynamic - FREE_FIELDS
+        needed = {parameter.name for parameter in parameters_of(header.dynamic) if parameter.step}
         if missing := needed - header.steps.keys():
             raise StreamError(f"The header states no step for {', '.join(sorted(missing))}.")
         if header.reference.keys() != rows:
@@ -114,14 +99,8 @@ class _Compact:
         return self.state.bins, Models(self.state.models)
 
     def _coded(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
-        return coded_scene(
-            coder,
-            after,
-            before,
-            fields=anchor_fields(self._header.dynamic),
-            has_free="free" in self._header.dynamic,
-            where=f"Packet {index}",
-        )
+        has_free = not FREE_FIELDS.isdisjoint(self._header.dynamic)
+        return coded_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
 
     def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
         # What a key packet changes is everything since the reference, and tells nothing of what comes next.

@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free Gaussians from frame to frame: some die, some change, some are born (docs/bitstream.md, section Free 3DGs)."""
 
+from itertools import accumulate
+
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.arrays import Bins, Flags
 from structgstream.codec.entropy.adaptive import AdaptiveCoder
 from structgstream.codec.entropy.bits import bit_lengths
-from structgstream.codec.scene.bins import FreeBins
+from structgstream.codec.scene.bins import FREE_PARAMETERS, FreeBins
 from structgstream.codec.scene.change import Change
 from structgstream.codec.scene.rows import coded_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FREE_COLUMNS
 
-GROUPS = (
-    ("free.means", 0, 3),
-    ("free.log_scales", 3, 6),
-    ("free.quats", 6, 10),
-    ("free.logit_opacities", 10, 11),
-    ("free.colors", 11, 14),
-)
+_ENDS = tuple(accumulate(parameter.columns for parameter in FREE_PARAMETERS))
+GROUPS = tuple((p.path, end - p.columns, end) for p, end in zip(FREE_PARAMETERS, _ENDS, strict=True))
 MOST_FREE = 2**18
 """Free Gaussians that a scene may have: a symbol can take less than a bit, so bytes do not bound their number."""
 _MEANS = range(6, 11)  # quaternions and opacities

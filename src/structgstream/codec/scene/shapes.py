@@ -7,25 +7,8 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import StreamError
-from structgstream.scene.state import FREE_COLUMNS, FieldName
+from structgstream.scene.state import FIELDS, FieldName
 
-SHAPES: Mapping[FieldName, tuple[str | int, ...]] = {
-    "anchor_positions": ("M", 3),
-    "offset_scales": ("M", 3),
-    "base_scales": ("M", 3),
-    "anchor_offsets": ("M", "K", 3),
-    "anchor_features": ("M", "D"),
-    "opacity_mlp": ("P_alpha",),
-    "color_mlp": ("P_c",),
-    "covariance_mlp": ("P_Sigma",),
-    "free": ("F", FREE_COLUMNS),
-    "free_births": ("F",),
-    "camera_color": ("V", 6),
-    "appearance": ("M", "R"),
-    "appearance_basis": ("R", "D"),
-    "environment": ("E", 3),
-}
-"""A number is a size itself; a letter is the same size wherever it stands."""
 ENVIRONMENT_ROWS = (1, 4, 9)
 """Spherical harmonics up to degree 0, 1 and 2."""
 
@@ -49,21 +32,22 @@ def check_shapes(
         raise StreamError(f"{where} has {sizes['K']} Gaussians and {sizes['D']} features an anchor; both must be 1 up.")
     inputs = sizes["D"] + 3 + int(distance_input)
     hidden: int | None = None
-    for letter, outputs in (("P_alpha", sizes["K"]), ("P_c", 3 * sizes["K"]), ("P_Sigma", 7 * sizes["K"])):
-        if letter not in sizes:
+    for name, row in FIELDS.items():
+        if not row.outputs or name not in fields:
             continue
-        units, rest = divmod(sizes[letter] - outputs, inputs + 1 + outputs)
+        weights, outputs = len(fields[name]), row.outputs * sizes["K"]
+        units, rest = divmod(weights - outputs, inputs + 1 + outputs)
         if rest or units < 1 or units != (hidden or units):
             raise StreamError(
-                f"{where} has an MLP of {sizes[letter]} weights, which is no hidden layer between {inputs} inputs and "
+                f"{where} has an MLP of {weights} weights, which is no hidden layer between {inputs} inputs and "
                 f"{outputs} outputs, or not the same as in the other MLPs."
             )
         hidden = units
 
 
 def _match(name: FieldName, value: Tensor, sizes: dict[str, int], where: str) -> None:
-    shape = SHAPES[name]
-    fits = value.dim() == len(shape) and (value.dtype == torch.int64) == (name == "free_births")
+    shape = FIELDS[name].shape
+    fits = value.dim() == len(shape) and (value.dtype == torch.int64) == FIELDS[name].integers
     for size, expected in zip(value.shape, shape):
         fits = fits and size == (sizes.setdefault(expected, size) if isinstance(expected, str) else expected)
     if not fits:

@@ -23,21 +23,16 @@ from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMB
 from structgstream.codec.scene.bins import LARGEST, nearest_bins, values_of
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
-from structgstream.scene.state import STATE_TABLE, FieldName
+from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, InitCoding
 
 MOST_ANCHORS = 2**22
 MOST_WEIGHTS = 2**20
 FREE_NUMBERS, NUMBERS_A_BYTE = 2**20, 64
 """Numbers that the coded fields may have together, whatever their bytes, and how many more with each byte: a symbol can
 take next to nothing, so a few bytes could stand for gigabytes. What is fitted has 5 to 9 numbers a byte."""
-MOST_COLUMNS: Mapping[FieldName, int] = {
-    "offset_scales": 3,
-    "base_scales": 3,
-    "anchor_offsets": 3 * 64,
-    "anchor_features": 256,
-    "appearance": 256,
-}
-AS_THEY_ARE: frozenset[FieldName] = frozenset({"free", "free_births", "camera_color"})
+_MOST_GAUSSIANS, _MOST_OTHERS = 64, 256
+"""Of an anchor: the size K and all other sizes that a letter stands for."""
+UNCODED_FIELDS: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if row.init_coding == "uncoded")
 """Fields that the init record holds as numbers with either codec."""
 SHIFTS = 8
 _SIZES = 5  # classes of what the two columns before hold: 0, 1, 2 to 3, 4 to 7, 8 and more
@@ -100,7 +95,7 @@ def decoded_fields(
     """
     names = _coded_names(coded.keys())
     if len(names) < len(coded):
-        raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & AS_THEY_ARE))} coded; it has no coding.")
+        raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & UNCODED_FIELDS))} coded; it has no coding.")
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
     decoder = Decoder(Tables(), coded, where=_WHERE)
@@ -110,7 +105,18 @@ def decoded_fields(
 
 
 def _coded_names(names: Set[FieldName]) -> list[FieldName]:
-    return [row.name for row in STATE_TABLE if row.name in names and row.name not in AS_THEY_ARE]
+    return [row.name for row in STATE_TABLE if row.name in names and row.name not in UNCODED_FIELDS]
+
+
+def _of_coding(coding: InitCoding, names: Set[FieldName]) -> list[FieldName]:
+    return [row.name for row in STATE_TABLE if row.init_coding == coding and row.name in names]
+
+
+def most_columns(name: FieldName) -> int:
+    """How many columns a field may have that is coded as rows."""
+    most = {"K": _MOST_GAUSSIANS}
+    sizes = (size if isinstance(size, int) else most.get(size, _MOST_OTHERS) for size in FIELDS[name].shape[1:])
+    return math.prod(sizes)
 
 
 def _coded(
@@ -122,32 +128,34 @@ def _coded(
     positions = _coded_positions(coder, given.get("anchor_positions"), budget)
     found["anchor_positions"] = positions
     shifts = np.zeros(len(positions), np.int32)
-    for name, most in MOST_COLUMNS.items():
-        if name in names:
-            shape = (len(positions), math.prod(given[name].shape[1:])) if name in given else None
-            rows = None if shape is None else given[name].reshape(shape)
-            found[name], shifts = _coded_rows(coder, name, rows, shifts, most=most, budget=budget)
-    for name in _coded_names(names - found.keys()):
+    for name in _of_coding("rows", names):
+        shape = (len(positions), math.prod(given[name].shape[1:])) if name in given else None
+        rows = None if shape is None else given[name].reshape(shape)
+        found[name], shifts = _coded_rows(coder, name, rows, shifts, budget=budget)
+    for name in _of_coding("numbers", names):
         found[name] = _coded_numbers(coder, name, given[name].ravel() if name in given else None, budget)
     return _shaped(found)
 
 
 def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
-    """Rows of three an offset and a coefficient of the environment, and of the features' width in the basis."""
-    shapes: dict[FieldName, tuple[int, int, int] | tuple[int, int]] = {}
-    if (offsets := found.get("anchor_offsets")) is not None:
-        shapes["anchor_offsets"] = (len(offsets), offsets.shape[1] // 3, 3)
-    features, appearance = found.get("anchor_features"), found.get("appearance")
-    if "appearance_basis" in found:
-        if features is None or appearance is None:
-            raise StreamError(f"{_WHERE} holds directions of an appearance without the appearance.")
-        shapes["appearance_basis"] = (appearance.shape[1], features.shape[1])
-    if (coefficients := found.get("environment")) is not None:
-        shapes["environment"] = (coefficients.size // 3, 3)
-    for name, shape in shapes.items():
-        if found[name].size != math.prod(shape):
-            raise StreamError(f"{_WHERE} holds {found[name].size} numbers of {name}, which do not fit {shape}.")
-        found[name] = found[name].reshape(shape)
+    """The same in the shapes of the state table; a size is what the first field that has it makes of its numbers."""
+    tellers: dict[str | int, FieldName] = {size: row.name for row in reversed(STATE_TABLE) for size in row.shape}
+    sizes: dict[str | int, int] = {}
+    for name in _coded_names(found.keys()):
+        bins, wanted = found[name], FIELDS[name].shape
+        # Rows are told apart even where there are none of them; other numbers are counted as a whole.
+        rows, count = ((len(bins),), math.prod(bins.shape[1:])) if bins.ndim > 1 else ((), bins.size)
+        rest: list[int | None] = []
+        for size in wanted[len(rows) :]:
+            if isinstance(size, str) and size not in sizes and tellers[size] != name:
+                raise StreamError(f"{_WHERE} holds {name} without {tellers[size]}, which tells its shape.")
+            rest.append(size if isinstance(size, int) else sizes.get(size))
+        left = count // max(1, math.prod(size for size in rest if size is not None))
+        columns = tuple(left if size is None else size for size in rest)
+        if count != math.prod(columns):
+            raise StreamError(f"{_WHERE} holds {bins.size} numbers of {name}, which do not fit {(*rows, *columns)}.")
+        sizes.update(zip(wanted, (*rows, *columns), strict=True))
+        found[name] = bins.reshape((*rows, *columns))
     return found
 
 
@@ -198,11 +206,11 @@ def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
 
 
 def _coded_rows(
-    coder: Coder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, most: int, budget: _Budget
+    coder: Coder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, budget: _Budget
 ) -> tuple[Bins, NDArray[np.int32]]:
     """Rows ``[n, C]``, column by column, and their shifts, which are like those of another field."""
     given = None if bins is None else bins.shape[1]
-    columns = _bounded(coder.number(f"{name}.columns", given), most, f"columns of {name}")
+    columns = _bounded(coder.number(f"{name}.columns", given), most_columns(name), f"columns of {name}")
     budget.take(columns * len(like))
     shifts = None if bins is None else _common_shifts(bins, like)
     shifts = coder.residuals(f"{name}.shift", shifts, like.astype(np.uint16), count=SHIFTS)

@@ -11,6 +11,7 @@ from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
+from structgstream.scene.state import fields_of, parameters_of
 from structgstream.training.initial import rig_extent
 from structgstream.training.optim import EPS, Rate, constant
 from structgstream.training.result import Step, StepListener
@@ -23,7 +24,7 @@ from structgstream_studies.peers.fitting import LastPsnr, Leaves, gradients_of, 
 from structgstream_studies.peers.plain import Y0, PlainGaussians
 
 COLORS = ("base_colors", "sh")
-CAMERA = ("camera_gains", "camera_biases")
+CAMERA = parameters_of(fields_of("camera"))
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,7 @@ def rates_at(iteration: int, config: GaussiansConfig, *, extent: float) -> dict[
         "logit_opacities": r.logit_opacities.at(share),
         "base_colors": r.base_colors.at(share),
         "sh": r.sh.at(share) if iteration >= config.sh_from else 0.0,
-        "camera_gains": r.camera_color.at(share),
-        "camera_biases": r.camera_color.at(share),
+        **{parameter.name: r.camera_color.at(share) for parameter in CAMERA},
     }
 
 
@@ -169,7 +169,7 @@ def fit_gaussians(
     with watch.stage("initialise"):
         start = initial_gaussians(points, views, config)
         identity = CameraColor.identity(len(views), start.means)
-        camera = {"camera_gains": identity.gains, "camera_biases": identity.biases} if config.camera_color else {}
+        camera = {p.name: getattr(identity, p.attribute) for p in CAMERA} if config.camera_color else {}
         small = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
     leaves = Leaves.of(start.tensors() | camera, backend=backend, eps=EPS)
     statistics = GradientStatistics(len(start), backend.device)
@@ -217,7 +217,7 @@ def fit_gaussians(
 def parts(leaves: Leaves, identity: CameraColor) -> tuple[PlainGaussians, CameraColor]:
     """What the leaves stand for; ``identity`` where no camera colour is learned."""
     values = leaves.values
-    gaussians = PlainGaussians(**{name: value for name, value in values.items() if name not in CAMERA})
-    if "camera_gains" not in values:
-        return gaussians, identity
-    return gaussians, CameraColor(values["camera_gains"], values["camera_biases"]).gauged()
+    color = {p.attribute: values[p.name] for p in CAMERA if p.name in values}
+    names = {parameter.name for parameter in CAMERA}
+    gaussians = PlainGaussians(**{name: value for name, value in values.items() if name not in names})
+    return gaussians, CameraColor(**color).gauged() if color else identity
