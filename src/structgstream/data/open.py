@@ -17,7 +17,7 @@ LAYOUTS = """Supported layouts:
   videos + JSON    cameras.json, CAMERA.mp4
   Neural 3D Video  poses_bounds.npy, camXX.mp4
   COLMAP           sparse/0/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
-                   frames/FRAME/CAMERA.ext or CAMERA.mp4"""
+                   frames/FRAME/CAMERA.ext, CAMERA.mp4, or images/CAMERA.ext for one frame"""
 
 FORMATS = (
     (recognises_panoptic, open_panoptic),
