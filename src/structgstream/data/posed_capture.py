@@ -13,23 +13,26 @@ camera is a name that stands for one pose. Pictures that are a uniform reduction
 (``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
 """
 
+import logging
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
+from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera
 from structgstream.data.picture_size import picture_size
 from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
-from structgstream.data.undistortion import undistorted
+from structgstream.data.undistortion import rectilinear, undistorted
 from structgstream.data.video import VIDEO_SUFFIXES, scan_videos, synchronised
 from structgstream.errors import CalibrationError, CaptureError
+
+log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures do not state a rate
 STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estimated poses of one camera may differ
@@ -41,8 +44,15 @@ Pictures = Mapping[str, Mapping[str, Path]]  # camera, then instant
 Sizes = Mapping[str, tuple[int, int]]
 
 
-def open_posed(path: Path, calibration: Calibration) -> FrameSource:
+def open_posed(
+    path: Path, calibration: Calibration, *, target: Callable[[LensCamera], Camera] = rectilinear
+) -> FrameSource:
     """The capture at ``path`` with these cameras; the calibration's points come along.
+
+    Args:
+        path: the folder with pictures or videos.
+        calibration: its cameras.
+        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
 
     Raises:
         CaptureError: no pictures or videos, or not of the calibrated cameras.
@@ -50,31 +60,41 @@ def open_posed(path: Path, calibration: Calibration) -> FrameSource:
     """
     for root in (path / name for name in ROOTS):
         if videos := _videos(root):
-            poses = _poses(calibration, videos)
-            _check(poses, videos, calibration=calibration, root=root)
-            tracks = scan_videos({name: videos[name] for name in sorted(poses, key=natural)})
-            filmed = _filmed(poses, {name: (track.width, track.height) for name, track in tracks.items()}, calibration)
-            rig = _rig(filmed, calibration, path)
-            return undistorted(synchronised(tracks, rig, where=path, points=calibration.points), filmed)
+            return undistorted(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := _folders(root):
-            return _of_pictures(path, *_layout(folders, calibration, root), root=root, calibration=calibration)
+            files, poses = _layout(folders, calibration, root)
+            return undistorted(*_of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
     for root in (path / name for name in ("images", *REDUCED, "")):
         if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
-            return _of_pictures(path, stills, _poses(calibration, stills), root=root, calibration=calibration)
+            poses = _poses(calibration, stills)
+            return undistorted(*_of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."
     )
 
 
+def _of_videos(
+    path: Path, videos: Mapping[str, Path], *, root: Path, calibration: Calibration
+) -> tuple[FrameSource, Mapping[str, LensCamera]]:
+    """The videos as they are, and their cameras with lenses."""
+    poses = _poses(calibration, videos)
+    _check(poses, videos, calibration=calibration, root=root)
+    tracks = scan_videos({name: videos[name] for name in sorted(poses, key=natural)})
+    filmed = _filmed(poses, {name: (track.width, track.height) for name, track in tracks.items()}, calibration)
+    rig = _rig(filmed, calibration, path)
+    return synchronised(tracks, rig, where=path, points=calibration.points), filmed
+
+
 def _of_pictures(
     path: Path, files: Pictures, poses: Mapping[str, PosedCamera], *, root: Path, calibration: Calibration
-) -> FrameSource:
+) -> tuple[FrameSource, Mapping[str, LensCamera]]:
+    """The pictures as they are, and their cameras with lenses."""
     _check(poses, files, calibration=calibration, root=root)
     common = common_pictures({name: files[name] for name in sorted(poses, key=natural)}, where=path)
     filmed = _filmed(poses, {name: picture_size(pictures[0]) for name, pictures in common.items()}, calibration)
     rig = _rig(filmed, calibration, path)
-    return undistorted(ImageSource(path.name, rig, PICTURE_FPS, common, calibration.points), filmed)
+    return ImageSource(path.name, rig, PICTURE_FPS, common, calibration.points), filmed
 
 
 def _files(root: Path, suffixes: Collection[str]) -> dict[str, Path]:
@@ -138,7 +158,12 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
 def _parts(name: str) -> tuple[str, ...]:
     """The parts of a path, without the suffix of pictures and videos."""
     path = PurePosixPath(name)
-    return (path.with_suffix("") if path.suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES else path).parts
+    return (path.with_suffix("") if _is_file(name) else path).parts
+
+
+def _is_file(name: str) -> bool:
+    """Whether a calibration names a picture or video here, rather than a camera."""
+    return PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES
 
 
 def _number(name: str) -> tuple[int, ...] | None:
@@ -176,6 +201,10 @@ def _check(
     """
     if poses:
         check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
+        used = {posed.name for posed in poses.values()}
+        idle = [posed.name for posed in calibration.cameras if posed.name not in used and not _is_file(posed.name)]
+        if idle:
+            log.warning("%s has no pictures of %s of %s; left out", root, listed(idle), calibration.where)
         return
     first = calibration.cameras[0].name if calibration.cameras else "nothing"
     raise CalibrationError(

@@ -7,7 +7,7 @@ The grid of a camera is computed once. By default the picture shows the largest 
 
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -217,21 +217,26 @@ class Undistorted(WithRig):
         """The same frames at the sizes of ``rig``, resampled once."""
         return replace(self, other=rig)
 
+    def passes(self, name: str) -> bool:
+        """Whether the pictures of a camera stay as they are."""
+        filmed = self.filmed[name]
+        return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
+
     def _plan(self, name: str) -> Undistortion | None:
         if name not in self._plans:
-            filmed, target = self.filmed[name], self.rig[name]
-            same = isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, target.K)
-            self._plans[name] = None if same else Undistortion(filmed, target)
+            self._plans[name] = None if self.passes(name) else Undistortion(self.filmed[name], self.rig[name])
         return self._plans[name]
 
 
-def undistorted(source: FrameSource, filmed: Mapping[str, LensCamera], *, degrees: float | None = None) -> FrameSource:
+def undistorted(
+    source: FrameSource, filmed: Mapping[str, LensCamera], *, target: Callable[[LensCamera], Camera] = rectilinear
+) -> FrameSource:
     """A capture whose cameras have lenses, as one of pinholes; the source itself when none distorts.
 
     Args:
         source: its rig has the intrinsics and sizes of ``filmed``.
         filmed: the same cameras with their lenses.
-        degrees: see :func:`rectilinear`.
+        target: chooses the pinhole for a camera, see :func:`rectilinear`.
 
     Raises:
         CalibrationError: a lens that cannot be undistorted, naming its camera.
@@ -239,10 +244,8 @@ def undistorted(source: FrameSource, filmed: Mapping[str, LensCamera], *, degree
     cameras: dict[str, Camera] = {}
     for name in source.rig:
         try:
-            target = rectilinear(filmed[name], degrees=degrees)
+            cameras[name] = replace(target(filmed[name]), near=source.rig[name].near)
         except CalibrationError as error:
             raise CalibrationError(f"Camera {name!r} of {source.name}: {error}") from None
-        cameras[name] = replace(target, near=source.rig[name].near)
-    if all(torch.equal(cameras[name].K, source.rig[name].K) for name in cameras):
-        return source
-    return Undistorted(source, source.rig.mapped(cameras), filmed)
+    made = Undistorted(source, source.rig.mapped(cameras), filmed)
+    return source if all(made.passes(name) for name in made.rig) else made
