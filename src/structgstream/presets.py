@@ -130,6 +130,8 @@ class PaperData:
         height: the same.
         cameras: of the rig.
         held_out: how many of them are for testing; None where the paper does not say.
+        held_out_camera: which one published results keep from training.
+        scale: of the pictures to those that the data set stores; ``--scale`` of ``reconstruct``.
         undistorted: whether pictures of fisheye lenses were made rectilinear first.
     """
 
@@ -137,13 +139,17 @@ class PaperData:
     height: int
     cameras: int
     held_out: int | None
+    held_out_camera: str
+    scale: float = 1.0
     undistorted: bool = False
 
 
 PAPER_DATA: Mapping[str, PaperData] = {
-    "paper-n3dv": PaperData(1352, 1014, cameras=21, held_out=None),
-    "paper-meetroom": PaperData(1280, 720, cameras=13, held_out=1),
-    "paper-immersive": PaperData(1280, 960, cameras=46, held_out=1, undistorted=True),
+    "paper-n3dv": PaperData(1352, 1014, cameras=21, held_out=None, held_out_camera="cam00", scale=0.5),
+    "paper-meetroom": PaperData(1280, 720, cameras=13, held_out=1, held_out_camera="cam_0"),
+    "paper-immersive": PaperData(
+        1280, 960, cameras=46, held_out=1, held_out_camera="camera_0001", scale=0.5, undistorted=True
+    ),
 }
 """By the preset that is named after it. They belong to the capture, so no configuration can hold them."""
 
@@ -157,11 +163,15 @@ def departures(preset: str, rig: CameraRig) -> list[str]:
     sizes = sorted({(rig[name].width, rig[name].height) for name in rig})
     if sizes != [(data.width, data.height)]:
         theirs = ", ".join(f"{width}x{height}" for width, height in sizes)
-        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}")
+        found.append(
+            f"pictures of {theirs} instead of {data.width}x{data.height}, --scale {data.scale:g} of the stored"
+        )
     if len(rig.cameras) != data.cameras:
         found.append(f"{len(rig.cameras)} cameras instead of {data.cameras}")
     if data.held_out is not None and len(rig.testing) != data.held_out:
         found.append(f"{len(rig.testing)} held out instead of {data.held_out}")
+    if data.held_out_camera in rig.training:
+        found.append(f"{data.held_out_camera} trained on instead of held out")
     return found
 
 

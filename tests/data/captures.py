@@ -9,6 +9,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from rigs import arc_rig
@@ -165,10 +166,12 @@ def write_shared_intrinsics(path: Path, *, cameras: int = 3, frames: int = 4) ->
     return rig
 
 
-def write_n3dv(path: Path, *, cameras: int = 4, frames: int = 6, size: float = 1.0, skip: int = 2) -> CameraRig:
+def write_n3dv(
+    path: Path, *, cameras: int = 4, frames: int = 6, size: float = 1.0, skip: int = 2, pattern: str = "cam{:02d}"
+) -> CameraRig:
     """The N3DV layout, without a video numbered ``skip``; poses are for ``size`` times the videos' pixels."""
     rig = small_rig(cameras)
-    names = [f"cam{number:02d}" for number in range(cameras + 1) if number != skip]
+    names = [pattern.format(number) for number in range(cameras + 1) if number != skip]
     write_videos(path, names, frames=frames)
     rows = []
     for camera in rig.cameras.values():
@@ -177,7 +180,50 @@ def write_n3dv(path: Path, *, cameras: int = 4, frames: int = 6, size: float = 1
         hwf = np.array([HEIGHT * size, WIDTH * size, float(camera.K[0, 0]) * size])
         rows.append(np.concatenate([np.stack([down, right, -forward, center, hwf], axis=1).ravel(), [0.5, 9.0]]))
     np.save(path / "poses_bounds.npy", np.array(rows))
-    return CameraRig({name: rig[old] for name, old in zip(names, rig)}, frozenset({"cam00"}))
+    return CameraRig({name: rig[old] for name, old in zip(names, rig)}, frozenset(names[:1]))
+
+
+def write_meet_room(path: Path) -> CameraRig:
+    """As N3DV, with names of its own: thirteen cameras, of which ``cam_10`` follows ``cam_9``."""
+    return write_n3dv(path, cameras=13, skip=13, pattern="cam_{}")
+
+
+IMMERSIVE_RADIAL = [0.02, -0.003]
+
+
+def write_immersive(path: Path, *, cameras: int = 4, frames: int = 3) -> CameraRig:
+    """The layout of Google Immersive: fisheye videos of half the pixels that ``models.json`` is for.
+
+    The rig is that of the pinholes, of half the fisheye's focal length, whose pictures are those of :func:`picture`.
+    """
+    width, height, focal = 4 * WIDTH, 4 * HEIGHT, 80.0
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    centers = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float64).reshape(-1, 1, 2)
+    rays = cv2.fisheye.undistortPoints(centers, K, np.array([*IMMERSIVE_RADIAL, 0, 0])).reshape(height, width, 2)
+    maps = (rays * focal / 2 + K[:2, 2]).astype(np.float32)
+    rig, entries, made = small_rig(cameras), [], {}
+    for number, camera in enumerate(rig.cameras.values()):
+        name = f"camera_{number + 1:04d}"
+        pictures = [picture(number, frame, width=width, height=height) for frame in range(frames)]
+        filmed = [cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR) for image in pictures]
+        write_video(path / f"{name}.mp4", [image.astype(np.uint8) for image in filmed])
+        entries.append(
+            {
+                "name": name,
+                "width": 2.0 * width,
+                "height": 2.0 * height,
+                "focal_length": 2 * focal,
+                "principal_point": [width - 0.5, height - 0.5],
+                "radial_distortion": [*IMMERSIVE_RADIAL, 0.7],
+                "orientation": cv2.Rodrigues(camera.viewmat[:3, :3].numpy())[0].ravel().tolist(),
+                "position": camera.center.tolist(),
+                "projection_type": "fisheye",
+            }
+        )
+        pinhole = np.array([[focal / 2, 0, width / 2], [0, focal / 2, height / 2], [0, 0, 1]])
+        made[name] = Camera(camera.viewmat, torch.from_numpy(pinhole), width, height)
+    (path / "models.json").write_text(json.dumps(entries))
+    return CameraRig(made, frozenset({"camera_0001"}))
 
 
 def quaternion(camera: Camera) -> list[float]:

@@ -72,7 +72,7 @@ def test_a_camera_without_calibration(tmp_path: Path) -> None:
 def test_a_calibration_that_belongs_to_nothing(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"other{name[-1]}.png", name) for name in RIG])
-    with pytest.raises(CalibrationError, match=r"No picture of .*sparse belongs to .*'other0\.png'"):
+    with pytest.raises(CalibrationError, match=r"No camera of .*sparse belongs to .*'other0\.png'.*'cam0\d'"):
         open_colmap(tmp_path)
 
 
@@ -92,17 +92,74 @@ def test_a_missing_picture_in_the_middle(tmp_path: Path) -> None:
         open_colmap(tmp_path)
 
 
-def test_pictures_of_another_size_than_the_model(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM/FRAME.png")
-    large = RIG.mapped({name: RIG[name].resized(128, 96) for name in RIG})
+@pytest.mark.parametrize("folder", ["images", "images_2", "images_4", "images_8", ""])
+def test_reduced_pictures_scale_the_intrinsics(tmp_path: Path, folder: str) -> None:
+    """257 / 4 is 64.25: the picture's own size counts, not the factor."""
+    write_pictures(tmp_path / folder, "CAM/FRAME.png")
+    large = RIG.mapped({name: RIG[name].resized(257, 193) for name in RIG})
     write_text_model(tmp_path / "sparse", large, [(f"{name}.png", name) for name in RIG])
-    with pytest.raises(CalibrationError, match=r"64x48 pixels, .* 128x96"):
-        next(open_colmap(tmp_path).frames())
+    source = open_colmap(tmp_path)
+    for name in RIG:
+        torch.testing.assert_close(source.rig[name].K, RIG[name].K)
+        assert (source.rig[name].width, source.rig[name].height) == (64, 48)
+    assert all_numbers(source.frames()) == EXPECTED
+
+
+def test_full_pictures_are_preferred_to_reduced_ones(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "images/CAM/FRAME.png")
+    for number, name in enumerate(RIG):
+        for frame in range(FRAMES):
+            write_picture(
+                tmp_path / "images_2" / name / f"{frame:06d}.png", picture(number, frame, width=32, height=24)
+            )
+    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
+    assert open_colmap(tmp_path).rig["cam00"].width == 64
+
+
+def test_pictures_of_other_proportions_than_the_model(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "images/CAM/FRAME.png")
+    large = RIG.mapped({name: RIG[name].resized(128, 90) for name in RIG})
+    write_text_model(tmp_path / "sparse", large, [(f"{name}.png", name) for name in RIG])
+    with pytest.raises(CalibrationError, match=r"'cam00' have 64x48 pixels, .*sparse is for 128x90: other proportions"):
+        open_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["images", "images_4", ""])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "bmp"])
+def test_a_static_folder_is_a_capture_of_one_frame(tmp_path: Path, folder: str, suffix: str) -> None:
+    for number, name in enumerate(RIG):
+        write_picture(tmp_path / folder / f"{name}.{suffix}", picture(number, 7))
+    write_text_model(tmp_path / "sparse/0", RIG, [(f"{name}.JPG", name) for name in RIG], points=np.eye(3))
+    source = open_colmap(tmp_path)
+    assert (len(source), list(source.rig), source.rig.held_out) == (1, list(RIG), frozenset())
+    assert source.points is not None
+    assert all_numbers(source.frames()) == [[(camera, 7) for camera in range(3)]]
+
+
+@pytest.mark.parametrize("videos", [False, True])
+def test_a_model_with_lenses_is_undistorted(tmp_path: Path, videos: bool) -> None:
+    """The pose stays, nothing is black, and the pictures are those of the right camera and frame."""
+    if videos:
+        write_videos(tmp_path, list(RIG), frames=FRAMES)
+    else:
+        write_pictures(tmp_path, "images/CAM/FRAME.png")
+    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG], points=np.eye(3))
+    lenses = ["OPENCV 64 48 40 40 32 24 -0.05 0.01 0.001 0", "OPENCV_FISHEYE 64 48 40 40 32 24 0.01 0 0 0"]
+    cameras = [f"{number} {lens}" for number, lens in enumerate([*lenses, "PINHOLE 64 48 40 40 32 24"], start=1)]
+    (tmp_path / "sparse/cameras.txt").write_text("\n".join(cameras))
+    source = open_colmap(tmp_path)
+    assert source.points is not None
+    assert torch.equal(source.rig["cam02"].K, RIG["cam02"].K)
+    for name in RIG:
+        torch.testing.assert_close(source.rig[name].viewmat, RIG[name].viewmat)
+        assert source.rig[name].near == source.rig["cam02"].near
+    assert float(source.rig["cam00"].K[0, 0]) != pytest.approx(40, abs=0.1)
+    assert all_numbers(source.frames(1)) == EXPECTED[1:]
 
 
 def test_a_model_without_frames(tmp_path: Path) -> None:
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
-    with pytest.raises(CaptureError, match="a COLMAP model but no frames"):
+    with pytest.raises(CaptureError, match="has the calibration .*sparse but no frames"):
         open_colmap(tmp_path)
     with pytest.raises(CaptureError, match="no COLMAP model"):
         open_colmap(tmp_path / "sparse" / "elsewhere")

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from captures import all_numbers, write_n3dv
+from captures import all_numbers, small_rig, write_meet_room, write_n3dv, write_text_model
 from structgstream.data.n3dv import open_n3dv
 from structgstream.errors import CalibrationError
 
@@ -29,6 +30,58 @@ def test_reduced_videos_scale_the_intrinsics(tmp_path: Path, size: float) -> Non
     camera = source.rig["cam01"]
     assert (camera.width, camera.height) == (64, 48)
     torch.testing.assert_close(camera.K, rig["cam01"].K)
+
+
+def test_meet_room_holds_its_first_camera_out(tmp_path: Path) -> None:
+    """Thirteen videos, cam_0 to cam_12: the poses follow the numbers, not the alphabet."""
+    rig = write_meet_room(tmp_path)
+    source = open_n3dv(tmp_path)
+    assert list(source.rig) == [f"cam_{number}" for number in range(13)]
+    assert source.rig.testing == ("cam_0",)
+    for name in rig:
+        torch.testing.assert_close(source.rig[name].viewmat, rig[name].viewmat)
+    assert all_numbers(source.frames(5)) == [[(camera, 5) for camera in range(13)]]
+
+
+POINTS = np.array([[0.1, 0.2, 0.3], [-0.5, 0.25, 1.0]])
+
+
+@pytest.mark.parametrize("folder", ["sparse/0", "colmap/sparse/0", "colmap_0/sparse/0"])
+def test_points_of_a_model_with_the_same_poses(tmp_path: Path, folder: str) -> None:
+    rig = write_n3dv(tmp_path)
+    write_text_model(tmp_path / folder, rig, [(f"{name}.png", name) for name in rig], points=POINTS)
+    np.testing.assert_allclose(open_n3dv(tmp_path).points, POINTS, atol=1e-6)  # type: ignore[arg-type]
+
+
+def test_points_of_a_model_with_a_frame_of_its_own(tmp_path: Path) -> None:
+    """What COLMAP makes from scratch: turned, moved, scaled."""
+    rig = write_n3dv(tmp_path)
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    change_of_frame = torch.eye(4, dtype=torch.float64)
+    change_of_frame[:3, :3] = torch.from_numpy(turn)
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        viewmat = camera.viewmat @ change_of_frame.inverse()
+        viewmat[:3, 3] = 2.5 * viewmat[:3, 3] - viewmat[:3, :3] @ torch.tensor([3.0, 4.0, 5.0], dtype=torch.float64)
+        cameras[name] = replace(camera, viewmat=viewmat)
+    theirs = 2.5 * POINTS @ turn.T + [3, 4, 5]
+    write_text_model(tmp_path / "sparse/0", rig.mapped(cameras), [(f"{n}.png", n) for n in rig], points=theirs)
+    np.testing.assert_allclose(open_n3dv(tmp_path).points, POINTS, atol=1e-6)  # type: ignore[arg-type]
+
+
+def test_points_of_another_rig_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rig = write_n3dv(tmp_path)
+    names = list(rig)
+    swapped = [(f"{names[1]}.png", names[2]), (f"{names[2]}.png", names[1]), *[(f"{n}.png", n) for n in names[3:]]]
+    write_text_model(tmp_path / "sparse/0", rig, [*swapped, ("cam00.png", names[0])], points=POINTS)
+    assert open_n3dv(tmp_path).points is None
+    assert "rig's extent away from the rig's; its points are not used" in caplog.text
+    caplog.clear()
+    other = small_rig(4)
+    write_text_model(tmp_path / "sparse/0", other, [(f"picture{i}.png", n) for i, n in enumerate(other)], points=POINTS)
+    assert open_n3dv(tmp_path).points is None
+    assert "has 0 cameras of the rig by name" in caplog.text
 
 
 def change(path: Path, rows: slice, column: int, value: float) -> None:

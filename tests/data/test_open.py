@@ -11,6 +11,7 @@ from captures import (
     picture,
     small_rig,
     write_clip,
+    write_meet_room,
     write_n3dv,
     write_panoptic,
     write_picture,
@@ -31,7 +32,14 @@ def write_colmap(path: Path) -> CameraRig:
     return rig
 
 
-WRITERS = [write_panoptic, write_clip, write_shared_intrinsics, write_n3dv, write_colmap]
+WRITERS = [
+    write_panoptic,
+    write_clip,
+    write_shared_intrinsics,
+    write_n3dv,
+    write_meet_room,
+    write_colmap,
+]
 
 
 @pytest.mark.parametrize("write", WRITERS)

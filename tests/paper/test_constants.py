@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every constant of the paper's section Implementations, and the ablations as edits of one preset."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -81,14 +81,21 @@ def test_what_differs_is_the_data() -> None:
     assert [data.undistorted for data in PAPER_DATA.values()] == [False, False, True]
 
 
+def test_what_published_loaders_do_where_the_paper_is_silent() -> None:
+    assert [data.held_out_camera for data in PAPER_DATA.values()] == ["cam00", "cam_0", "camera_0001"]
+    assert [data.scale for data in PAPER_DATA.values()] == [0.5, 1.0, 0.5]
+
+
 def test_another_rig_than_the_papers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = arc_rig(4)
     assert departures("paper-immersive", rig) == [
-        "pictures of 48x32 instead of 1280x960",
+        "pictures of 48x32 instead of 1280x960, --scale 0.5 of the stored",
         "4 cameras instead of 46",
     ]
     assert departures("rig", rig) == []
-    monkeypatch.setitem(PAPER_DATA, "paper-n3dv", PaperData(48, 32, cameras=4, held_out=None))  # type: ignore[arg-type]
+    small = PaperData(48, 32, cameras=4, held_out=None, held_out_camera="cam00")
+    monkeypatch.setitem(PAPER_DATA, "paper-n3dv", small)  # type: ignore[arg-type]
     assert departures("paper-n3dv", rig) == []
-    monkeypatch.setitem(PAPER_DATA, "paper-n3dv", PaperData(48, 32, cameras=4, held_out=2))  # type: ignore[arg-type]
+    assert departures("paper-n3dv", rig.with_held_out(frozenset({"cam01"}))) == ["cam00 trained on instead of held out"]
+    monkeypatch.setitem(PAPER_DATA, "paper-n3dv", replace(small, held_out=2))  # type: ignore[arg-type]
     assert departures("paper-n3dv", rig) == ["1 held out instead of 2"]

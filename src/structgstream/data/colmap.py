@@ -13,9 +13,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
+from structgstream.data.posed import Calibration, PosedCamera, intrinsics
 from structgstream.errors import CalibrationError
 
-PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
+# Those of a pinhole or with a lens of lenses.py, and how many parameters each has.
+PARAMETERS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5,
+}  # fmt: skip
+ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 MODEL_NAMES = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
@@ -24,29 +31,11 @@ MODEL_NAMES = (
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """Intrinsics shared by images: ``K [3, 3]`` in pixels and the size they are for."""
+    """Intrinsics shared by images: ``K [3, 3]`` in pixels, the size they are for, and the lens."""
 
     K: NDArray[np.float64]
-    width: int
-    height: int
-
-
-@dataclass(frozen=True)
-class ColmapImage:
-    """A registered picture: its name in the model, ``viewmat [4, 4]`` world to camera, and its intrinsics."""
-
-    name: str
-    viewmat: NDArray[np.float64]
-    camera: ColmapCamera
-
-
-@dataclass(frozen=True)
-class ColmapModel:
-    """A model: its pictures by name, and its points ``[P, 3]``."""
-
-    folder: Path
-    images: tuple[ColmapImage, ...]
-    points: NDArray[np.float64]
+    size: tuple[int, int]
+    lens: Lens
 
 
 def find_model(path: Path) -> Path | None:
@@ -59,11 +48,11 @@ def find_model(path: Path) -> Path | None:
     return None
 
 
-def read_model(folder: Path) -> ColmapModel:
-    """The model in ``folder``; binary files are preferred.
+def read_model(folder: Path) -> Calibration:
+    """The model in ``folder``; binary files are preferred. Its cameras have the names of its pictures.
 
     Raises:
-        CalibrationError: the files are cut or not a model, or a camera has lens distortion.
+        CalibrationError: the files are cut or not a model, or a camera has a lens model that is not known here.
     """
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     try:
@@ -76,24 +65,37 @@ def read_model(folder: Path) -> ColmapModel:
         points = _points(folder)
     except CalibrationError:
         raise
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+    except (OSError, ValueError, KeyError, IndexError, TypeError, struct.error) as error:
         raise CalibrationError(
             f"The COLMAP model in {folder} cannot be read ({type(error).__name__}: {error}); export it again."
         ) from None
-    return ColmapModel(folder, tuple(sorted(images, key=lambda image: image.name)), points)
+    ordered = tuple(sorted(images, key=lambda image: image.name))
+    return Calibration(folder, ordered, points if len(points) else None)
 
 
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:
-    if model not in PINHOLES:
+    if len(params) != _parameters(model, where):
+        raise ValueError(f"{len(params)} parameters of a {model}")
+    fx, fy, cx, cy, *coefficients = (params[0], *params) if model in ONE_FOCAL_LENGTH else params
+    lens: Lens = Pinhole()
+    if model.endswith("FISHEYE"):
+        lens = Fisheye(*coefficients)
+    elif "PINHOLE" not in model:
+        lens = RadialTangential(*coefficients)
+    return ColmapCamera(intrinsics(fx, fy, cx, cy), (width, height), lens)
+
+
+def _parameters(model: str, where: Path) -> int:
+    """How many parameters a model has."""
+    if model not in PARAMETERS:
         raise CalibrationError(
-            f"{where} has a camera of model {model}, which has lens distortion; undistort the pictures and "
-            "the model (colmap image_undistorter) so that every camera is PINHOLE or SIMPLE_PINHOLE."
+            f"{where} has a camera of model {model}, whose lens is not known here; calibrate again with one of "
+            f"{', '.join(PARAMETERS)}, or undistort pictures and model (colmap image_undistorter)."
         )
-    fx, fy, cx, cy = params if model == "PINHOLE" else (params[0], *params)
-    return ColmapCamera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height)
+    return PARAMETERS[model]
 
 
-def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> ColmapImage:
+def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCamera:
     """From a quaternion (w, x, y, z) and a translation."""
     w, x, y, z = np.array(pose[:4]) / np.linalg.norm(pose[:4])
     viewmat = np.eye(4)
@@ -103,7 +105,7 @@ def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> ColmapIm
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     viewmat[:3, 3] = pose[4:]
-    return ColmapImage(name, viewmat, camera)
+    return PosedCamera(name, viewmat, camera.K, camera.size, camera.lens)
 
 
 def _lines(file: Path) -> Iterator[str]:
@@ -119,7 +121,7 @@ def _text_cameras(file: Path) -> dict[int, ColmapCamera]:
     return cameras
 
 
-def _text_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[ColmapImage]:
+def _text_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCamera]:
     images = []
     lines = _lines(file)
     for line in lines:
@@ -139,13 +141,13 @@ def _binary_cameras(file: Path) -> dict[int, ColmapCamera]:
     for _ in range(count):
         number, model, width, height = struct.unpack_from("<iiQQ", data, offset)
         name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else f"number {model}"
-        params = struct.unpack_from(f"<{PINHOLES.get(name, 0)}d", data, offset + 24)
+        params = struct.unpack_from(f"<{_parameters(name, file)}d", data, offset + 24)
         cameras[number] = _camera(name, width, height, params, file)
         offset += 24 + 8 * len(params)
     return cameras
 
 
-def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[ColmapImage]:
+def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCamera]:
     data = file.read_bytes()
     (count,) = struct.unpack_from("<Q", data)
     offset, images = 8, []

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of Neural 3D Video (Li et al., CVPR 2022): ``camXX.mp4`` and ``poses_bounds.npy``.
+"""The layout of Neural 3D Video (Li et al., CVPR 2022) and of Meet Room (Li et al., NeurIPS 2022).
 
-Each row of the file is an LLFF pose: a 3x5 matrix ``[R | t | (height, width, focal)]``, camera to world with
-the axes down, right, backward, then two depth bounds. Rows belong to the existing videos in sorted order;
-``cam00`` is held out, as in published results.
+One ``camXX.mp4`` (Meet Room: ``cam_X.mp4``) a camera and ``poses_bounds.npy``. Each row of the file is an LLFF pose: a
+3x5 matrix ``[R | t | (height, width, focal)]``, camera to world with the axes down, right, backward, then two depth
+bounds. Rows belong to the existing videos in sorted order; the first camera, ``cam00`` or ``cam_0``, is held out, as in
+published results.
+
+Published loaders lay a COLMAP model beside it, in ``sparse``, ``colmap/sparse`` or ``colmap_0/sparse``: its points come
+along, moved to the poses of the file where it has a frame of its own.
 """
 
 from pathlib import Path
@@ -11,14 +15,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.aligned_points import aligned_points
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
+from structgstream.data.colmap import find_model, read_model
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, VideoTrack, scan_videos, synchronised
 from structgstream.errors import CalibrationError
 
 POSES = "poses_bounds.npy"
-HELD_OUT = "cam00"
+HELD_OUT = ("cam00", "cam_0")
+MODELS = ("", "colmap", "colmap_0")
 
 
 def recognises_n3dv(path: Path) -> bool:
@@ -42,8 +49,14 @@ def open_n3dv(path: Path) -> VideoSource:
         )
     tracks = scan_videos({video.stem: video for video in videos})
     cameras = {name: _camera(name, pose, tracks[name], path / POSES) for name, pose in zip(tracks, poses)}
-    held_out = (HELD_OUT,) if HELD_OUT in cameras else ()
-    return synchronised(tracks, calibrated_rig(cameras, held_out, where=path), where=path)
+    rig = calibrated_rig(cameras, [name for name in HELD_OUT if name in cameras], where=path)
+    return synchronised(tracks, rig, where=path, points=_points(path, rig))
+
+
+def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
+    """Those of the COLMAP model beside the poses, if there is one that agrees with them."""
+    found = next((model for name in MODELS if (model := find_model(path / name)) is not None), None)
+    return None if found is None else aligned_points(read_model(found), rig)
 
 
 def _read_poses(file: Path) -> NDArray[np.float64]:

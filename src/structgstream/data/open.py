@@ -5,6 +5,7 @@ from pathlib import Path
 
 from structgstream.data.calibration import with_near
 from structgstream.data.colmap_capture import open_colmap, recognises_colmap
+from structgstream.data.immersive import open_immersive, recognises_immersive
 from structgstream.data.json_videos import open_json_videos, recognises_json_videos
 from structgstream.data.n3dv import open_n3dv, recognises_n3dv
 from structgstream.data.panoptic import open_panoptic, recognises_panoptic
@@ -15,14 +16,16 @@ from structgstream.errors import CaptureError, ConfigError
 LAYOUTS = """Supported layouts:
   PanopticSports   train_meta.json, test_meta.json, ims/CAMERA/FRAME.jpg
   videos + JSON    cameras.json, CAMERA.mp4
-  Neural 3D Video  poses_bounds.npy, camXX.mp4
+  Neural 3D Video  poses_bounds.npy, camXX.mp4 (Meet Room: cam_X.mp4), with or without a COLMAP model
+  Immersive        models.json, camera_XXXX.mp4, of fisheye lenses
   COLMAP           sparse/0/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
-                   frames/FRAME/CAMERA.ext or CAMERA.mp4"""
+                   frames/FRAME/CAMERA.ext, CAMERA.mp4, or images/CAMERA.ext for one frame"""
 
 FORMATS = (
     (recognises_panoptic, open_panoptic),
     (recognises_json_videos, open_json_videos),
     (recognises_n3dv, open_n3dv),
+    (recognises_immersive, open_immersive),
     (recognises_colmap, open_colmap),
 )
 

@@ -4,6 +4,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,15 @@ class Resized(WithRig):
             yield MultiViewFrame(frame.index, frame.pts_seconds, images)
 
 
+@runtime_checkable
+class Resizable(Protocol):
+    """A source that resamples pictures anyway, so that another size costs nothing and is not a second resampling."""
+
+    def resized(self, rig: CameraRig) -> FrameSource:
+        """The same frames at the sizes of ``rig``."""
+        ...
+
+
 @dataclass(frozen=True)
 class Section(Wrapped):
     """The frames ``first`` to ``first + length - 1`` of a capture, counted and timed from 0 again."""
@@ -104,7 +114,7 @@ def resized(source: FrameSource, scale: float) -> FrameSource:
             for name, camera in cameras.items()
         }
     )
-    return source.resized(rig) if isinstance(source, VideoSource) else Resized(source, rig)
+    return source.resized(rig) if isinstance(source, Resizable) else Resized(source, rig)
 
 
 def section(source: FrameSource, *, start: int = 0, frames: int | None = None) -> FrameSource:

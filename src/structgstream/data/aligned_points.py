@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a model of the same cameras, in another frame of reference."""
+
+import logging
+from pathlib import PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import CameraRig
+from structgstream.data.posed import Calibration, PosedCamera
+
+log = logging.getLogger(__name__)
+
+LEAST_CAMERAS = 3
+MOST_OFF = 0.03
+"""Of the rig's extent: how far cameras of the two may lie apart after the best similarity."""
+
+
+def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | None:
+    """The points ``[P, 3]`` of ``model`` in the frame of ``rig``, by the similarity that carries its cameras there.
+
+    None, with a warning, when too few cameras have the same name or their positions do not agree.
+    """
+    if model.points is None:
+        return None
+    found = _common(model, rig)
+    if len(found) < LEAST_CAMERAS:
+        log.warning(
+            "%s has %d cameras of the rig by name; its points are not used. Its pictures need the cameras' names.",
+            model.where, len(found),
+        )  # fmt: skip
+        return None
+    theirs = np.array([posed.center for posed in found.values()])
+    ours = np.array([rig[name].center.numpy() for name in found])
+    # The rotation by the cameras' axes: positions alone do not give it when cameras stand in a line.
+    turns = sum(rig[name].viewmat[:3, :3].numpy().T @ posed.viewmat[:3, :3] for name, posed in found.items())
+    u, _, vh = np.linalg.svd(turns)
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh
+    turned = (theirs - theirs.mean(0)) @ rotation.T
+    centred = ours - ours.mean(0)
+    scale = (turned * centred).sum() / max((turned**2).sum(), 1e-300)
+    off = np.linalg.norm(scale * turned - centred, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
+    if not off <= MOST_OFF:
+        log.warning(
+            "The cameras of %s lie up to %.0f %% of the rig's extent away from the rig's; its points are not used.",
+            model.where, 100 * off,
+        )  # fmt: skip
+        return None
+    return (model.points - theirs.mean(0)) @ rotation.T * scale + ours.mean(0)
+
+
+def _common(model: Calibration, rig: CameraRig) -> dict[str, PosedCamera]:
+    """A pose of the model for each camera of the rig whose name is a part of a picture's."""
+    found: dict[str, PosedCamera] = {}
+    for posed in model.cameras:
+        parts = PurePosixPath(posed.name).with_suffix("").parts
+        if (name := next((part for part in parts if part in rig.cameras), None)) is not None:
+            found.setdefault(name, posed)
+    return found

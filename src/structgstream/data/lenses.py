@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lens models as values: where a lens puts what a pinhole would put somewhere else.
+
+Points are normalised: where a ray meets the plane one unit before the camera, ``[..., 2]`` float64. Each lens has
+
+- ``reach``: how far from the axis, normalised, it is one to one;
+- ``distort``: where it puts points; NaN beyond its reach;
+- ``undistort``: the inverse; NaN where nothing within its reach comes to lie.
+
+Intrinsics follow the package's convention, the top-left pixel's centre at (0.5, 0.5); :func:`from_integer_centers`
+converts those of tools that have it at (0, 0), which OpenCV is one of.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import ArrayLike, NDArray
+
+from structgstream.cameras import Camera
+
+Floats = NDArray[np.float64]
+
+NEWTON_STEPS = 50
+CLOSE_ENOUGH = 1e-10
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """No distortion."""
+
+    @property
+    def reach(self) -> float:
+        return math.inf
+
+    def distort(self, points: Floats) -> Floats:
+        return points
+
+    def undistort(self, points: Floats) -> Floats:
+        return points
+
+
+@dataclass(frozen=True)
+class RadialTangential:
+    """OpenCV's model: a radius is multiplied by ``(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``,
+    and ``p1``, ``p2`` add what a tilted lens does (Brown, Decentering Distortion of Lenses, 1966)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    @property
+    def reach(self) -> float:
+        """The smallest radius at which the distorted one stops to grow, or the factor has a pole."""
+        over, under = self._polynomials
+        radius = Polynomial([0.0, 1.0])
+        grows = (radius * over).deriv() * under - radius * over * under.deriv()
+        return min(_first_root(grows), _first_root(under))
+
+    @property
+    def _polynomials(self) -> tuple[Polynomial, Polynomial]:
+        """Numerator and denominator of the factor, in the radius."""
+        over = Polynomial([1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3])
+        return over, Polynomial([1.0, 0.0, self.k4, 0.0, self.k5, 0.0, self.k6])
+
+    def distort(self, points: Floats) -> Floats:
+        return np.where(_radii(points) <= self.reach, self._anywhere(points), np.nan)
+
+    def _anywhere(self, points: Floats) -> Floats:
+        over, under = self._polynomials
+        radii = _radii(points)
+        x, y = points[..., :1], points[..., 1:]
+        tilt = 2 * x * y * [self.p1, self.p2]
+        tilt = tilt + np.array([self.p2, self.p1]) * (radii**2 + 2 * points**2)
+        return points * (over(radii) / under(radii)) + tilt
+
+    def undistort(self, points: Floats) -> Floats:
+        """By Newton's method from the radius that the radial part alone has."""
+        radii = _radii(points)
+        over, under = self._polynomials
+        bounded = _inverse(lambda r: r * over(r) / under(r), radii, most=self.reach)
+        with np.errstate(invalid="ignore"):
+            found = points * np.where(radii > 0, bounded / np.where(radii > 0, radii, 1.0), 1.0)
+        if not (self.p1 or self.p2):
+            return found
+        for _ in range(NEWTON_STEPS):
+            error = self._anywhere(found) - points
+            step = np.linalg.solve(_jacobian(self._anywhere, np.nan_to_num(found)), error[..., None])[..., 0]
+            found = found - step
+            if not np.nanmax(np.abs(step), initial=0.0) > CLOSE_ENOUGH:
+                break
+        close = np.abs(self._anywhere(found) - points).max(-1, keepdims=True) < 1e-6
+        return np.where(close & (_radii(found) <= self.reach), found, np.nan)
+
+
+@dataclass(frozen=True)
+class Fisheye:
+    """OpenCV's equidistant model: an angle ``t`` to the axis comes to lie at the radius
+    ``t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`` (Kannala and Brandt, 2006)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    @property
+    def widest_angle(self) -> float:
+        """The angle to the axis, radians, up to which the model is one to one; at most a right angle."""
+        grows = self._radius.deriv()
+        return min(_first_root(grows), math.pi / 2 - 1e-6)
+
+    @property
+    def _radius(self) -> Polynomial:
+        return Polynomial([0.0, 1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, 0.0, self.k4])
+
+    @property
+    def reach(self) -> float:
+        return math.tan(self.widest_angle)
+
+    def distort(self, points: Floats) -> Floats:
+        radii = _radii(points)
+        angles = np.arctan(radii)
+        factor = np.where(radii > 1e-12, self._radius(angles) / np.maximum(radii, 1e-12), 1.0)
+        return np.where(angles <= self.widest_angle, points * factor, np.nan)
+
+    def undistort(self, points: Floats) -> Floats:
+        radii = _radii(points)
+        angles = _inverse(self._radius, radii, most=self.widest_angle)
+        return points * np.where(radii > 1e-12, np.tan(angles) / np.maximum(radii, 1e-12), 1.0)
+
+
+Lens = Pinhole | RadialTangential | Fisheye
+
+
+@dataclass(frozen=True)
+class LensCamera:
+    """A camera as it films: ``camera`` holds intrinsics, pose and size of its pictures, ``lens`` what bends rays."""
+
+    camera: Camera
+    lens: Lens
+
+    def pixels(self, points: Floats) -> Floats:
+        """Where the camera sees points ``[..., 3]`` of the world; NaN beyond the reach of the lens and behind."""
+        viewmat = self.camera.viewmat.numpy()
+        local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        depths = np.where(local[..., 2:] > 0, local[..., 2:], np.nan)
+        return self.placed(local[..., :2] / depths)
+
+    def placed(self, normalised: Floats) -> Floats:
+        """The pixels ``[..., 2]`` of normalised points, through the lens."""
+        K = self.camera.K.numpy()
+        return self.lens.distort(normalised) @ K[:2, :2].T + K[:2, 2]
+
+    def normalised(self, pixels: Floats) -> Floats:
+        """The points ``[..., 2]`` that a pinhole would see in the direction of pixels."""
+        K = self.camera.K.numpy()
+        return self.lens.undistort((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
+
+
+def from_integer_centers(K: ArrayLike) -> Floats:
+    """Intrinsics ``[3, 3]`` of a tool that has the top-left pixel's centre at (0, 0), in the package's convention."""
+    moved = np.array(K, dtype=np.float64)
+    moved[:2, 2] += 0.5
+    return moved
+
+
+def opencv_lens(coefficients: Sequence[float]) -> Lens:
+    """From OpenCV's vector ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, which may be empty.
+
+    Raises:
+        ValueError: a vector of another length that is not padded with zeros: a model with more terms.
+    """
+    values = [float(value) for value in coefficients]
+    if any(values[8:]) or len(values) in (1, 2, 3):
+        raise ValueError(
+            f"{len(values)} distortion coefficients; expected 4, 5 or 8 (k1, k2, p1, p2, k3, k4, k5, k6): calibrate "
+            "again without thin prism and tilted sensor"
+        )
+    return RadialTangential(*values[:8]) if any(values) else Pinhole()
+
+
+def fisheye_lens(coefficients: Sequence[float]) -> Fisheye:
+    """From OpenCV's vector ``k1, k2, k3, k4`` of its fisheye module; what is left out is 0.
+
+    Raises:
+        ValueError: more than four numbers that are not 0.
+    """
+    values = [float(value) for value in coefficients]
+    if any(values[4:]):
+        raise ValueError(f"{len(values)} fisheye coefficients; expected at most 4 (k1, k2, k3, k4)")
+    return Fisheye(*values[: len(fields(Fisheye))])
+
+
+def _radii(points: Floats) -> Floats:
+    return np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def _first_root(polynomial: Polynomial) -> float:
+    """The smallest positive real root, infinity without one."""
+    roots = polynomial.trim().roots()
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    return float(min(real[real > 1e-9], default=math.inf))
+
+
+def _inverse(grows: Callable[[Floats], Floats], values: Floats, *, most: float) -> Floats:
+    """Where a function that grows from 0 to ``most`` takes ``values``, by bisection; NaN where it does not."""
+    low, high = np.zeros_like(values), np.full_like(values, most)
+    if math.isinf(most):
+        high = np.maximum(values, 1.0)
+        while (short := grows(high) < values).any():
+            high = np.where(short, 2 * high, high)
+    inside = values <= grows(high)
+    for _ in range(70):
+        middle = (low + high) / 2
+        below = grows(middle) < values
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.where(inside, high, np.nan)
+
+
+def _jacobian(function: Callable[[Floats], Floats], points: Floats) -> Floats:
+    """Derivatives ``[..., 2, 2]`` by central differences: exact enough for Newton's steps."""
+    step = 1e-6
+    columns = [(function(points + axis) - function(points - axis)) / (2 * step) for axis in np.eye(2) * step]
+    return np.stack(columns, axis=-1)

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The size of a picture without decoding it, as a capture may have hundreds of cameras."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from structgstream.data.images import opencv
+from structgstream.errors import CaptureError
+
+PNG = b"\x89PNG\r\n\x1a\n"
+START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # ITU-T T.81, table B.1
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height of the stored pixels.
+
+    Raises:
+        CaptureError: the file cannot be read or is not a picture.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
+    size = None
+    if data[:8] == PNG and len(data) >= 24:
+        size = struct.unpack(">II", data[16:24])
+    elif data[:2] == b"\xff\xd8":
+        size = _jpeg_size(data)
+    return size or _decoded_size(data, path)
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, length = struct.unpack_from(">BH", data, at + 1)
+        if marker in START_OF_FRAME:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 2 + length
+    return None
+
+
+def _decoded_size(data: bytes, path: Path) -> tuple[int, int]:
+    cv2 = opencv()
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if picture is None:
+        raise CaptureError(f"The picture {path} cannot be decoded ({len(data)} bytes); restore it.")
+    return picture.shape[1], picture.shape[0]

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures of pictures or videos beside a calibration that names them: a COLMAP model, or a file of another tool.
+
+::
+
+    images/CAMERA/FRAME.ext     one folder per camera
+    frames/FRAME/CAMERA.ext     one folder per frame
+    CAMERA.mp4                  one video per camera, in the folder itself or in videos/
+    images/CAMERA.ext           one picture per camera: a capture of one frame
+
+Folders of pictures may lie in the capture itself, too. Which of the two layouts it is follows from the calibration: a
+camera is a name that stands for one pose. Pictures that are a uniform reduction of the size that was calibrated
+(``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
+"""
+
+import logging
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
+from structgstream.data.lenses import LensCamera
+from structgstream.data.picture_size import picture_size
+from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.source import FrameSource
+from structgstream.data.timeline import natural
+from structgstream.data.undistortion import rectilinear, undistorted
+from structgstream.data.video import VIDEO_SUFFIXES, scan_videos, synchronised
+from structgstream.errors import CalibrationError, CaptureError
+
+log = logging.getLogger(__name__)
+
+PICTURE_FPS = 30.0  # folders of pictures do not state a rate
+STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estimated poses of one camera may differ
+REDUCED = ("images_2", "images_4", "images_8")
+# In the order in which they are looked through; the last but one are those of the CMU Panoptic toolbox.
+ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "", *REDUCED)
+
+Pictures = Mapping[str, Mapping[str, Path]]  # camera, then instant
+Sizes = Mapping[str, tuple[int, int]]
+
+
+def open_posed(
+    path: Path, calibration: Calibration, *, target: Callable[[LensCamera], Camera] = rectilinear
+) -> FrameSource:
+    """The capture at ``path`` with these cameras; the calibration's points come along.
+
+    Args:
+        path: the folder with pictures or videos.
+        calibration: its cameras.
+        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
+
+    Raises:
+        CaptureError: no pictures or videos, or not of the calibrated cameras.
+        CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
+    """
+    for root in (path / name for name in ROOTS):
+        if videos := _videos(root):
+            return undistorted(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
+        if folders := _folders(root):
+            files, poses = _layout(folders, calibration, root)
+            return undistorted(*_of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
+    for root in (path / name for name in ("images", *REDUCED, "")):
+        if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
+            poses = _poses(calibration, stills)
+            return undistorted(*_of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
+    raise CaptureError(
+        f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
+        "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."
+    )
+
+
+def _of_videos(
+    path: Path, videos: Mapping[str, Path], *, root: Path, calibration: Calibration
+) -> tuple[FrameSource, Mapping[str, LensCamera]]:
+    """The videos as they are, and their cameras with lenses."""
+    poses = _poses(calibration, videos)
+    _check(poses, videos, calibration=calibration, root=root)
+    tracks = scan_videos({name: videos[name] for name in sorted(poses, key=natural)})
+    filmed = _filmed(poses, {name: (track.width, track.height) for name, track in tracks.items()}, calibration)
+    rig = _rig(filmed, calibration, path)
+    return synchronised(tracks, rig, where=path, points=calibration.points), filmed
+
+
+def _of_pictures(
+    path: Path, files: Pictures, poses: Mapping[str, PosedCamera], *, root: Path, calibration: Calibration
+) -> tuple[FrameSource, Mapping[str, LensCamera]]:
+    """The pictures as they are, and their cameras with lenses."""
+    _check(poses, files, calibration=calibration, root=root)
+    common = common_pictures({name: files[name] for name in sorted(poses, key=natural)}, where=path)
+    filmed = _filmed(poses, {name: picture_size(pictures[0]) for name, pictures in common.items()}, calibration)
+    rig = _rig(filmed, calibration, path)
+    return ImageSource(path.name, rig, PICTURE_FPS, common, calibration.points), filmed
+
+
+def _files(root: Path, suffixes: Collection[str]) -> dict[str, Path]:
+    """Files of these kinds in a folder, by stem."""
+    if not root.is_dir():
+        return {}
+    return {file.stem: file for file in root.iterdir() if file.suffix.lower() in suffixes}
+
+
+def _videos(root: Path) -> dict[str, Path]:
+    return _files(root, VIDEO_SUFFIXES)
+
+
+def _folders(root: Path) -> dict[str, dict[str, Path]]:
+    """Folders below ``root`` that hold pictures: folder name, then file stem."""
+    if not root.is_dir():
+        return {}
+    folders = (folder for folder in root.iterdir() if folder.is_dir() and folder.name not in ROOTS)
+    return {folder.name: pictures for folder in folders if (pictures := _files(folder, PICTURE_SUFFIXES))}
+
+
+def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pictures, dict[str, PosedCamera]]:
+    """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras."""
+    per_frame: dict[str, dict[str, Path]] = {}
+    for folder, pictures in folders.items():
+        for stem, file in pictures.items():
+            per_frame.setdefault(stem, {})[folder] = file
+    found: list[tuple[Pictures, dict[str, PosedCamera]]] = []
+    reasons: list[CalibrationError] = []
+    for files in (folders, per_frame):
+        try:
+            found.append((files, _poses(calibration, files)))
+        except CalibrationError as error:
+            reasons.append(error)
+    files, poses = max(found, key=lambda candidate: len(candidate[1]), default=({}, {}))
+    if not poses and reasons:
+        raise reasons[0]
+    return (files, poses) if poses else (folders, {})
+
+
+def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, PosedCamera]:
+    """The calibration of each camera that has one.
+
+    Names of cameras that differ in their form alone, such as ``cam_1`` and ``Camera01``, are matched by their numbers,
+    provided that all of them are.
+
+    Raises:
+        CalibrationError: pictures of one camera have different poses.
+    """
+    parts = [_parts(posed.name) for posed in calibration.cameras]
+    found = [next((part for part in path if part in cameras), None) for path in parts]
+    if any(found) or any(_parts(posed.name) != (posed.name,) for posed in calibration.cameras):
+        return _still(calibration, found)
+    numbered = {_number(name): name for name in cameras}
+    numbers = [_number(name) for (name,) in parts]
+    if None in numbered or len(numbered) != len(cameras) or set(numbers) != set(numbered):
+        return {}
+    return _still(calibration, [numbered[number] for number in numbers])
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """The parts of a path, without the suffix of pictures and videos."""
+    path = PurePosixPath(name)
+    return (path.with_suffix("") if _is_file(name) else path).parts
+
+
+def _is_file(name: str) -> bool:
+    """Whether a calibration names a picture or video here, rather than a camera."""
+    return PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES | VIDEO_SUFFIXES
+
+
+def _number(name: str) -> tuple[int, ...] | None:
+    """The numbers in a name, which ``cam_1``, ``Cam01`` and ``1`` share."""
+    return tuple(int(digits) for digits in re.findall(r"\d+", name)) or None
+
+
+def _still(calibration: Calibration, names: Sequence[str | None]) -> dict[str, PosedCamera]:
+    """The first pose of each camera of ``names``, which all others of it must agree with."""
+    centers = np.array([camera.center for camera in calibration.cameras]).reshape(-1, 3)
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) else 0.0
+    found: dict[str, PosedCamera] = {}
+    for name, posed in zip(names, calibration.cameras, strict=True):
+        if name is None:
+            continue
+        first = found.setdefault(name, posed)
+        turn = np.trace(first.viewmat[:3, :3] @ posed.viewmat[:3, :3].T)
+        degrees = np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1)))
+        shift = float(np.linalg.norm(first.center - posed.center))
+        if shift > STILL_FRACTION * extent or degrees > STILL_DEGREES:
+            raise CalibrationError(
+                f"Camera {name!r} moves in {calibration.where}: {first.name!r} and {posed.name!r} lie {shift:.3g} "
+                f"units and {degrees:.2g} degrees apart; expected cameras that stand still."
+            )
+    return found
+
+
+def _check(
+    poses: Mapping[str, PosedCamera], pictured: Collection[str], *, calibration: Calibration, root: Path
+) -> None:
+    """Pictures and calibration belong together.
+
+    Raises:
+        CalibrationError: they do not.
+    """
+    if poses:
+        check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
+        used = {posed.name for posed in poses.values()}
+        idle = [posed.name for posed in calibration.cameras if posed.name not in used and not _is_file(posed.name)]
+        if idle:
+            log.warning("%s has no pictures of %s of %s; left out", root, listed(idle), calibration.where)
+        return
+    first = calibration.cameras[0].name if calibration.cameras else "nothing"
+    raise CalibrationError(
+        f"No camera of {calibration.where} belongs to the pictures in {root}: the one names {first!r}, the others "
+        f"{next(iter(pictured), 'nothing')!r}; expected the camera's name in both."
+    )
+
+
+def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibration) -> dict[str, LensCamera]:
+    """Every camera at the size of its pictures, in the order of ``sizes``."""
+    return {
+        name: LensCamera(_sized(name, poses[name], sizes[name], calibration.where), poses[name].lens) for name in sizes
+    }
+
+
+def _sized(name: str, posed: PosedCamera, size: tuple[int, int], where: Path) -> Camera:
+    width, height = posed.size or size
+    camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
+    if abs(size[1] - height * size[0] / width) > 1:
+        raise CalibrationError(
+            f"The pictures of camera {name!r} have {size[0]}x{size[1]} pixels, {where} is for {width}x{height}: other "
+            "proportions, so they are not a reduction; use pictures of the mode that was calibrated, or calibrate it."
+        )
+    return camera.resized(*size)
+
+
+def _rig(filmed: Mapping[str, LensCamera], calibration: Calibration, path: Path) -> CameraRig:
+    held_out = [name for name in calibration.held_out if name in filmed]
+    return calibrated_rig({name: own.camera for name, own in filmed.items()}, held_out, where=path)

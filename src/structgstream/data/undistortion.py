@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of any lens made rectilinear as they are read, so that everything after sees pinholes.
+
+The grid of a camera is computed once. By default the picture shows the largest field of view that the lens fills, up to
+:data:`WIDEST_DEGREES`; a wider one can be asked for, and what the lens does not show is black and masked.
+"""
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.images import opencv
+from structgstream.data.lenses import Floats, LensCamera, Pinhole
+from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import WithRig
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.frames import MultiViewFrame
+
+WIDEST_DEGREES = 110.0
+"""Across the longer side. A plane stretches what lies off its axis: 3 times at the edge of 110 degrees, 15 of 150."""
+MOST_OVERSAMPLING = 4
+BORDER_SAMPLES = 129
+SCALE_SAMPLES = 33
+
+
+def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple[int, int] | None = None) -> Camera:
+    """The pinhole that pictures of a lens can be resampled for, with square pixels.
+
+    Args:
+        filmed: the camera as it films; one without distortion is given back as it is, unless something is asked for.
+        degrees: field of view across the picture's width, around the optical axis; None for the largest that the lens
+            fills, up to :data:`WIDEST_DEGREES` across the longer side.
+        size: width and height of the pictures, pixels; None for those of the lens.
+
+    Raises:
+        ConfigError: a field of view that no plane can show, or a size that is not positive.
+        CalibrationError: a lens that is one to one nowhere in its picture.
+    """
+    width, height = (filmed.camera.width, filmed.camera.height) if size is None else size
+    if min(width, height) < 1:
+        raise ConfigError(f"A picture of {width}x{height} pixels cannot be made; give a positive width and height.")
+    if degrees is None and isinstance(filmed.lens, Pinhole):
+        return filmed.camera.resized(width, height)
+    if degrees is not None:
+        if not 0 < degrees < 175:
+            raise ConfigError(f"A plane cannot show {degrees:g} degrees; give a field of view of less than 175.")
+        focal = width / 2 / math.tan(math.radians(degrees) / 2)
+        middle = np.zeros(2)
+    else:
+        low, high = _filled(filmed)
+        middle = (low + high) / 2
+        least = max(width, height) / 2 / math.tan(math.radians(WIDEST_DEGREES) / 2)
+        # The picture's outermost pixel centres lie on the border of what is filled.
+        focal = float(max((np.array([width - 1, height - 1]) / (high - low)).max(), least))
+    cx, cy = width / 2 - focal * middle[0], height / 2 - focal * middle[1]
+    K = torch.tensor([[focal, 0, cx], [0, focal, cy], [0, 0, 1]], dtype=torch.float64)
+    return replace(filmed.camera, K=K, width=width, height=height)
+
+
+def _filled(filmed: LensCamera) -> tuple[Floats, Floats]:
+    """Two corners, normalised, of a rectangle around the axis that the lens fills."""
+    width, height = filmed.camera.width, filmed.camera.height
+    across, down = np.linspace(0.5, width - 0.5, BORDER_SAMPLES), np.linspace(0.5, height - 0.5, BORDER_SAMPLES)
+    bounds = []
+    for axis, along, edge in ((0, down, width), (1, across, height)):
+        for at, worst in ((0.5, np.nanmax), (edge - 0.5, np.nanmin)):
+            pixels = np.stack([np.full_like(along, at), along] if axis == 0 else [along, np.full_like(along, at)], -1)
+            seen = filmed.normalised(pixels)[:, axis]  # NaN where the lens sees no such thing: no bound
+            bounds.append(worst(seen) if np.isfinite(seen).any() else math.copysign(math.inf, at - 1))
+    most = min(filmed.lens.reach, math.tan(math.radians(WIDEST_DEGREES) / 2))
+    low, high = np.maximum(bounds[0::2], -most), np.minimum(bounds[1::2], most)
+    if not ((low < 0).all() and (high > 0).all()):
+        raise CalibrationError(
+            "The lens does not fill a picture around its axis: principal point or distortion belong to another "
+            "picture; expected the calibration of these pictures."
+        )
+    # Corners may lie beyond the reach of the lens, or outside of its picture, although the sides do not.
+    for _ in range(400):
+        if _shows(filmed, _border(low, high)):
+            return low, high
+        low, high = low * 0.99, high * 0.99
+    raise CalibrationError(
+        "The lens model folds at its axis, so that nothing can be undistorted; check the order of the coefficients."
+    )
+
+
+def _border(low: Floats, high: Floats) -> Floats:
+    along = np.linspace(0, 1, BORDER_SAMPLES)[:, None]
+    corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    return np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))])
+
+
+def _shows(filmed: LensCamera, normalised: Floats) -> bool:
+    return bool(_inside(filmed.placed(normalised), filmed.camera).all())
+
+
+def _inside(pixels: Floats, camera: Camera) -> NDArray[np.bool_]:
+    """Which pixels lie on the picture, within its outermost pixel centres; NaN lies outside."""
+    slack = 0.01  # pixels; the border is sampled
+    most = np.array([camera.width, camera.height]) - 0.5 + slack
+    return np.all((pixels >= 0.5 - slack) & (pixels <= most), axis=-1)
+
+
+@dataclass(frozen=True)
+class Undistortion:
+    """How pictures of ``filmed`` become those of the pinhole ``target``, which has the same pose.
+
+    Where pictures shrink, areas are averaged: the picture is reduced as far as nothing of it is lost, and every pixel
+    is the mean of a finer grid.
+    """
+
+    filmed: LensCamera
+    target: Camera
+
+    def __call__(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """``[H, W, 3]`` of the lens to ``[H, W, 3]`` of the pinhole; black where the lens shows nothing."""
+        cv2 = opencv()
+        if (reduced := self._reduced) != (self.filmed.camera.width, self.filmed.camera.height):
+            picture = cv2.resize(picture, reduced, interpolation=cv2.INTER_AREA)
+        result = cv2.remap(picture, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        size = (self.target.width, self.target.height)
+        if result.shape[1::-1] != size:
+            result = cv2.resize(result, size, interpolation=cv2.INTER_AREA)
+        if self.shown is not None:
+            result[~self.shown] = 0
+        return result
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_] | None:
+        """Which pixels ``[H, W]`` of the pinhole the lens shows; None when it shows all."""
+        shown = _inside(self.filmed.placed(_rays(self.target, 1)), self.filmed.camera)
+        return None if shown.all() else shown
+
+    @cached_property
+    def _scales(self) -> tuple[float, float]:
+        """Least and most pixels of the lens, along any direction, in a pixel of the pinhole."""
+        K = self.target.K.numpy()
+        across = np.linspace(1, self.target.width - 1, SCALE_SAMPLES)
+        down = np.linspace(1, self.target.height - 1, SCALE_SAMPLES)
+        pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
+
+        def at(pixels: Floats) -> Floats:
+            return self.filmed.placed((pixels - K[:2, 2]) / K[[0, 1], [0, 1]])
+
+        steps = [at(pixels + axis) - at(pixels - axis) for axis in np.eye(2) / 2]
+        jacobians = np.stack(steps, -1)
+        jacobians = jacobians[np.isfinite(jacobians).all((-1, -2))]
+        if not len(jacobians):
+            raise CalibrationError("The lens shows nothing of the field of view that was asked for; give a wider one.")
+        singular = np.linalg.svd(jacobians, compute_uv=False)
+        return float(singular.min()), float(singular.max())
+
+    @property
+    def _reduced(self) -> tuple[int, int]:
+        """The size to which pictures of the lens are reduced first."""
+        width, height = self.filmed.camera.width, self.filmed.camera.height
+        factor = self._scales[0]
+        return (width, height) if factor < 1.25 else (round(width / factor), round(height / factor))
+
+    @cached_property
+    def _maps(self) -> tuple[NDArray[np.generic], NDArray[np.generic]]:
+        """Where each pixel comes from, in fixed-point numbers of 1/32 pixel, as OpenCV counts: centres are integers."""
+        cv2 = opencv()
+        camera, reduced = self.filmed.camera, self._reduced
+        left = self._scales[1] * reduced[0] / camera.width
+        grid = _rays(self.target, min(max(math.ceil(left - 0.5), 1), MOST_OVERSAMPLING))
+        pixels = self.filmed.placed(grid) * (reduced[0] / camera.width, reduced[1] / camera.height) - 0.5
+        # Beyond the lens any place will do: those pixels become black.
+        clipped = np.clip(np.nan_to_num(pixels, nan=-1.0), -1, np.array(reduced)).astype(np.float32)
+        return cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2)
+
+
+def _rays(camera: Camera, oversampling: int) -> Floats:
+    """Normalised points ``[H, W, 2]`` of a pinhole's pixel centres, or of a grid as many times as fine."""
+    K = camera.K.numpy()
+    columns = (np.arange(camera.width * oversampling) + 0.5) / oversampling
+    rows = (np.arange(camera.height * oversampling) + 0.5) / oversampling
+    pixels = np.stack(np.meshgrid(columns, rows), -1)
+    return (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+
+
+@dataclass(frozen=True)
+class Undistorted(WithRig):
+    """The frames of ``source``, whose pictures are as the lenses of ``filmed`` give them, as pinholes would take them.
+
+    ``other`` is the rig of the pinholes. Cameras without distortion whose size stays pass through.
+    """
+
+    filmed: Mapping[str, LensCamera]
+    _plans: dict[str, Undistortion | None] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        plans = [self._plan(name) for name in self.rig]
+
+        def pinhole(plan: Undistortion | None, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+            return picture if plan is None else plan(picture)
+
+        with ThreadPoolExecutor(min(len(plans), os.cpu_count() or 1), "lenses") as pool:
+            for frame in self.source.frames(start):
+                pictures = pool.map(pinhole, plans, [frame.images[name] for name in self.rig])
+                yield replace(frame, images=dict(zip(self.rig, pictures, strict=True)))
+
+    def shown(self, name: str) -> NDArray[np.bool_] | None:
+        """Which pixels ``[H, W]`` of a camera its lens shows; None when all."""
+        plan = self._plan(name)
+        return None if plan is None else plan.shown
+
+    def resized(self, rig: CameraRig) -> "Undistorted":
+        """The same frames at the sizes of ``rig``, resampled once."""
+        return replace(self, other=rig)
+
+    def passes(self, name: str) -> bool:
+        """Whether the pictures of a camera stay as they are."""
+        filmed = self.filmed[name]
+        return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
+
+    def _plan(self, name: str) -> Undistortion | None:
+        if name not in self._plans:
+            self._plans[name] = None if self.passes(name) else Undistortion(self.filmed[name], self.rig[name])
+        return self._plans[name]
+
+
+def undistorted(
+    source: FrameSource, filmed: Mapping[str, LensCamera], *, target: Callable[[LensCamera], Camera] = rectilinear
+) -> FrameSource:
+    """A capture whose cameras have lenses, as one of pinholes; the source itself when none distorts.
+
+    Args:
+        source: its rig has the intrinsics and sizes of ``filmed``.
+        filmed: the same cameras with their lenses.
+        target: chooses the pinhole for a camera, see :func:`rectilinear`.
+
+    Raises:
+        CalibrationError: a lens that cannot be undistorted, naming its camera.
+    """
+    cameras: dict[str, Camera] = {}
+    for name in source.rig:
+        try:
+            cameras[name] = replace(target(filmed[name]), near=source.rig[name].near)
+        except CalibrationError as error:
+            raise CalibrationError(f"Camera {name!r} of {source.name}: {error}") from None
+    made = Undistorted(source, source.rig.mapped(cameras), filmed)
+    return source if all(made.passes(name) for name in made.rig) else made

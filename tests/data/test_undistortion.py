@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from captures import small_rig
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.data.undistortion import WIDEST_DEGREES, Undistorted, Undistortion, rectilinear, undistorted
+from structgstream.data.wrappers import of_cameras, resized, section
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.frames import MultiViewFrame
+
+MILD = RadialTangential(k1=-0.2, k2=0.05, p1=0.001, p2=-0.002)
+PINCUSHION = RadialTangential(k1=0.15)
+WIDE = Fisheye(0.05, -0.01, 0.002, -0.001)
+LENSES = [(MILD, 300.0), (PINCUSHION, 300.0), (WIDE, 300.0), (Fisheye(), 245.0), (RadialTangential(k1=-0.35), 250.0)]
+
+
+def filmed(lens: Lens, focal: float = 300.0, *, width: int = 320, height: int = 240) -> LensCamera:
+    """The principal point lies off the middle, and pixels are a little wider than high."""
+    focal *= width / 640
+    K = torch.tensor([[focal, 0, 0.49 * width], [0, 1.01 * focal, 0.53 * height], [0, 0, 1]], dtype=torch.float64)
+    return LensCamera(Camera(torch.eye(4), K, width, height), lens)
+
+
+def pattern(normalised: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """What the world looks like in a direction: smooth, and of a slope that shows shifts."""
+    x, y = np.moveaxis(normalised, -1, 0)
+    waves = np.stack([np.sin(5 * x), np.sin(5 * y), np.sin(3 * (x + y))], -1)
+    return np.rint(127.5 + 120 * np.nan_to_num(waves)).astype(np.uint8)
+
+
+def centers(camera: Camera) -> NDArray[np.float64]:
+    columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    return np.stack(np.meshgrid(columns, rows), -1).astype(np.float64)
+
+
+def expected(camera: Camera) -> NDArray[np.uint8]:
+    return pattern(LensCamera(camera, Pinhole()).normalised(centers(camera)))
+
+
+@pytest.mark.parametrize(("lens", "focal"), LENSES)
+@pytest.mark.parametrize("degrees", [None, 60.0])
+def test_the_pinhole_sees_what_is_there(lens: Lens, focal: float, degrees: float | None) -> None:
+    """A picture taken through the lens, against the one that a pinhole takes: the mean error is that of rounding.
+
+    Half a pixel of shift, the difference of the two conventions, would be 0.8 levels and more.
+    """
+    camera = filmed(lens, focal, width=640, height=480)
+    taken = pattern(camera.normalised(centers(camera.camera)))
+    target = rectilinear(camera, degrees=degrees)
+    plan = Undistortion(camera, target)
+    shown = np.ones((480, 640), bool) if plan.shown is None else plan.shown
+    error = np.abs(plan(taken).astype(float) - expected(target))[shown]
+    assert error.mean() < 0.35
+    assert np.quantile(error, 0.999) < 3
+
+
+@pytest.mark.parametrize(("lens", "focal"), LENSES)
+@pytest.mark.parametrize("size", [(640, 480), (320, 320)])
+def test_no_border_is_black_by_default(lens: Lens, focal: float, size: tuple[int, int]) -> None:
+    camera = filmed(lens, focal, width=640, height=480)
+    target = rectilinear(camera, size=size)
+    assert (target.width, target.height) == size
+    assert target.K[0, 0] == target.K[1, 1]
+    assert Undistortion(camera, target).shown is None
+
+
+def test_the_field_of_view_is_the_largest_without_a_border() -> None:
+    """A little more would show one."""
+    for lens, focal in LENSES[:3]:
+        camera = filmed(lens, focal, width=640, height=480)
+        target = rectilinear(camera)
+        wider = replace(target, K=target.K * torch.tensor([[0.97, 1, 1], [1, 0.97, 1], [1, 1, 1]]))
+        assert Undistortion(camera, wider).shown is not None
+
+
+def test_a_wide_fisheye_stops_at_the_widest_that_a_plane_shows_well() -> None:
+    camera = filmed(Fisheye(), 640 / math.radians(150), width=640, height=480)
+    target = rectilinear(camera)
+    assert math.degrees(2 * math.atan(320 / float(target.K[0, 0]))) == pytest.approx(WIDEST_DEGREES)
+    wide = rectilinear(camera, degrees=140)
+    assert float(wide.K[0, 0]) == pytest.approx(320 / math.tan(math.radians(70)))
+    shown = Undistortion(camera, wide).shown
+    assert shown is not None  # the picture is less high than wide
+    assert shown[240].all()
+
+
+def test_what_the_lens_does_not_show_is_black_and_masked() -> None:
+    camera = filmed(Fisheye(), 640 / math.radians(90), width=640, height=480)
+    plan = Undistortion(camera, rectilinear(camera, degrees=110))
+    white = np.full((480, 640, 3), 255, np.uint8)
+    result = plan(white)
+    assert plan.shown is not None
+    assert 0.4 < plan.shown.mean() < 0.9
+    assert (result[plan.shown] == 255).all()
+    assert (result[~plan.shown] == 0).all()
+    assert plan.shown[240, 320]
+    assert not plan.shown[0, 0]
+
+
+@pytest.mark.parametrize("lens", [MILD, Fisheye()])
+def test_areas_are_averaged_where_pictures_shrink(lens: Lens) -> None:
+    """Stripes of one pixel become grey; single samples of them would be black or white."""
+    camera = filmed(lens, 500, width=640, height=480)
+    stripes = np.zeros((480, 640, 3), np.uint8)
+    stripes[:, ::2] = 255
+    small = Undistortion(camera, rectilinear(camera, size=(160, 120)))(stripes)
+    assert small.shape == (120, 160, 3)
+    assert abs(float(small.mean()) - 127.5) < 2
+    assert small.std() < 25
+
+
+def test_a_pinhole_stays_as_it_is() -> None:
+    camera = filmed(Pinhole())
+    assert rectilinear(camera) is not camera.camera
+    assert torch.equal(rectilinear(camera).K, camera.camera.K)
+    half = rectilinear(camera, size=(160, 120))
+    assert torch.equal(half.K, camera.camera.resized(160, 120).K)
+
+
+def test_what_cannot_be_made_is_refused() -> None:
+    with pytest.raises(ConfigError, match="cannot show 180 degrees"):
+        rectilinear(filmed(WIDE), degrees=180)
+    with pytest.raises(ConfigError, match="0x10 pixels"):
+        rectilinear(filmed(WIDE), size=(0, 10))
+    off = filmed(MILD)
+    K = off.camera.K.clone()
+    K[0, 2] = -40
+    with pytest.raises(CalibrationError, match="belong to another picture"):
+        rectilinear(replace(off, camera=replace(off.camera, K=K)))
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """Two frames of the pattern through the lenses of a rig; the second is darker."""
+
+    cameras: dict[str, LensCamera]
+    fps: float = 30.0
+    name: str = "take"
+    points: None = None
+
+    @property
+    def rig(self) -> CameraRig:
+        return CameraRig({name: own.camera for name, own in self.cameras.items()}, frozenset({"cam00"}))
+
+    def __len__(self) -> int:
+        return 2
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        for index in range(start, 2):
+            images = {
+                name: (pattern(own.normalised(centers(own.camera))) // (index + 1)).astype(np.uint8)
+                for name, own in self.cameras.items()
+            }
+            yield MultiViewFrame(index, index / self.fps, images)
+
+
+@pytest.fixture
+def source() -> Filmed:
+    rig = small_rig(4)
+    lenses = (MILD, Pinhole(), WIDE, PINCUSHION)
+    cameras = [
+        replace(filmed(lens), camera=replace(filmed(lens).camera, viewmat=rig[name].viewmat, near=0.3))
+        for lens, name in zip(lenses, rig)
+    ]
+    return Filmed(dict(zip(rig, cameras)))
+
+
+def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
+    made = undistorted(source, source.cameras)
+    assert isinstance(made, Undistorted)
+    assert made.rig.testing == ("cam00",)
+    assert (made.name, made.fps, len(made)) == ("take", 30.0, 2)
+    assert {camera.near for camera in made.rig.cameras.values()} == {0.3}
+    taken = list(source.frames())
+    for frame, before in zip(made.frames(), taken, strict=True):
+        assert (frame.index, frame.pts_seconds) == (before.index, before.pts_seconds)
+        assert frame.images["cam01"] is not None
+        np.testing.assert_array_equal(frame.images["cam01"], before.images["cam01"])
+        for name in made.rig:
+            error = np.abs(frame.images[name].astype(float) - expected(made.rig[name]) // (frame.index + 1))
+            assert error.mean() < 1
+            assert torch.equal(made.rig[name].viewmat, source.rig[name].viewmat)
+    assert made.shown("cam00") is None
+    assert [frame.index for frame in made.frames(1)] == [1]
+
+
+def test_a_capture_of_pinholes_is_left_alone(source: Filmed) -> None:
+    plain = replace(source, cameras={name: replace(own, lens=Pinhole()) for name, own in source.cameras.items()})
+    assert undistorted(plain, plain.cameras) is plain
+
+
+def test_a_smaller_picture_is_resampled_once(source: Filmed) -> None:
+    half = section(resized(undistorted(source, source.cameras), 0.5), start=1)
+    (frame,) = half.frames()
+    for name in half.rig:
+        camera = half.rig[name]
+        assert frame.images[name].shape == (120, 160, 3) == (camera.height, camera.width, 3)
+        error = np.abs(frame.images[name].astype(float) - expected(camera) // 2)
+        assert error.mean() < 1
+
+
+def test_some_of_the_cameras(source: Filmed) -> None:
+    part = of_cameras(undistorted(source, source.cameras), ("cam02", "cam03"))
+    assert [*part.rig] == ["cam02", "cam03"]
+    whole = next(undistorted(source, source.cameras).frames())
+    for name, image in next(part.frames()).images.items():
+        np.testing.assert_array_equal(image, whole.images[name])
+
+
+def test_a_broken_lens_names_its_camera(source: Filmed, tmp_path: Path) -> None:
+    broken = source.cameras["cam02"]
+    K = broken.camera.K.clone()
+    K[1, 2] = -10
+    cameras = {**source.cameras, "cam02": replace(broken, camera=replace(broken.camera, K=K))}
+    with pytest.raises(CalibrationError, match="Camera 'cam02' of take"):
+        undistorted(source, cameras)
