@@ -11,7 +11,7 @@ ablations are edits of the dynamic set. The order of rows is the order of fields
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from operator import attrgetter
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -83,9 +83,14 @@ class Parameter:
         """Whether there is a rate for it."""
         return self.online_rate is not None or self.first_rate is not None
 
-    @property
+    @cached_property
+    def holder(self) -> str:
+        """The part of the scene that holds the attribute; empty for the scene itself."""
+        return self.path.rpartition(".")[0]
+
+    @cached_property
     def attribute(self) -> str:
-        """The last part of the path: the attribute's name in the part of the scene that holds it."""
+        """The attribute's name in the part of the scene that holds it."""
         return self.path.rpartition(".")[2]
 
 
@@ -128,7 +133,7 @@ class StateField:
     first_rate: str | None = None
     init_step: str | None = None
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """The parts, or the field itself as the only one."""
         return self.parts or (Parameter(self.name, self.path, 0, self.step, self.online_rate, self.first_rate),)
@@ -212,7 +217,6 @@ STATE_TABLE: tuple[StateField, ...] = (
 
 FIELDS: Mapping[FieldName, StateField] = {row.name: row for row in STATE_TABLE}
 PARAMETERS: tuple[Parameter, ...] = tuple(parameter for row in STATE_TABLE for parameter in row.parameters)
-REQUIRED: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if not row.optional)
 PAPER_DYNAMIC: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if row.dynamic)
 FREE_COLUMNS = sum(parameter.columns for parameter in FIELDS["free"].parts)
 _PARTS_OF_SCENE = {"anchors": AnchorCloud, "mlps": MLPWeights, "free": FreeGaussians, "camera_color": CameraColor}
@@ -242,7 +246,7 @@ def unflatten_head(vector: Tensor, inputs: int, outputs: int) -> HeadWeights:
 
 def tensor_of(scene: Scene, parameter: Parameter) -> Tensor | None:
     """A parameter's tensor in ``scene``, an MLP as one vector; None where the scene does without it."""
-    value = attrgetter(parameter.path)(scene)
+    value = getattr(getattr(scene, parameter.holder) if parameter.holder else scene, parameter.attribute)
     return flatten_head(value) if isinstance(value, HeadWeights) else value
 
 
@@ -280,8 +284,7 @@ def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) 
                 continue
             if row.outputs:
                 value = unflatten_head(value, inputs, row.outputs * k)
-            holder = parameter.path.rpartition(".")[0]
-            (found[holder] if holder else found)[parameter.attribute] = value
+            (found[parameter.holder] if parameter.holder else found)[parameter.attribute] = value
     for holder, kind in _PARTS_OF_SCENE.items():
         found[holder] = kind(**found[holder])
     return Scene(**found, distance_input=distance_input)
