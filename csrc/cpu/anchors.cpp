@@ -168,10 +168,30 @@ void write_rows(const float* rows, int width, const Block& block, float* values)
         for (int l = 0; l < block.count; ++l) values[block.anchors[l] * width + column] = rows[column * kBlock + l];
 }
 
+// Rows of kBlock floats in one piece of memory: what is asked for first lies first.
+class Rows {
+  public:
+    int take(int rows) {
+        const int first = count_;
+        count_ += rows;
+        return first;
+    }
+    size_t size() const { return static_cast<size_t>(count_) * kBlock; }  // floats
+
+  private:
+    int count_ = 0;
+};
+
+inline float* row_of(float* memory, int row) { return memory + static_cast<size_t>(row) * kBlock; }
+inline const float* row_of(const float* memory, int row) { return memory + static_cast<size_t>(row) * kBlock; }
+inline int32_t* bit_row_of(float* memory, int row) { return reinterpret_cast<int32_t*>(row_of(memory, row)); }
+
 // The MLPs' inputs of a block: rows 0 ... D - 1 the feature, then the direction, then the distance if it is an input.
 struct Inputs {
     float* rows;      // [inputs_padded][kBlock]
     float* distance;  // [kBlock]
+    static int take(Rows& rows, const Sizes& s) { return rows.take(s.inputs_padded + 1); }
+    Inputs(float* first, const Sizes& s) : rows(first), distance(row_of(first, s.inputs_padded)) {}
     [[gnu::noinline]] void read(const sgs_anchors& a, const Sizes& s, const Block& block) const {
         read_rows(a.features, s.d, block, rows);
         float* direction = rows + s.d * kBlock;
@@ -266,12 +286,14 @@ void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
     const int m = a.visible_count, chunks = (m + kChunk - 1) / kChunk;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
     for (int chunk = 0; chunk < chunks; ++chunk) {
-        const int rows = s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[0] + s.words;
-        const Buffer memory(static_cast<size_t>(rows) * kBlock);
-        const Inputs x{memory.get(), memory.get() + s.inputs_padded * kBlock};
-        float* hidden = x.distance + kBlock;
-        float* raw = hidden + s.hidden_padded * kBlock;
-        int32_t* bits = reinterpret_cast<int32_t*>(raw + s.outputs_padded[0] * kBlock);
+        Rows rows;
+        const int inputs_at = Inputs::take(rows, s), hidden_at = rows.take(s.hidden_padded),
+                  raw_at = rows.take(s.outputs_padded[0]), bits_at = rows.take(s.words);
+        const Buffer memory(rows.size());
+        const Inputs x(row_of(memory.get(), inputs_at), s);
+        float* hidden = row_of(memory.get(), hidden_at);
+        float* raw = row_of(memory.get(), raw_at);
+        int32_t* bits = bit_row_of(memory.get(), bits_at);
         for (int row = chunk * kChunk; row < std::min(m, (chunk + 1) * kChunk); row += kBlock) {
             const int count = std::min(kBlock, m - row);
             Block block{count, {}};
@@ -302,24 +324,83 @@ void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
     out.gaussian_count = gaussians;
 }
 
+namespace {
+
+// Where the attributes of a block lie while they are made.
+struct AttributeRows {
+    Rows rows;
+    int inputs, hidden, color, covariance, norms, reach, base, bits;
+    explicit AttributeRows(const Sizes& s)
+        : inputs(Inputs::take(rows, s)), hidden(rows.take(s.hidden_padded)), color(rows.take(s.outputs_padded[1])),
+          covariance(rows.take(s.outputs_padded[2])), norms(rows.take(s.k)), reach(rows.take(3)), base(rows.take(3)),
+          bits(rows.take(s.words)) {}
+};
+
+// What the heads say to attributes: colours through the sigmoid, scales times their base, quaternions of length one.
+void activate(const AttributeRows& at, int k, float* memory) {
+    float* color = row_of(memory, at.color);
+    const float* base = row_of(memory, at.base);
+    for (int i = 0; i < 3 * k * kBlock; i += kLanes) store(color + i, sigmoid(load(color + i)));
+    for (int j = 0; j < k; ++j) {
+        float* rows = row_of(memory, at.covariance + 7 * j);
+        for (int i = 0; i < 3 * kBlock; i += kLanes) store(rows + i, sigmoid(load(rows + i)) * load(base + i));
+        float* quat = rows + 3 * kBlock;
+        float* norm = row_of(memory, at.norms + j);
+        for (int l = 0; l < kBlock; ++l) {
+            const float w = quat[l], x = quat[kBlock + l], y = quat[2 * kBlock + l], z = quat[3 * kBlock + l];
+            norm[l] = 1.0f / std::max(std::sqrt(w * w + x * x + y * y + z * z), 1e-12f);
+            for (int c = 0; c < 4; ++c) quat[c * kBlock + l] *= norm[l];
+        }
+    }
+}
+
+// The drawn Gaussians of a block, from active row `begin` on, to where they belong.
+void write_gaussians(
+    const sgs_anchors& a, const sgs_selection& selection, const AttributeRows& at, const float* memory, int begin,
+    const Block& block, const sgs_gaussians& out) {
+    const int k = a.offsets_per_anchor;
+    const float* reach = row_of(memory, at.reach);
+    for (int l = 0; l < block.count; ++l) {
+        const int64_t anchor = block.anchors[l];
+        const float* raw = selection.raw_opacities + static_cast<size_t>(selection.active[begin + l]) * k;
+        const float* position = a.positions + anchor * 3;
+        const int64_t start = selection.starts[begin + l], end = selection.starts[begin + l + 1];
+        for (int64_t j = 0, g = start; g < end; ++j) {  // writes what is not drawn too, and then over it
+            out.ids[g] = anchor * k + j;
+            g += raw[j] > 0.0f;
+        }
+        for (int64_t g = start; g < end; ++g) {
+            const int j = static_cast<int>(out.ids[g] - anchor * k);
+            const float* offset = a.offsets + out.ids[g] * 3;
+            const float* shape = row_of(memory, at.covariance + 7 * j) + l;
+            const float* shade = row_of(memory, at.color + 3 * j) + l;
+            for (int c = 0; c < 3; ++c) {
+                out.means[3 * g + c] = position[c] + offset[c] * reach[c * kBlock + l];
+                out.scales[3 * g + c] = shape[c * kBlock];
+                out.colors[3 * g + c] = shade[c * kBlock];
+            }
+            for (int c = 0; c < 4; ++c) out.quats[4 * g + c] = shape[(3 + c) * kBlock];
+            out.quat_norms[g] = row_of(memory, at.norms + j)[l];
+            out.opacities[g] = raw[j];
+        }
+    }
+}
+
+}  // namespace
+
 void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const sgs_gaussians& out, int threads) {
     const Sizes s(a);
+    const AttributeRows at(s);
     const Packed first[2] = {first_layer(a.heads[1], s), first_layer(a.heads[2], s)};
     const Packed second[2] = {second_layer(a.heads[1], s, 1), second_layer(a.heads[2], s, 2)};
     const int total = static_cast<int>(selection.active_count), chunks = (total + kChunk - 1) / kChunk;
-    const int k = s.k;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
     for (int chunk = 0; chunk < chunks; ++chunk) {
-        const int rows = s.inputs_padded + 1 + s.hidden_padded + s.outputs_padded[1] + s.outputs_padded[2];
-        const Buffer memory(static_cast<size_t>(rows + k + 6 + s.words) * kBlock);
-        const Inputs x{memory.get(), memory.get() + s.inputs_padded * kBlock};
-        float* hidden = x.distance + kBlock;
-        float* color = hidden + s.hidden_padded * kBlock;
-        float* covariance = color + s.outputs_padded[1] * kBlock;
-        float* norms = covariance + s.outputs_padded[2] * kBlock;
-        float* reach = norms + k * kBlock;
-        float* base = reach + 3 * kBlock;
-        int32_t* bits = reinterpret_cast<int32_t*>(base + 3 * kBlock);
+        const Buffer buffer(at.rows.size());
+        float* memory = buffer.get();
+        const Inputs x(row_of(memory, at.inputs), s);
+        float* hidden = row_of(memory, at.hidden);
+        int32_t* bits = bit_row_of(memory, at.bits);
         for (int begin = chunk * kChunk; begin < std::min(total, (chunk + 1) * kChunk); begin += kBlock) {
             const int count = std::min(kBlock, total - begin);
             const Block block = active_block(a, selection, begin, count);
@@ -330,51 +411,51 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
                 for (int l = 0; l < count; ++l)
                     for (int w = 0; w < s.words; ++w)
                         bits_of(selection, s, selection.active[begin + l], h)[w] = bits[w * kBlock + l];
-                second[h - 1].apply(hidden, h == 1 ? color : covariance);
+                second[h - 1].apply(hidden, row_of(memory, h == 1 ? at.color : at.covariance));
             }
-            read_exponentials(a.log_offset_scales, block, reach);
-            read_exponentials(a.log_base_scales, block, base);
-            for (int i = 0; i < 3 * k * kBlock; i += kLanes) store(color + i, sigmoid(load(color + i)));
-            for (int j = 0; j < k; ++j) {
-                float* rows = covariance + 7 * j * kBlock;
-                for (int i = 0; i < 3 * kBlock; i += kLanes) store(rows + i, sigmoid(load(rows + i)) * load(base + i));
-                float* quat = rows + 3 * kBlock;
-                float* norm = norms + j * kBlock;
-                for (int l = 0; l < kBlock; ++l) {
-                    const float w = quat[l], x1 = quat[kBlock + l], y = quat[2 * kBlock + l], z = quat[3 * kBlock + l];
-                    norm[l] = 1.0f / std::max(std::sqrt(w * w + x1 * x1 + y * y + z * z), 1e-12f);
-                    for (int c = 0; c < 4; ++c) quat[c * kBlock + l] *= norm[l];
-                }
-            }
-            for (int l = 0; l < count; ++l) {
-                const int64_t anchor = block.anchors[l];
-                const float* raw = selection.raw_opacities + static_cast<size_t>(selection.active[begin + l]) * k;
-                const float* position = a.positions + anchor * 3;
-                const int64_t start = selection.starts[begin + l], end = selection.starts[begin + l + 1];
-                for (int64_t j = 0, g = start; g < end; ++j) {  // writes what is not drawn too, and then over it
-                    out.ids[g] = anchor * k + j;
-                    g += raw[j] > 0.0f;
-                }
-                for (int64_t g = start; g < end; ++g) {
-                    const int j = static_cast<int>(out.ids[g] - anchor * k);
-                    const float* offset = a.offsets + out.ids[g] * 3;
-                    const float* shape = covariance + 7 * j * kBlock + l;
-                    const float* shade = color + 3 * j * kBlock + l;
-                    for (int c = 0; c < 3; ++c) {
-                        out.means[3 * g + c] = position[c] + offset[c] * reach[c * kBlock + l];
-                        out.scales[3 * g + c] = shape[c * kBlock];
-                        out.colors[3 * g + c] = shade[c * kBlock];
-                    }
-                    for (int c = 0; c < 4; ++c) out.quats[4 * g + c] = shape[(3 + c) * kBlock];
-                    out.quat_norms[g] = norms[j * kBlock + l];
-                    out.opacities[g] = raw[j];
-                }
-            }
+            read_exponentials(a.log_offset_scales, block, row_of(memory, at.reach));
+            read_exponentials(a.log_base_scales, block, row_of(memory, at.base));
+            activate(at, s.k, memory);
+            write_gaussians(a, selection, at, memory, begin, block, out);
         }
     }
 }
 
 namespace {
+
+// Where a block's rows of the backward pass lie. Those of all blocks of a chunk are kept: sums over the chunk follow.
+struct GradientRows {
+    Rows rows;
+    int inputs, outputs[kHeads], hidden_gradients[kHeads], hidden[kHeads];
+    explicit GradientRows(const Sizes& s) : inputs(Inputs::take(rows, s)) {
+        for (int h = 0; h < kHeads; ++h) outputs[h] = rows.take(s.outputs_padded[h]);
+        for (int& row : hidden_gradients) row = rows.take(s.hidden_padded);  // together: one product takes them all
+        for (int& row : hidden) row = rows.take(s.hidden_padded);
+    }
+};
+
+// What a block needs for no longer than itself.
+struct ScratchRows {
+    Rows rows;
+    int input_gradient, means, bits;
+    explicit ScratchRows(const Sizes& s)
+        : input_gradient(rows.take(s.inputs_padded)), means(rows.take(3)), bits(rows.take(s.words)) {}
+};
+
+// Where the sums of the weights' gradients lie among a group's: of the heads that are trained, one after the other, w1 and
+// w2 in the tiles of `add_products`.
+struct SumPlaces {
+    size_t w1[kHeads], b1[kHeads], w2[kHeads], b2[kHeads], size = 0;
+    SumPlaces(const Sizes& s, const bool (&trained)[kHeads]) {
+        for (int h = 0; h < kHeads; ++h) {
+            w1[h] = size;
+            b1[h] = w1[h] + static_cast<size_t>(s.hidden_padded) * s.inputs_padded;
+            w2[h] = b1[h] + s.hidden_padded;
+            b2[h] = w2[h] + static_cast<size_t>(s.outputs_padded[h]) * s.hidden_padded;
+            if (trained[h]) size = b2[h] + s.outputs_padded[h];
+        }
+    }
+};
 
 // Everything that the backward pass knows before it starts.
 struct Backward {
@@ -387,22 +468,26 @@ struct Backward {
     bool trained[kHeads];
     bool to_inputs;    // the MLPs' inputs carry a gradient
     int input_first;   // its first row
-    size_t partial[kHeads + 1];  // where each head's sums start within a group's
+    GradientRows at;
+    ScratchRows scratch;
+    SumPlaces sums;
+    Packed first[kHeads], to_hidden[kHeads], to_input;
 
     Backward(
         const sgs_anchors& anchors, const sgs_selection& selected, const sgs_gaussians& gaussians,
         const sgs_gaussian_gradients& given, const sgs_anchor_gradients& wanted)
-        : a(anchors), selection(selected), drawn(gaussians), from(given), to(wanted), s(anchors) {
-        to_inputs = to.positions != nullptr || to.features != nullptr;
-        input_first = to.features != nullptr ? 0 : s.d;
-        partial[0] = 0;
-        for (int h = 0; h < kHeads; ++h) {
-            trained[h] = to.heads[h].w1 != nullptr;
-            const size_t size = static_cast<size_t>(s.hidden_padded) * (s.inputs_padded + 1) +
-                                static_cast<size_t>(s.outputs_padded[h]) * (s.hidden_padded + 1);
-            partial[h + 1] = partial[h] + (trained[h] ? size : 0);
-        }
-    }
+        : a(anchors), selection(selected), drawn(gaussians), from(given), to(wanted), s(anchors),
+          trained{to.heads[0].w1 != nullptr, to.heads[1].w1 != nullptr, to.heads[2].w1 != nullptr},
+          to_inputs(to.positions != nullptr || to.features != nullptr), input_first(to.features != nullptr ? 0 : s.d),
+          at(s), scratch(s), sums(s, trained),
+          first{first_layer(a.heads[0], s), first_layer(a.heads[1], s), first_layer(a.heads[2], s)},
+          to_hidden{
+              second_layer_backwards(a.heads[0], s, 0), second_layer_backwards(a.heads[1], s, 1),
+              second_layer_backwards(a.heads[2], s, 2)},
+          to_input(s.inputs - input_first, kHeads * s.hidden_padded, nullptr, [this](int o, int i) {
+              const int h = i / s.hidden_padded, unit = i % s.hidden_padded;
+              return unit < s.hidden ? a.heads[h].w1[unit * s.inputs + input_first + o] : 0.0f;
+          }) {}
     bool uses(int h) const { return trained[h] || to_inputs; }
 };
 
@@ -488,111 +573,103 @@ struct Backward {
     write_rows(to_positions, 3, block, b.to.positions);
 }
 
+// The rows of one block, and the gradients of its anchors.
+void block_backward(const Backward& b, int begin, int count, float* rows, float* scratch) {
+    const Sizes& s = b.s;
+    const Inputs x(row_of(rows, b.at.inputs), s);
+    float* input_gradient = row_of(scratch, b.scratch.input_gradient);
+    float* means = row_of(scratch, b.scratch.means);
+    int32_t* bits = bit_row_of(scratch, b.scratch.bits);
+    float* const outputs[kHeads] = {
+        row_of(rows, b.at.outputs[0]), row_of(rows, b.at.outputs[1]), row_of(rows, b.at.outputs[2])};
+    const Block block = active_block(b.a, b.selection, begin, count);
+    x.read(b.a, s, block);
+    gather(b, begin, block, outputs, means);
+    for (int h = 0; h < kHeads; ++h) {
+        if (!b.uses(h)) continue;
+        float* gradient = row_of(rows, b.at.hidden_gradients[h]);
+        b.to_hidden[h].apply(outputs[h], gradient);
+        for (int l = 0; l < kBlock; ++l) {
+            const int row = b.selection.active[begin + std::min(l, count - 1)];
+            const int32_t* kept = bits_of(b.selection, s, row, h);
+            for (int w = 0; w < s.words; ++w) bits[w * kBlock + l] = kept[w];
+        }
+        mask(gradient, s.hidden_padded, bits);
+        if (b.trained[h]) {
+            float* values = row_of(rows, b.at.hidden[h]);
+            b.first[h].apply(x.rows, values);
+            mask(values, s.hidden_padded, bits);
+        }
+    }
+    if (b.to_inputs) {
+        b.to_input.apply(row_of(rows, b.at.hidden_gradients[0]), input_gradient);
+        give(b, x, input_gradient, means, block);
+    }
+}
+
+// Adds what the blocks of a chunk say of the weights to a group's sums.
+void add_weights(const Backward& b, const float* rows, int blocks, float* sums) {
+    const Sizes& s = b.s;
+    const size_t stride = b.at.rows.size();
+    const float* inputs = row_of(rows, b.at.inputs);
+    for (int h = 0; h < kHeads; ++h) {
+        if (!b.trained[h]) continue;
+        const float* gradient = row_of(rows, b.at.hidden_gradients[h]);
+        const float* hidden = row_of(rows, b.at.hidden[h]);
+        const float* outputs = row_of(rows, b.at.outputs[h]);
+        add_products(gradient, s.hidden_padded, inputs, s.inputs_padded, stride, blocks, sums + b.sums.w1[h]);
+        add_sums(gradient, s.hidden_padded, stride, blocks, sums + b.sums.b1[h]);
+        add_products(outputs, s.outputs_padded[h], hidden, s.hidden_padded, stride, blocks, sums + b.sums.w2[h]);
+        add_sums(outputs, s.outputs_padded[h], stride, blocks, sums + b.sums.b2[h]);
+    }
+}
+
+// Sums over all groups, without their tiles and padding.
+void write_weights(const Backward& b, const float* sums) {
+    const Sizes& s = b.s;
+    for (int h = 0; h < kHeads; ++h) {
+        if (!b.trained[h]) continue;
+        const float *w1 = sums + b.sums.w1[h], *w2 = sums + b.sums.w2[h];
+        const sgs_head_gradient& out = b.to.heads[h];
+        for (int o = 0; o < s.hidden; ++o)
+            for (int i = 0; i < s.inputs; ++i) out.w1[o * s.inputs + i] = w1[in_tiles(o, i, s.inputs_padded)];
+        for (int o = 0; o < s.outputs[h]; ++o)
+            for (int i = 0; i < s.hidden; ++i) out.w2[o * s.hidden + i] = w2[in_tiles(o, i, s.hidden_padded)];
+        std::copy_n(sums + b.sums.b1[h], s.hidden, out.b1);
+        std::copy_n(sums + b.sums.b2[h], s.outputs[h], out.b2);
+    }
+}
+
 }  // namespace
 
 void anchors_backward(
     const sgs_anchors& a, const sgs_selection& selection, const sgs_gaussians& drawn,
     const sgs_gaussian_gradients& from, const sgs_anchor_gradients& to, int threads) {
     const Backward b(a, selection, drawn, from, to);
-    const Sizes& s = b.s;
-    const Packed first[kHeads] = {first_layer(a.heads[0], s), first_layer(a.heads[1], s), first_layer(a.heads[2], s)};
-    const Packed to_hidden[kHeads] = {
-        second_layer_backwards(a.heads[0], s, 0), second_layer_backwards(a.heads[1], s, 1),
-        second_layer_backwards(a.heads[2], s, 2)};
-    const Packed to_input(s.inputs - b.input_first, kHeads * s.hidden_padded, nullptr, [&](int o, int i) {
-        const int h = i / s.hidden_padded, unit = i % s.hidden_padded;
-        return unit < s.hidden ? a.heads[h].w1[unit * s.inputs + b.input_first + o] : 0.0f;
-    });
     const int total = static_cast<int>(selection.active_count), chunks = (total + kChunk - 1) / kChunk;
     const int groups = std::min(chunks, kGroups);
-    const size_t sums_size = b.partial[kHeads];
-    const Buffer memory_of_sums(std::max(1, groups) * sums_size);
+    const size_t size = b.sums.size;
+    const Buffer memory_of_sums(std::max(1, groups) * size);
     float* sums = memory_of_sums.get();
-    std::memset(sums, 0, sizeof(float) * std::max(1, groups) * sums_size);
-    // Rows of one block: inputs, distance, outputs of the heads, their hidden layers' gradients, hidden values.
-    const int outputs_rows = s.outputs_padded[0] + s.outputs_padded[1] + s.outputs_padded[2];
-    const int block_rows = s.inputs_padded + 1 + outputs_rows + 2 * kHeads * s.hidden_padded;
-    const size_t block_size = static_cast<size_t>(block_rows) * kBlock;
+    std::memset(sums, 0, sizeof(float) * std::max(1, groups) * size);
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1) if (threads > 1)
     for (int group = 0; group < groups; ++group) {
-        const Buffer memory(kChunkBlocks * block_size + (s.inputs_padded + 3 + s.words) * kBlock);
-        float* input_gradient = memory.get() + kChunkBlocks * block_size;
-        float* means = input_gradient + s.inputs_padded * kBlock;
-        int32_t* bits = reinterpret_cast<int32_t*>(means + 3 * kBlock);
+        const Buffer memory(kChunkBlocks * b.at.rows.size() + b.scratch.rows.size());
+        float* scratch = memory.get() + kChunkBlocks * b.at.rows.size();
         for (int chunk = static_cast<int>(static_cast<int64_t>(chunks) * group / groups);
              chunk < static_cast<int>(static_cast<int64_t>(chunks) * (group + 1) / groups); ++chunk) {
             const int end = std::min(total, (chunk + 1) * kChunk);
             const int blocks = (end - chunk * kChunk + kBlock - 1) / kBlock;
             for (int n = 0; n < blocks; ++n) {
-                const int begin = chunk * kChunk + n * kBlock, count = std::min(kBlock, end - begin);
-                float* rows = memory.get() + n * block_size;
-                const Inputs x{rows, rows + s.inputs_padded * kBlock};
-                float* outputs[kHeads];
-                float* next = x.distance + kBlock;
-                for (int h = 0; h < kHeads; ++h) outputs[h] = next, next += s.outputs_padded[h] * kBlock;
-                float* hidden_gradient = next;
-                float* hidden = next + kHeads * s.hidden_padded * kBlock;
-                const Block block = active_block(a, selection, begin, count);
-                x.read(a, s, block);
-                gather(b, begin, block, outputs, means);
-                for (int h = 0; h < kHeads; ++h) {
-                    if (!b.uses(h)) continue;
-                    float* gradient = hidden_gradient + h * s.hidden_padded * kBlock;
-                    to_hidden[h].apply(outputs[h], gradient);
-                    for (int l = 0; l < kBlock; ++l) {
-                        const int row = selection.active[begin + std::min(l, count - 1)];
-                        const int32_t* kept = bits_of(selection, s, row, h);
-                        for (int w = 0; w < s.words; ++w) bits[w * kBlock + l] = kept[w];
-                    }
-                    mask(gradient, s.hidden_padded, bits);
-                    if (b.trained[h]) {
-                        float* values = hidden + h * s.hidden_padded * kBlock;
-                        first[h].apply(x.rows, values);
-                        mask(values, s.hidden_padded, bits);
-                    }
-                }
-                if (b.to_inputs) {
-                    to_input.apply(hidden_gradient, input_gradient);
-                    give(b, x, input_gradient, means, block);
-                }
+                const int begin = chunk * kChunk + n * kBlock;
+                block_backward(b, begin, std::min(kBlock, end - begin), memory.get() + n * b.at.rows.size(), scratch);
             }
-            const float* rows = memory.get();
-            const float* outputs = rows + (s.inputs_padded + 1) * kBlock;
-            for (int h = 0; h < kHeads; ++h) {
-                const float* gradient = rows + (s.inputs_padded + 1 + outputs_rows + h * s.hidden_padded) * kBlock;
-                const float* hidden = gradient + kHeads * s.hidden_padded * kBlock;
-                if (b.trained[h]) {
-                    float* w1 = sums + group * sums_size + b.partial[h];
-                    float* b1 = w1 + s.hidden_padded * s.inputs_padded;
-                    float* w2 = b1 + s.hidden_padded;
-                    float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
-                    add_products(gradient, s.hidden_padded, rows, s.inputs_padded, block_size, blocks, w1);
-                    add_sums(gradient, s.hidden_padded, block_size, blocks, b1);
-                    add_products(outputs, s.outputs_padded[h], hidden, s.hidden_padded, block_size, blocks, w2);
-                    add_sums(outputs, s.outputs_padded[h], block_size, blocks, b2);
-                }
-                outputs += s.outputs_padded[h] * kBlock;
-            }
+            add_weights(b, memory.get(), blocks, sums + group * size);
         }
     }
     for (int group = 1; group < groups; ++group)
-        for (size_t i = 0; i < sums_size; ++i) sums[i] += sums[group * sums_size + i];
-    for (int h = 0; h < kHeads; ++h) {
-        if (!b.trained[h]) continue;
-        const float* w1 = sums + b.partial[h];
-        const float* b1 = w1 + s.hidden_padded * s.inputs_padded;
-        const float* w2 = b1 + s.hidden_padded;
-        const float* b2 = w2 + s.outputs_padded[h] * s.hidden_padded;
-        const sgs_head_gradient& out = to.heads[h];
-        for (int o = 0; o < s.hidden; ++o) {
-            for (int i = 0; i < s.inputs; ++i) out.w1[o * s.inputs + i] = w1[in_tiles(o, i, s.inputs_padded)];
-            out.b1[o] = b1[o];
-        }
-        for (int o = 0; o < s.outputs[h]; ++o) {
-            for (int i = 0; i < s.hidden; ++i) out.w2[o * s.hidden + i] = w2[in_tiles(o, i, s.hidden_padded)];
-            out.b2[o] = b2[o];
-        }
-    }
+        for (size_t i = 0; i < size; ++i) sums[i] += sums[group * size + i];
+    write_weights(b, sums);
 }
 
 }  // namespace SGS_ISA

@@ -153,27 +153,42 @@ void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float
     });
 }
 
+// The splat of pair `n`, of those before `end`. Neighbours in depth are far apart in memory: it asks for a later one.
+[[gnu::always_inline]] inline const Splat& splat_of(const Raster& raster, int n, int end) {
+    __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)]]);
+    return raster.splats[raster.pairs[n]];
+}
+
+// Visits the blocks of pixels of a tile that a splat covers, and lets it dim the light behind it: visit(place of the block
+// in the tile, transmittance before, coverage).
+template <typename Visit>
+[[gnu::always_inline]] inline void for_covered(
+    const Splat& s, const Tile& tile, const Lanes& lanes, Front& front, Visit visit) {
+    const Blocks blocks(s, tile.left, tile.top);
+    for (int by = blocks.y0; by < blocks.y1; ++by)
+        for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
+            const int block = by * kBlocksX + bx, at = block * kLanes;
+            if (front.done[block]) continue;
+            const vf before = load(front.T + at);
+            Coverage c;
+            if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
+            visit(at, before, c);
+            front.pass(block, before, c);
+        }
+}
+
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
     const Tile tile(raster, index);
     const Lanes lanes;
     alignas(kAlignment) float color[3][kTilePixels] = {};
     Front front;
-    for (int n = raster.starts[index]; n < raster.starts[index + 1] && front.live > 0; ++n) {
-        const Splat& s = raster.splats[raster.pairs[n]];
-        // Neighbours in depth are far apart in memory: ask early.
-        __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
-        const Blocks blocks(s, tile.left, tile.top);
-        for (int by = blocks.y0; by < blocks.y1; ++by)
-            for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
-                const int block = by * kBlocksX + bx, at = block * kLanes;
-                if (front.done[block]) continue;
-                const vf before = load(front.T + at);
-                Coverage c;
-                if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
-                const vf weight = c.alpha * before;
-                for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
-                front.pass(block, before, c);
-            }
+    const int end = raster.starts[index + 1];
+    for (int n = raster.starts[index]; n < end && front.live > 0; ++n) {
+        const Splat& s = splat_of(raster, n, end);
+        for_covered(s, tile, lanes, front, [&](int at, vf before, const Coverage& c) {
+            const vf weight = c.alpha * before;
+            for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
+        });
     }
     alignas(kAlignment) float coverage[1][kTilePixels];
     for (int i = 0; i < kTilePixels; i += kLanes) {
@@ -209,40 +224,30 @@ void blend_backward(
             rest[i] += (color[k][i] - behind) * gradient[k][i];
         }
     }
+    const int end = raster.starts[index + 1];
     int n = raster.starts[index];
-    for (; n < raster.starts[index + 1] && front.live > 0; ++n) {
-        const Splat& s = raster.splats[raster.pairs[n]];
-        // Neighbours in depth are far apart in memory: ask early.
-        __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
-        const Blocks blocks(s, tile.left, tile.top);
+    for (; n < end && front.live > 0; ++n) {
+        const Splat& s = splat_of(raster, n, end);
         const bool trained = raster.pairs[n] < raster.trained;
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
-        for (int by = blocks.y0; by < blocks.y1; ++by)
-            for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
-                const int block = by * kBlocksX + bx, at = block * kLanes;
-                if (front.done[block]) continue;
-                const vf before = load(front.T + at);
-                Coverage c;
-                if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
-                hit = true;
-                const vf weight = c.alpha * before;
-                const vf g0 = load(gradient[0] + at), g1 = load(gradient[1] + at), g2 = load(gradient[2] + at);
-                const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(grad_coverage[0] + at);
-                const vf to_come = load(rest + at) - weight * q;
-                store(rest + at, to_come);
-                if (trained) {
-                    const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
-                    const vf d = keep(without(c.used, c.clamped), slope * c.alpha);  // a clamped alpha does not react
-                    const vf dx = d * c.dx, dy = d * c.dy;
-                    m[0] += d, m[1] += dx, m[2] += dy;
-                    m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
-                    m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
-                }
-                front.pass(block, before, c);
-            }
+        for_covered(s, tile, lanes, front, [&](int at, vf before, const Coverage& c) {
+            hit = true;
+            const vf weight = c.alpha * before;
+            const vf g0 = load(gradient[0] + at), g1 = load(gradient[1] + at), g2 = load(gradient[2] + at);
+            const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(grad_coverage[0] + at);
+            const vf to_come = load(rest + at) - weight * q;
+            store(rest + at, to_come);
+            if (!trained) return;
+            const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
+            const vf d = keep(without(c.used, c.clamped), slope * c.alpha);  // a clamped alpha does not react
+            const vf dx = d * c.dx, dy = d * c.dy;
+            m[0] += d, m[1] += dx, m[2] += dy;
+            m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
+            m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
+        });
         if (!trained) continue;
         if (hit) {
             store_sums(m, out);
@@ -250,7 +255,7 @@ void blend_backward(
             std::memset(out, 0, sizeof(float) * kMomentCount);
         }
     }
-    for (; n < raster.starts[index + 1]; ++n)  // hidden
+    for (; n < end; ++n)  // hidden
         if (raster.pairs[n] < raster.trained)
             std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
 }
@@ -266,27 +271,18 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
 #pragma GCC unroll 8
         for (int k = 0; k < Maps; ++k) values[k][at] = maps[pixel * stride + k];
     });
-    for (int n = raster.starts[index]; n < raster.starts[index + 1]; ++n) {
+    const int end = raster.starts[index + 1];
+    for (int n = raster.starts[index]; n < end; ++n) {
         float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
         std::fill_n(out, Maps, 0.0f);
         if (front.live == 0) continue;
-        const Splat& s = raster.splats[raster.pairs[n]];
-        __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, raster.starts[index + 1] - 1)]]);
-        const Blocks blocks(s, tile.left, tile.top);
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
-        for (int by = blocks.y0; by < blocks.y1; ++by)
-            for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
-                const int block = by * kBlocksX + bx, at = block * kLanes;
-                if (front.done[block]) continue;
-                const vf before = load(front.T + at);
-                Coverage c;
-                if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
-                const vf weight = c.alpha * before;
+        for_covered(splat_of(raster, n, end), tile, lanes, front, [&](int at, vf before, const Coverage& c) {
+            const vf weight = c.alpha * before;
 #pragma GCC unroll 8
-                for (int k = 0; k < Maps; ++k) m[k] += weight * load(values[k] + at);
-                front.pass(block, before, c);
-            }
+            for (int k = 0; k < Maps; ++k) m[k] += weight * load(values[k] + at);
+        });
 #pragma GCC unroll 8
         for (int k = 0; k < Maps; ++k) {
             float parts[kLanes];
