@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Applying growth to everything that has a row for each anchor: parameters, Adam state and statistics."""
+"""Applying growth to everything that has a row for each anchor: parameters with their moments, and statistics."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from structgstream.scene.scene import Scene
 from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import ANCHOR_ROWS, ParameterName, Parameters
+from structgstream.training.parameters import ANCHOR_ROWS, ParameterName
 from structgstream.training.statistics import GradientStatistics
 
 
@@ -49,7 +49,7 @@ class Densifier:
         return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
 
     def apply(
-        self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator, *, iteration: int
+        self, scene: Scene, adam: Adam[ParameterName], generator: torch.Generator, *, iteration: int
     ) -> tuple[int, int]:
         """Grow, then prune, after ``iteration``; returns how many anchors were added and removed."""
         k = self.offsets_per_anchor
@@ -79,36 +79,27 @@ class Densifier:
             "anchor_features": new.features,
             "appearance": new.positions.new_zeros(len(new), 0),
         }
-        self._replace(parameters, adam, keep=keep, added=added, count=len(new))
-        parameters.values["base_scales"].detach().clamp_(max=0.05)
+        self._replace(adam, keep=keep, added=added)
+        adam.values["base_scales"].detach().clamp_(max=0.05)
         return len(new), int(remove.sum())
 
     def judges(self, iteration: int) -> bool:
         """Whether contributions decide after this iteration who stays."""
         return self.config.least_contribution > 0.0 and iteration in self.config.contribution_at
 
-    def judge(self, contributions: Tensor, parameters: Parameters, adam: Adam) -> int:
+    def judge(self, contributions: Tensor, adam: Adam[ParameterName]) -> int:
         """Remove the anchors whose ``contributions`` ``[M]`` (shares of the mean) are too small; tells how many."""
         keep = contributions >= self.config.least_contribution
         added: dict[ParameterName, Tensor] = {
-            name: values.detach()[:0] for name, values in parameters.values.items() if name in ANCHOR_ROWS
+            name: values.detach()[:0] for name, values in adam.values.items() if name in ANCHOR_ROWS
         }
-        self._replace(parameters, adam, keep=keep, added=added, count=0)
+        self._replace(adam, keep=keep, added=added)
         return int((~keep).sum())
 
-    def _replace(
-        self,
-        parameters: Parameters,
-        adam: Adam,
-        *,
-        keep: Tensor,
-        added: dict[ParameterName, Tensor],
-        count: int,
-    ) -> None:
-        """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor."""
-        k = self.offsets_per_anchor
-        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added)
-        adam.replace_rows(ANCHOR_ROWS, keep=keep, added=count)
+    def _replace(self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor]) -> None:
+        """Keep the rows of a mask ``[M]`` and append ``added`` in everything that has a row for each anchor."""
+        k, count = self.offsets_per_anchor, len(added["anchor_positions"])
+        adam.replace_rows(added, keep=keep)
         for statistics in (self.gradients, self.opacities):
             rows = keep.repeat_interleave(k) if statistics is self.gradients else keep
             more = count * k if statistics is self.gradients else count

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from structgstream.scene.color import CameraColor
@@ -116,18 +115,6 @@ class Parameters:
             name: value.detach().clone().contiguous().requires_grad_(name in trained) for name, value in values.items()
         }
         return cls(copies, free.births.clone(), scene.distance_input, dict(steps or {}))
-
-    @property
-    def trained(self) -> list[ParameterName]:
-        """Names that collect gradients, in a fixed order, without those that are empty."""
-        return [name for name, value in self.values.items() if value.requires_grad and value.numel()]
-
-    def replace_rows(self, names: Iterable[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor]) -> None:
-        """Keep the rows ``keep`` (mask) of each name and append ``added[name]``."""
-        for name in names:
-            old = self.values[name]
-            rows = torch.cat([old.detach()[keep], added[name]])
-            self.values[name] = rows.contiguous().requires_grad_(old.requires_grad)
 
     def scene(self, template: Scene) -> Scene:
         """The scene these parameters stand for; differentiable. ``template`` gives the MLPs' widths."""
