@@ -9,8 +9,8 @@ import pytest
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, log_path, read_log
+from structgstream.frame_report import FrameReport
 from structgstream.recorder import check_output, logged
-from structgstream.session import FrameReport
 
 
 def report(index: int) -> FrameReport:

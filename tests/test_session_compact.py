@@ -12,13 +12,14 @@ import torch
 
 from small_presets import TINY_RIG
 from streams import same
-from structgstream import session
+from structgstream import struct_gstream as method
 from structgstream.cameras import CameraRig
 from structgstream.codec.bins import FREE_STEPS
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.records import scanned
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
+from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import COMPACT, PRESETS, StreamConfig
@@ -26,7 +27,8 @@ from structgstream.rate_control import RateConfig
 from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
-from structgstream.session import FrameReport, Session
+from structgstream.session import Session
+from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.motion import MotionConfig
 from structgstream.training.rounding import RoundingConfig, pixel_size
@@ -78,13 +80,13 @@ class Capture:
 
 
 def run(sink, *, config: StreamConfig = CONFIG, resumed=None, frames: int = FRAMES) -> list[FrameReport]:
-    return list(Session(Capture(frames), sink, config, reference_backend(), resumed=resumed).run())
+    return list(Session(Capture(frames), sink, stream_pipeline(config), reference_backend(), resumed=resumed).run())
 
 
 @cache
 def whole() -> tuple[bytes, list[FrameReport], list[Scene], list[Scene]]:
     """The stream, the reports, where each later frame's fit started, and what it came to."""
-    started, fitted, fit = [], [], session.fit_next_frame
+    started, fitted, fit = [], [], method.fit_next_frame
 
     def following(scene, *arguments, **options):
         started.append(scene)
@@ -92,11 +94,11 @@ def whole() -> tuple[bytes, list[FrameReport], list[Scene], list[Scene]]:
         fitted.append(found.scene)
         return found
 
-    session.fit_next_frame = following  # type: ignore[assignment]
+    method.fit_next_frame = following  # type: ignore[assignment]
     try:
         reports = run(sink := MemorySink())
     finally:
-        session.fit_next_frame = fit
+        method.fit_next_frame = fit
     return sink.data, reports, started, fitted
 
 
@@ -205,7 +207,7 @@ def test_another_codec_does_not_continue_it(tmp_path: Path) -> None:
     path = tmp_path / "a.sgs"
     path.write_bytes(whole()[0])
     sink, resumed = FileSink.resume(path)
-    with pytest.raises(ConfigError, match="another configuration: codec differ"):
+    with pytest.raises(ConfigError, match="another method or codec, .compact. instead of .raw."):
         run(sink, resumed=resumed, config=replace(CONFIG, codec="raw"))
     sink.close()
 

@@ -11,9 +11,11 @@ from small_presets import TINY_RIG
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
+from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.session import FrameReport, Session
+from structgstream.session import Session
+from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.motion import MotionConfig
 from worlds import moving_world
 
@@ -57,7 +59,7 @@ class Capture:
 
 
 def run(capture: Capture, sink: FileSink, *, resumed: StreamReader | None = None) -> list[FrameReport]:
-    return list(Session(capture, sink, CONFIG, reference_backend(), resumed=resumed).run())
+    return list(Session(capture, sink, stream_pipeline(CONFIG), reference_backend(), resumed=resumed).run())
 
 
 def test_a_resumed_stream_is_the_uninterrupted_one_byte_for_byte(tmp_path: Path) -> None:

@@ -14,10 +14,12 @@ from structgstream.cameras import CameraRig
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.records import scanned
 from structgstream.codec.sinks import FileSink, MemorySink
+from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import COMPACT
-from structgstream.session import FrameReport, Session
+from structgstream.session import Session
+from structgstream.struct_gstream import stream_pipeline
 from worlds import moving_world
 
 FRAMES = 4
@@ -58,7 +60,7 @@ class Capture:
 
 
 def run(sink, *, resumed=None, pictures: list[MultiViewFrame] = WORLD.frames) -> list[FrameReport]:
-    return list(Session(Capture(pictures), sink, CONFIG, reference_backend(), resumed=resumed).run())
+    return list(Session(Capture(pictures), sink, stream_pipeline(CONFIG), reference_backend(), resumed=resumed).run())
 
 
 @cache

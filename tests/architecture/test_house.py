@@ -3,15 +3,18 @@
 
 import ast
 import importlib
+import inspect
 import pkgutil
 import re
 import statistics
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
 import structgstream
+from structgstream.session import Session
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "src" / "structgstream").rglob("*.py"))
@@ -35,6 +38,14 @@ def test_the_picture_of_layers_is_that_of_the_contract() -> None:
     assert drawn == stated
     modules = {module.name for module in pkgutil.iter_modules(structgstream.__path__)}
     assert set().union(*drawn) == modules - {"__main__"}
+
+
+def test_the_printed_loop_is_the_loop() -> None:
+    """Line by line, and short."""
+    printed = (ROOT / "ARCHITECTURE.md").read_text().split("```python\n")[1].split("```")[0]
+    body = inspect.getsource(Session._frames).split("\n", 1)[1]
+    assert textwrap.dedent(body) == printed
+    assert len(printed.splitlines()) <= 12
 
 
 def test_modules_stay_small() -> None:

@@ -19,8 +19,8 @@ from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.data.clip import bundled_clip_path
+from structgstream.frame_report import FrameReport
 from structgstream.kernels._load import native_reason
-from structgstream.session import FrameReport
 
 CLIP = str(bundled_clip_path())
 DEVICE = "cpu" if native_reason() is None else "reference"

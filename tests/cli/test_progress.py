@@ -10,7 +10,7 @@ from rich.console import Console
 from structgstream.cli import progress
 from structgstream.cli.progress import Bars, Lines, display, human_bytes
 from structgstream.codec.packets import PacketKind
-from structgstream.session import FrameReport
+from structgstream.frame_report import FrameReport
 from structgstream.training.result import Step
 
 REPORT = FrameReport(

@@ -9,8 +9,8 @@ import numpy as np
 
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.peers.method import PeerFit
 from structgstream.peers.methods import AnyMethod
+from structgstream.training.result import FitResult
 from worlds import moving_world
 
 
@@ -42,15 +42,15 @@ class Watched:
     """A method that remembers what it fitted."""
 
     method: AnyMethod
-    fits: list[PeerFit[Any]] = field(default_factory=list)
+    fits: list[FitResult[Any]] = field(default_factory=list)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.method, name)
 
-    def first(self, *args: Any, **kwargs: Any) -> PeerFit[Any]:
+    def first(self, *args: Any, **kwargs: Any) -> FitResult[Any]:
         self.fits.append(self.method.first(*args, **kwargs))
         return self.fits[-1]
 
-    def next(self, *args: Any, **kwargs: Any) -> PeerFit[Any]:
+    def next(self, *args: Any, **kwargs: Any) -> FitResult[Any]:
         self.fits.append(self.method.next(*args, **kwargs))
         return self.fits[-1]

@@ -9,6 +9,7 @@ decodes the bytes it has just made and returns that. Without it trainer and view
 
 import math
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from structgstream.codec.blocks import coded_block, packed_block
 from structgstream.codec.compact import CompactEncoder
@@ -16,15 +17,17 @@ from structgstream.codec.decoder import FRAME, SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import STATE_TABLE, FieldName, state_of
+from structgstream.scene.state import STATE_TABLE, state_of
+
+SceneT = TypeVar("SceneT", covariant=True)
 
 
 @dataclass(frozen=True)
-class Encoded:
+class Encoded(Generic[SceneT]):
     """A packet and the scene a decoder makes of it."""
 
     packet: Packet
-    reconstruction: Scene
+    reconstruction: SceneT
 
 
 class SceneEncoder:
@@ -48,7 +51,7 @@ class SceneEncoder:
         self._last_pts_seconds = packet.pts_seconds
         return scene
 
-    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded:
+    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[Scene]:
         """The packet of one frame.
 
         Raises:
@@ -61,7 +64,7 @@ class SceneEncoder:
                 f"({self._last_pts_seconds} s); the capture's time stamps must rise."
             )
         state = state_of(scene)
-        lengths: dict[FieldName, int] = {}
+        lengths: dict[str, int] = {}
         parts = [FRAME.pack(index, pts_seconds)]
         coded = None if self._compact is None else self._compact.encode(state, kind=kind, index=index)
         for row in STATE_TABLE:

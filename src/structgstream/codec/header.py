@@ -103,7 +103,7 @@ def unpacked_header(payload: bytes) -> StreamHeader:
     return header
 
 
-def field_bytes_of(payload: bytes) -> dict[FieldName, int]:
+def field_bytes_of(payload: bytes) -> dict[str, int]:
     """What each field takes in an init record's payload, which must be one that :func:`unpacked_header` reads."""
     (length,) = LENGTH.unpack_from(payload)
     blocks = blocks_in(payload, LENGTH.size + length, where="The init record")

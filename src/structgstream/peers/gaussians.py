@@ -18,7 +18,7 @@ from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, Rate, constant, leaves
 from structgstream.training.optimize import Hooks, Schedule, optimize
-from structgstream.training.result import StepListener
+from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import neighbour_distances, voxel_centers
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import ViewLoss, picture_loss
@@ -71,15 +71,11 @@ class GaussiansConfig:
 
 
 @dataclass(frozen=True)
-class GaussiansFit:
-    """A fitted frame: see ``peers.method.PeerFit``."""
+class RecordedGaussians:
+    """Gaussians, and how the training cameras record them."""
 
     gaussians: PlainGaussians
     camera_color: CameraColor
-    train_psnr: float
-    seconds: dict[str, float]
-    spawned: int
-    pruned: int
 
 
 def point_colors(points: Tensor, views: list[View]) -> Tensor:
@@ -153,7 +149,7 @@ def fit_gaussians(
     backend: Backend,
     seed: int,
     on_step: StepListener | None = None,
-) -> GaussiansFit:
+) -> FitResult[RecordedGaussians]:
     """Reconstruct one frame from its training views.
 
     Args:
@@ -184,11 +180,16 @@ def fit_gaussians(
     statistics, last_pass = GradientStatistics(len(start), backend.device), LastPass(config.iterations - len(views))
     hooks = _FromScratch(config, adam, identity, statistics, extent, generator, watch, last_pass)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
-    optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
+    iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     gaussians, color = hooks.parts()
-    color = CameraColor(color.gains.detach(), color.biases.detach())
-    return GaussiansFit(
-        gaussians.detached(), color, last_pass.psnr, watch.seconds, spawned=hooks.spawned, pruned=hooks.pruned
+    return FitResult(
+        scene=RecordedGaussians(gaussians.detached(), CameraColor(color.gains.detach(), color.biases.detach())),
+        iterations=iterations,
+        train_psnr=last_pass.psnr,
+        spawned=hooks.spawned,
+        pruned=hooks.pruned,
+        seconds=watch.seconds,
+        losses=last_pass.terms,
     )
 
 

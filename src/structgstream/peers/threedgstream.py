@@ -9,7 +9,7 @@
     base(t+1) starts here <-----------------------------------------'      dropped with the frame
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,28 +17,28 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera
 from structgstream.errors import StreamError
-from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.peers.additions import AdditionsConfig, fit_additions, spawned_at
 from structgstream.peers.gaussians import LOSSES, GaussiansConfig, fit_gaussians
 from structgstream.peers.hash_grid import Cache, GridConfig, GridQuery, transformation
-from structgstream.peers.method import Arrays, PeerFit, PointsMaker, stored
+from structgstream.peers.method import Arrays, LooksAtPicturesOnly, stored
 from structgstream.peers.plain import PlainGaussians, moved
 from structgstream.peers.plain_arrays import color_of, gaussians_of, tensor_of, with_prefix
 from structgstream.peers.warm_up import WarmUpConfig, warmed_up
+from structgstream.pipeline import FrameTask, Past
 from structgstream.scene.color import CameraColor
 from structgstream.training.initial import rig_extent
 from structgstream.training.last_pass import LastPass
 from structgstream.training.optim import Adam, leaves
 from structgstream.training.optimize import Hooks, Schedule, optimize
-from structgstream.training.result import StepListener
+from structgstream.training.result import FitResult
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import View, shuffled_views, training_views
+from structgstream.training.views import View, shuffled_views
 
 
 @dataclass(frozen=True)
@@ -156,66 +156,51 @@ class _Transformed(Hooks[View, ViewLoss]):
 
 
 @dataclass(frozen=True)
-class ThreeDGStream:
+class ThreeDGStream(LooksAtPicturesOnly):
     """The method behind the loop; its memory is the warmed-up cache."""
 
     config: ThreeDGStreamConfig = field(default_factory=ThreeDGStreamConfig)
     name: str = "3dgstream"
     stands_alone: bool = False
 
-    def first(
-        self,
-        frame: MultiViewFrame,
-        rig: CameraRig,
-        points: PointsMaker,
-        *,
-        backend: Backend,
-        seed: int,
-        on_step: StepListener | None = None,
-    ) -> PeerFit[StreamedGaussians]:
+    def first(self, task: FrameTask) -> FitResult[StreamedGaussians]:
         """Frame 0: plain Gaussians from scratch."""
         fit = fit_gaussians(
-            frame, rig, points(), config=self.config.initial, backend=backend, seed=seed, on_step=on_step
+            task.frame,
+            task.rig,
+            task.points(),
+            config=self.config.initial,
+            backend=task.backend,
+            seed=task.seed,
+            on_step=task.on_step,
         )
-        base = fit.gaussians
+        base, color = fit.scene.gaussians, fit.scene.camera_color
         none = PlainGaussians.empty(base.degree, base.means)
-        state = StreamedGaussians(base, none, fit.camera_color, box_of(base.means, self.config.box_share), None)
-        return PeerFit(state, fit.train_psnr, fit.seconds, fit.spawned, fit.pruned)
+        return fit.with_scene(StreamedGaussians(base, none, color, box_of(base.means, self.config.box_share), None))
 
-    def prepared(self, state: StreamedGaussians, *, backend: Backend, seed: int) -> Cache:
+    def prepare(self, state: StreamedGaussians, task: Callable[[], FrameTask]) -> Cache:
         """The cache that every frame starts from."""
+        first, config = task(), self.config
         _, positions = in_box(state.base.means, state.box)
-        config = self.config
-        return warmed_up(positions, config=config.warm_up, grid=config.grid, backend=backend, seed=seed)[0]
+        return warmed_up(positions, config=config.warm_up, grid=config.grid, backend=first.backend, seed=first.seed)[0]
 
-    def next(
-        self,
-        state: StreamedGaussians,
-        memory: Cache,
-        frame: MultiViewFrame,
-        rig: CameraRig,
-        points: PointsMaker,
-        *,
-        backend: Backend,
-        seed: int,
-        on_step: StepListener | None = None,
-    ) -> PeerFit[StreamedGaussians]:
-        """Both stages of a later frame; ``points`` are not asked for."""
-        config, base = self.config, state.base
-        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
-        views = training_views(frame, rig, backend.device)
+    def next(self, past: Past[StreamedGaussians, Cache], task: FrameTask) -> FitResult[StreamedGaussians]:
+        """Both stages of a later frame."""
+        config, state, base, backend = self.config, past.state, past.state.base, task.backend
+        generator, watch = torch.Generator().manual_seed(task.seed), Stopwatch(backend.device)
+        views = task.pictures.views
         order = shuffled_views(views, generator)
         with watch.stage("look up"):
             rows, positions = in_box(base.means, state.box)
             query = GridQuery.of(positions, config.grid)
-        adam = Adam(backend, leaves(memory.tensors()), config.eps)
+        adam = Adam(backend, leaves(past.memory.tensors()), config.eps)
         last_pass = LastPass(config.iterations - len(views))
         hooks = _Transformed(
             config, adam, state, rows, query, GradientStatistics(len(base), backend.device), watch, last_pass
         )
         rates = dict.fromkeys(adam.values, config.rate)
         schedule = Schedule(config.iterations, lambda _: rates, after=config.additions.iterations)
-        optimize(adam, order, schedule, hooks, watch=watch, on_step=on_step)
+        optimize(adam, order, schedule, hooks, watch=watch, on_step=task.on_step)
         fitted = replace(state, cache=Cache.of(adam.values).as_stored())
         decoded = self._moved(fitted, rows, query)
         parents = decoded.select(hooks.parents())
@@ -225,15 +210,16 @@ class ThreeDGStream:
             state.camera_color,
             order,
             config=config.additions,
-            extent=rig_extent(rig),
+            extent=rig_extent(task.rig),
             views=len(views),
             backend=backend,
             watch=watch,
             before=config.iterations,
-            on_step=on_step,
+            on_step=task.on_step,
         )
-        return PeerFit(
-            state=replace(fitted, base=decoded, added=result.added),
+        return FitResult(
+            scene=replace(fitted, base=decoded, added=result.added),
+            iterations=config.iterations + config.additions.iterations,
             train_psnr=last_pass.psnr if result.train_psnr is None else result.train_psnr,
             seconds=watch.seconds,
             spawned=len(parents),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 SceneT = TypeVar("SceneT", covariant=True)
+OtherT = TypeVar("OtherT")
 
 
 @dataclass(frozen=True)
@@ -53,3 +54,7 @@ class FitResult(Generic[SceneT]):
     counts: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     losses: Mapping[str, float] = field(default_factory=dict)
+
+    def with_scene(self, scene: OtherT) -> "FitResult[OtherT]":
+        """The same fit, seen as of ``scene``."""
+        return FitResult(**{**vars(self), "scene": scene})
