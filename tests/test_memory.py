@@ -23,6 +23,7 @@ from structgstream.data.prefetch import Prefetch
 from structgstream.frames import MultiViewFrame
 from structgstream.memory import PeakKind, PeakMeter, resident_bytes
 from structgstream.session import Session
+from structgstream.struct_gstream import stream_pipeline
 from worlds import World, moving_world
 
 FRAMES = 1_000
@@ -170,7 +171,7 @@ def test_a_long_run_and_reading_it_back_hold_no_more_at_the_end_than_at_the_begi
     path = tmp_path / "long.sgs"
     measured: dict[int, tuple[int, int]] = {}
     frees = []
-    for report in Session(Prefetch(source), FileSink(path), config, backend).run():
+    for report in Session(Prefetch(source), FileSink(path), stream_pipeline(config), backend).run():
         if report.index in (SETTLED, last):
             measured[report.index] = held()
             frees.append(report.free)

@@ -9,6 +9,7 @@ decodes the bytes it has just made and returns that. Without it trainer and view
 
 import math
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from structgstream.codec.container.blocks import coded_block, packed_block
 from structgstream.codec.container.payload import packet_with
@@ -19,13 +20,15 @@ from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
+SceneT = TypeVar("SceneT", covariant=True)
+
 
 @dataclass(frozen=True)
-class Encoded:
+class Encoded(Generic[SceneT]):
     """A packet and the scene a decoder makes of it."""
 
     packet: Packet
-    reconstruction: Scene
+    reconstruction: SceneT
 
 
 class SceneEncoder:
@@ -49,7 +52,7 @@ class SceneEncoder:
         self._last_pts_seconds = packet.pts_seconds
         return scene
 
-    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded:
+    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[Scene]:
         """The packet of one frame.
 
         Raises:

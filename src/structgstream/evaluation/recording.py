@@ -2,7 +2,7 @@
 """What can be scored: any file that gives something to draw for each frame, of this project or another."""
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol, cast, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -45,13 +45,6 @@ class Recording(Protocol):
     def complete(self) -> bool: ...
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Drawable]]: ...
-
-
-def counts(drawable: Drawable) -> dict[str, int]:
-    """``anchors`` and ``free`` Gaussians; all Gaussians of what has no anchors are free."""
-    if isinstance(drawable, Scene):
-        return {"anchors": len(drawable.anchors), "free": len(drawable.free)}
-    return {"anchors": 0, "free": len(cast(Sequence, drawable))}
 
 
 def placed(drawable: Drawable, device: torch.device) -> Drawable:
