@@ -12,7 +12,7 @@ from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.container.blocks import packed_block, unpacked_blocks
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import binned, valued
+from structgstream.codec.scene.bins import dequantize_state, quantize_state
 from structgstream.codec.scene.compact import CompactDecoder, CompactEncoder, CompactState
 from structgstream.scene.order import space_order
 from structgstream.scene.state import FieldName
@@ -106,7 +106,7 @@ def _moved(state: State, active: Tensor, frame: int, g: torch.Generator) -> Stat
 
 def _rounded(state: State, names: frozenset[FieldName]) -> State:
     """The fields ``names`` as a decoder has them."""
-    return valued(binned(state, names, STEPS), names, STEPS)
+    return dequantize_state(quantize_state(state, names, STEPS), names, STEPS)
 
 
 def _told(state: State) -> Results:

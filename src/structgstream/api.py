@@ -16,7 +16,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError
 from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
-from structgstream.evaluation.instruments import Selection
+from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, PageFormat
@@ -119,7 +119,7 @@ def evaluate(
     capture: FrameSource | Path | str,
     *,
     cameras: tuple[str, ...] | None = None,
-    metrics: Selection = "all",
+    metrics: MetricSelection = "all",
     lpips_weights: Path | None = None,
     backend: Backend | BackendName = "auto",
 ) -> Report:

@@ -11,7 +11,6 @@ from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
 from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig
-from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
@@ -19,8 +18,9 @@ from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
 from structgstream.training.motion_start import MotionStartConfig
 from structgstream.training.online import OnlineConfig
-from structgstream.training.optim import Rate
+from structgstream.training.optim import LearningRate
 from structgstream.training.patching import PatchingConfig
+from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.rounding import RoundingConfig
 from structgstream.training.solidity import SolidityConfig
 
@@ -112,7 +112,9 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
 
 def decayed(rates: InitialRates, share: float) -> InitialRates:
     """The same first rates, every one of them falling to ``share`` of itself over the schedule."""
-    return InitialRates(**{name: Rate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()})
+    return InitialRates(
+        **{name: LearningRate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
+    )
 
 
 PAPER = StreamConfig()
@@ -216,7 +218,7 @@ COMPACT = replace(
             least_growth=0.25,
             room_until=2400,
         ),
-        disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5),
+        disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
         solidity=SolidityConfig(weight=0.05, every=4),
         random_background=True,
     ),
@@ -285,6 +287,6 @@ PRESETS: dict[str, StreamConfig] = {
     "tiny": TINY,
 }
 DEFAULT_PRESET = "compact"
-PAPER_MODE = "rig"
+PAPER_METHOD_PRESET = "rig"
 """What the paper's ablations are edits of, and what others are compared with."""
 DEMO_PRESET = "fast"

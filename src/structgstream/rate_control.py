@@ -145,7 +145,7 @@ class RateController:
         )
 
 
-def pressed(config: OnlineConfig, pressure: float) -> OnlineConfig:
+def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
     """``config`` under a pressure: a bit costs so many times as much, a birth asks for the root of it more gradient."""
     if pressure == 1.0:
         return config

@@ -12,7 +12,7 @@ import torch
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.scene.bins import on_bins
+from structgstream.codec.scene.bins import round_to_bins
 from structgstream.codec.sinks import FileSink
 from structgstream.pipeline import FrameTask, StreamFacts
 from structgstream.presets import StreamConfig
@@ -20,7 +20,7 @@ from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
-from structgstream.training.first_bins import first_bins, float32, regauged, sensitivity_of
+from structgstream.training.first_quantization import estimate_sensitivity, float32, quantize_first_frame, regauge
 from structgstream.training.rounding import pixel_size
 
 
@@ -66,7 +66,7 @@ class SceneCodec(ABC):
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
         """Frame 0 as the frames after it start from it, and the header of the stream."""
-        scene, grid = self._begun(fitted, task)
+        scene, grid = self._initialize_stream(fitted, task)
         state, dynamic = state_of(scene), self.config.online.dynamic
         reference = dynamic.difference(fields_of("free")) if grid.steps else ()
         header = StreamHeader(
@@ -86,7 +86,7 @@ class SceneCodec(ABC):
         return scene, header
 
     @abstractmethod
-    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
         """Frame 0 with the numbers that a receiver will have."""
 
     def _with_dynamic_fields(self, scene: Scene) -> Scene:
@@ -101,7 +101,7 @@ class SceneCodec(ABC):
 class RawCodec(SceneCodec):
     """Every number as float32."""
 
-    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
         return self._with_dynamic_fields(scene), Grid()
 
 
@@ -109,18 +109,20 @@ class RawCodec(SceneCodec):
 class CompactCodec(SceneCodec):
     """Every number is a bin (``training/rounding.py``, Note [Bins]): frame 0 is rounded, and in space order."""
 
-    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
-        scene, worth = regauged(scene, sensitivity_of(scene, task.rig, backend=task.backend, seed=task.seed))
+        scene, sensitivity = regauge(scene, estimate_sensitivity(scene, task.rig, backend=task.backend, seed=task.seed))
         scene = self._with_dynamic_fields(scene)
         known = rounding.steps(pixel_size(scene.anchors.positions, task.rig))
         used = {parameter.name for parameter in parameters_of(dynamic)}
         steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
         voxel_size = self.config.initial.voxel_size
-        scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
+        scene, init_steps = quantize_first_frame(
+            scene, sensitivity, config=rounding, voxel_size=voxel_size, steps=steps
+        )
         if scene.environment is not None:
             init_steps["environment"] = float32(self.config.environment.step)
-        rounded = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
+        rounded = round_to_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
         return scene_of(rounded, distance_input=scene.distance_input), Grid(steps, init_steps)
 
 

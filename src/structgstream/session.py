@@ -22,7 +22,7 @@ from structgstream.lookahead import Lookahead
 from structgstream.pipeline import Coder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
 from structgstream.rate_control import RateController
 from structgstream.resuming import check_resumable
-from structgstream.similarity import normalising_similarity
+from structgstream.similarity import normalizing_similarity
 from structgstream.training.pictures import FramePictures
 from structgstream.training.result import StepListener
 
@@ -61,7 +61,7 @@ class Session(Generic[State, Memory]):
         self._backend = backend
         self._resumed = resumed if resumed is not None and len(resumed) else None
         self._on_step = on_step
-        self._similarity = normalising_similarity(source.rig, radius=pipeline.normalised_radius)
+        self._similarity = normalizing_similarity(source.rig, radius=pipeline.normalised_radius)
         self._rig = self._similarity.rig(source.rig)
         self._facts = StreamFacts(
             codec=pipeline.codec.name,

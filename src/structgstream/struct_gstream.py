@@ -10,7 +10,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past, Pipeline
 from structgstream.presets import StreamConfig, to_json
-from structgstream.rate_control import pressed
+from structgstream.rate_control import with_rate_control
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.scene_codecs import scene_codec
@@ -89,7 +89,7 @@ class StructGStream:
             on_device(past.state, device),
             task.frame,
             task.rig,
-            config=pressed(self.config.online, task.pressure),
+            config=with_rate_control(self.config.online, task.pressure),
             backend=task.backend,
             seed=task.seed,
             pictures=task.pictures,

@@ -23,7 +23,7 @@ def test_culling_never_changes_a_pixel() -> None:
             anchors, scene.mlps, camera.center.float(), torch.arange(300), distance_input=True
         )
         culled = draw(scene.gaussians(camera, backend), camera, backend)
-        full = draw(scene.dressed(everything), camera, backend)
+        full = draw(scene.with_free_gaussians(everything), camera, backend)
         assert torch.allclose(culled.image, full.image, atol=1e-6)
 
 
@@ -36,7 +36,7 @@ def test_culling_for_tiles_never_changes_a_pixel_in_them() -> None:
         culled = scene.structured(camera, backend, tiles=tiles)
         assert len(culled.anchors) < len(scene.structured(camera, backend).anchors)
         inside = tiles.pixels()
-        part = draw(scene.dressed(culled), camera, backend).image[inside]
+        part = draw(scene.with_free_gaussians(culled), camera, backend).image[inside]
         assert torch.allclose(part, draw(scene.gaussians(camera, backend), camera, backend).image[inside], atol=1e-6)
 
 

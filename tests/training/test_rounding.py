@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.scene.bins import LARGEST, binned, valued
+from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, ParameterName, parameters_of, state_of
@@ -44,7 +44,7 @@ def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
         name: value.detach() for name, value in state_of(parameters.scene(scene)).items()
     }
     of_codec: dict[str, float] = {**steps}
-    sent = valued(binned(drawn, CODABLE, of_codec), CODABLE, of_codec)
+    sent = dequantize_state(quantize_state(drawn, CODABLE, of_codec), CODABLE, of_codec)
     for name, value in sent.items():
         assert torch.equal(value, drawn[name]), name
 

@@ -14,7 +14,7 @@ from structgstream.cli.tables import quality, report_tables
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
-    from structgstream.evaluation.instruments import Selection
+    from structgstream.evaluation.optional_metrics import MetricSelection
     from structgstream.evaluation.report import Report
     from structgstream.kernels.backend import Backend
 
@@ -86,7 +86,7 @@ def scored(
     backend: "Backend",
     cameras: tuple[str, ...] | None,
     folder: Path | None,
-    metrics: "Selection" = "all",
+    metrics: "MetricSelection" = "all",
     lpips_weights: Path | None = None,
 ) -> "Report":
     """Evaluates with a word about the progress, and writes the report into ``folder`` (None: nowhere)."""

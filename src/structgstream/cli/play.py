@@ -76,10 +76,10 @@ def main(arguments: list[str]) -> None:
 
 
 def _wait_for(stream: "StreamFile") -> None:
-    if not stream.has_begun():
+    if not stream.has_header():
         text = f"Waiting for {stream.path}, which comes when frame 0 is done (Ctrl-C ends)."
         Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
-    while not stream.has_begun():
+    while not stream.has_header():
         time.sleep(LOOK_AGAIN_SECONDS)
 
 

@@ -76,7 +76,7 @@ def baked(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: 
             slots = generated.anchors[:, None] * anchors.offsets_per_anchor
             slots = (slots + torch.arange(anchors.offsets_per_anchor, device=slots.device)).flatten()
             free = torch.arange(sums.seen.shape[0] - len(scene.free), sums.seen.shape[0], device=slots.device)
-            sums.add(scene.dressed(generated), camera, backend, seen=torch.cat([slots, free]))
+            sums.add(scene.with_free_gaussians(generated), camera, backend, seen=torch.cat([slots, free]))
         return sums.result()
 
 

@@ -36,11 +36,11 @@ class StreamFile:
             return len(data), footer_offset(data) is not None
 
     def check(self) -> None:
-        """Refuse what a player cannot show anything of, as :func:`check_begun`."""
+        """Refuse what a player cannot show anything of, as :func:`check_has_header`."""
         with self.opened() as data:
-            check_begun(data, str(self.path))
+            check_has_header(data, str(self.path))
 
-    def has_begun(self) -> bool:
+    def has_header(self) -> bool:
         """Whether the file is there and holds a whole header.
 
         Raises:
@@ -55,7 +55,7 @@ class StreamFile:
             return head_at(data, PREFIX.size) is not None
 
 
-def check_begun(data: Stored, name: str) -> None:
+def check_has_header(data: Stored, name: str) -> None:
     """Refuse what a player cannot show anything of.
 
     Raises:

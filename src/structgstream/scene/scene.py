@@ -48,7 +48,7 @@ class Scene:
             return anchors.features
         return anchors.features + anchors.appearance @ self.appearance_basis
 
-    def baked(self) -> "Scene":
+    def with_folded_appearance(self) -> "Scene":
         """The same looks, with the appearance in the features: for many looks at a scene that stays as it is."""
         if self.appearance_basis is None:
             return self
@@ -92,9 +92,9 @@ class Scene:
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
         """Everything that can be drawn for ``camera``: structured Gaussians, then free ones."""
-        return self.dressed(self.structured(camera, backend))
+        return self.with_free_gaussians(self.structured(camera, backend))
 
-    def dressed(self, generated: StructuredGaussians) -> Gaussians:
+    def with_free_gaussians(self, generated: StructuredGaussians) -> Gaussians:
         """``generated`` and the free Gaussians as one drawable set."""
         structured = generated.gaussians
         return concatenate(structured, self.free_gaussians()) if len(self.free) else structured

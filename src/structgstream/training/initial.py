@@ -13,13 +13,13 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
-from structgstream.training.disturbance import DisturbanceConfig, disturbance_at, disturbed_center
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
-from structgstream.training.optim import Adam, Rate, constant
+from structgstream.training.optim import Adam, LearningRate, constant
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
+from structgstream.training.perturbation import PerturbationConfig, perturbation_at, perturbed_center
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import seeded_scene
 from structgstream.training.solidity import SolidityConfig, depth_spread
@@ -34,17 +34,17 @@ _JUDGED_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of the
 class InitialRates:
     """Learning rates of frame 0 (Scaffold-GS), scheduled over ``schedule_iterations``."""
 
-    positions: Rate = constant(0.0)
+    positions: LearningRate = constant(0.0)
     """Anchors do not move in frame 0."""
-    offsets: Rate = Rate(0.01, 1e-4)
+    offsets: LearningRate = LearningRate(0.01, 1e-4)
     """Times 1.1 rig radii, as the reference code scales it with the extent of the cameras."""
-    features: Rate = constant(0.0075)
-    scales: Rate = constant(0.007)
+    features: LearningRate = constant(0.0075)
+    scales: LearningRate = constant(0.007)
     """Both scales of an anchor."""
-    opacity_mlp: Rate = Rate(0.002, 2e-5)
-    covariance_mlp: Rate = constant(0.004)
-    color_mlp: Rate = Rate(0.008, 5e-5)
-    camera_color: Rate = Rate(0.002, 1e-4)
+    opacity_mlp: LearningRate = LearningRate(0.002, 2e-5)
+    covariance_mlp: LearningRate = constant(0.004)
+    color_mlp: LearningRate = LearningRate(0.008, 5e-5)
+    camera_color: LearningRate = LearningRate(0.002, 1e-4)
     """Gains and biases; unused when ``camera_color`` is off."""
 
 
@@ -78,7 +78,7 @@ class InitialConfig:
     all_drawn: bool = False
     """Whether all of an anchor's Gaussians begin opaque enough to be drawn (``training/seeding.py``, Note [Dead
     outputs]; Scaffold-GS: no, half of them by chance)."""
-    disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
     solidity: SolidityConfig = field(default_factory=SolidityConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
@@ -135,9 +135,9 @@ class _FirstFrame(Hooks[View, SceneLoss]):
             voxel_size=config.voxel_size,
             track_screen=self.densifier.collects(iteration),
             watch=self.watch,
-            disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
+            perturbation=perturbation_at(iteration, config.iterations, config.disturbance, generator),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
-            seen_from=disturbed_center(
+            seen_from=perturbed_center(
                 sample.camera.viewport(scene.anchors.positions).center,
                 self.extent / 1.1,
                 iteration,
@@ -148,7 +148,9 @@ class _FirstFrame(Hooks[View, SceneLoss]):
         )
         if weight := config.solidity.weight_at(iteration, config.iterations):
             with self.watch.stage("rasterise"):
-                spread = depth_spread(loss.calm, sample.camera, scale=config.solidity.scale, backend=self.backend)
+                spread = depth_spread(
+                    loss.unperturbed, sample.camera, scale=config.solidity.scale, backend=self.backend
+                )
                 loss = with_term(loss, "depth_spread", spread, weight=weight)
         self.last_pass.add(iteration, loss, sample)
         return loss

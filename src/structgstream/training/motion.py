@@ -164,9 +164,9 @@ def moving_parts(
         ease[changed_since(older, scene)] = config.moved_ease
     looks: list[_Look] = []
     with torch.no_grad():
-        baked = scene.baked()
+        folded = scene.with_folded_appearance()
         for view, change in zip(views, changes, strict=True):
-            looks.append(_look(baked, view, change, config=config, backend=backend, ease=ease, floor=floor))
+            looks.append(_look(folded, view, change, config=config, backend=backend, ease=ease, floor=floor))
     view_changes = [look.change for look in looks]
     trusted = [number for number, good in enumerate(believed(view_changes)) if good]
     seen, votes = (torch.stack([getattr(looks[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))

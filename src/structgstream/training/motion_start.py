@@ -128,12 +128,12 @@ def corrected(
         backend: what computes.
     """
     seen = [view for view in views if view.index in focuses]
-    baked = moving.baked()
+    folded = moving.with_folded_appearance()
     sums, cover = [], moving.anchors.positions.new_zeros(())
     with torch.no_grad():
         for view in seen:
             focus, small = focuses[view.index], view.reduced(scale)
-            gaussians = baked.gaussians(view.camera, backend)
+            gaussians = folded.gaussians(view.camera, backend)
             image = as_recorded(focus.picture, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
             inside = focus.tiles.pixels()
@@ -141,9 +141,9 @@ def corrected(
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)
             maps = [flow_map(picture, view.image, inside, size), torch.ones(*size, 1).to(image), small.colors]
-            found = gathered(gaussians, baked, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
+            found = gathered(gaussians, folded, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
             found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
-            sums.append(by_mover(found, baked))
+            sums.append(by_mover(found, folded))
             cover = cover + found[:, 3]
     nothing = torch.zeros(len(moving.anchors) + len(moving.free), 3).to(moving.anchors.positions)
     if not seen:

@@ -11,14 +11,14 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
+from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
 from structgstream.training.optimize import Hooks
 from structgstream.training.parameters import Parameters
 from structgstream.training.partition import Partition
 from structgstream.training.population import Population
-from structgstream.training.price import Rate
-from structgstream.training.settling import Settling
+from structgstream.training.price import BitPrice
 from structgstream.training.step import SceneLoss, view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View
@@ -31,7 +31,7 @@ class Start:
     Args:
         scene: the whole scene, or the moving part of ``partition``.
         views: the pictures.
-        ahead: ``[M + F, 3]`` how far from their places its movers (Note [Movers]) start.
+        displacements: ``[M + F, 3]`` how far from their places its movers (Note [Movers]) start.
         partition: what the scene is a part of.
         places: the views, by index, that it shows in, and where; None for all of all.
         born: what joins it.
@@ -39,7 +39,7 @@ class Start:
 
     scene: Scene
     views: list[View]
-    ahead: Tensor
+    displacements: Tensor
     partition: Partition | None = None
     places: Mapping[int, Focus] | None = None
     born: FreeGaussians | None = None
@@ -58,9 +58,9 @@ class NextFrame(Hooks[View, SceneLoss]):
         start: the scene and the pictures.
         parameters: what stands for the scene.
         losses: weights of the terms.
-        rate: the price of leaving the last frame's bins; None for nothing.
+        bit_price: the price of leaving the last frame's bins; None for nothing.
         population: of the free Gaussians.
-        settling: tells when there is little to gain.
+        early_stopping: tells when there is little to gain.
         patch_at: the iteration after which free Gaussians die and are born, unless the frame settles before.
         patches: whether they do.
         last_pass: gets the result of each view.
@@ -71,9 +71,9 @@ class NextFrame(Hooks[View, SceneLoss]):
     start: Start
     parameters: Parameters
     losses: LossWeights
-    rate: Rate | None
+    bit_price: BitPrice | None
     population: Population
-    settling: Settling
+    early_stopping: EarlyStopping
     patch_at: int
     patches: bool
     last_pass: LastPass
@@ -92,11 +92,15 @@ class NextFrame(Hooks[View, SceneLoss]):
             watch=self.watch,
             focus=None if places is None else places[sample.index],
         )
-        self.settling.add(sample.index, loss.total)
-        if iteration < self.patch_at and self.settling.settled:
+        self.early_stopping.add(sample.index, loss.total)
+        if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
         self.last_pass.add(iteration, loss, sample)
-        return loss if self.rate is None else replace(loss, total=loss.total + self.rate.price(self.parameters.values))
+        return (
+            loss
+            if self.bit_price is None
+            else replace(loss, total=loss.total + self.bit_price.price(self.parameters.values))
+        )
 
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
         if screen_gradient is not None:
@@ -104,11 +108,11 @@ class NextFrame(Hooks[View, SceneLoss]):
         if iteration == self.patch_at and self.patches:
             with self.watch.stage("patch"), torch.no_grad():
                 survivors = self.population.patch(sample)
-                self.rate = None if self.rate is None else self.rate.kept(survivors)
-            self.settling.begin_again()
+                self.bit_price = None if self.bit_price is None else self.bit_price.kept(survivors)
+            self.early_stopping.reset()
 
     def finished(self, iteration: int) -> bool:
-        return iteration > self.patch_at and self.settling.settled
+        return iteration > self.patch_at and self.early_stopping.should_stop
 
     def counts(self) -> tuple[int, int]:
         partition = self.start.partition

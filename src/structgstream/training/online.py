@@ -22,6 +22,7 @@ from structgstream.kernels.cuda_tiles import with_enough_room
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.births import BirthConfig
+from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
@@ -36,12 +37,11 @@ from structgstream.training.patching import PatchingConfig
 from structgstream.training.picture_change import PictureChange
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.population import Population
-from structgstream.training.price import Rate
+from structgstream.training.price import BitPrice
 from structgstream.training.renewal import renewal
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.rounding import RoundingConfig
-from structgstream.training.settling import Settling
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, shuffled_views
@@ -147,7 +147,7 @@ def fit_next_frame(
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
         fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
         if pictures.changes is None:
-            return fit.optimized(Start(scene, pictures.views, _ahead(scene, older, config.motion_prior)))
+            return fit.optimized(Start(scene, pictures.views, _prior_displacements(scene, older, config.motion_prior)))
         return _moved(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
 
     if backend.device.type != "cuda":
@@ -201,7 +201,7 @@ class _Fit:
 
     def _hooks(self, start: Start, iterations: int) -> NextFrame:
         config, patching, scene, seen = self.config, self.config.patching, start.scene, start.seen
-        parameters, rate = self._parameters(start)
+        parameters, bit_price = self._parameters(start)
         adam = Adam(self.backend, parameters.values)
         _move(parameters, adam, start)
         still_free = 0 if start.partition is None else len(start.partition.still.free)
@@ -223,9 +223,9 @@ class _Fit:
             start=start,
             parameters=parameters,
             losses=config.losses,
-            rate=rate,
+            bit_price=bit_price,
             population=population,
-            settling=Settling(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
+            early_stopping=EarlyStopping(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
             patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),
             patches="free" in config.dynamic,
             last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
@@ -233,7 +233,7 @@ class _Fit:
             watch=self.watch,
         )
 
-    def _parameters(self, start: Start) -> tuple[Parameters, Rate | None]:
+    def _parameters(self, start: Start) -> tuple[Parameters, BitPrice | None]:
         """The leaves of the scene where it was in the last frame, and the price of leaving that."""
         config = self.config
         dynamic = config.dynamic if start.partition is None else config.dynamic.difference(SHARED_FIELDS)
@@ -241,29 +241,29 @@ class _Fit:
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(start.scene, trained=trained, steps=steps)
         rounding = config.rounding.resolved()
-        return parameters, Rate.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
+        return parameters, BitPrice.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
 
 
 def _move(parameters: Parameters, adam: Adam[ParameterName], start: Start) -> None:
     """Put what is trained where the frame starts, with what is born."""
     values, anchors = parameters.values, len(start.scene.anchors)
     if values["anchor_positions"].requires_grad:
-        values["anchor_positions"].data += start.ahead[:anchors]
+        values["anchor_positions"].data += start.displacements[:anchors]
     if not values["free_means"].requires_grad:
         return
-    values["free_means"].data += start.ahead[anchors:]
+    values["free_means"].data += start.displacements[anchors:]
     if start.born is not None:
         keep = torch.ones(len(start.scene.free), dtype=torch.bool, device=start.born.means.device)
         parameters.births = torch.cat([parameters.births, start.born.births])
         adam.replace_rows(values_of_rows(start.born, FREE_ROWS), keep=keep)
 
 
-def _ahead(scene: Scene, older: Scene | None, motion_prior: float) -> Tensor:
+def _prior_displacements(scene: Scene, older: Scene | None, motion_prior: float) -> Tensor:
     """How far from their places the movers start ``[M + F, 3]``: a share of the anchors' last step."""
-    ahead = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
+    displacements = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
     if older is not None and motion_prior:
-        ahead[: len(scene.anchors)] = motion_prior * (scene.anchors.positions - older.anchors.positions)
-    return ahead
+        displacements[: len(scene.anchors)] = motion_prior * (scene.anchors.positions - older.anchors.positions)
+    return displacements
 
 
 def _moved(
@@ -277,13 +277,13 @@ def _moved(
 ) -> FitResult[Scene]:
     """Fit what moves in ``scene``, from where the pictures show it, and leave the rest as it is."""
     config, backend, watch = fit.config, fit.backend, fit.watch
-    ahead = _ahead(scene, older, config.motion_prior)
+    displacements = _prior_displacements(scene, older, config.motion_prior)
     with watch.stage("find motion"):
         which = moving_parts(scene, views, changes, config=config.motion, backend=backend, older=older, floor=floor)
-        partition, ahead = Partition.of(scene, which), ahead[which.movers]
+        partition, displacements = Partition.of(scene, which), displacements[which.movers]
         trusted = [views[number] for number in which.trusted]
     with watch.stage("start motion"):
-        start = started(partition, trusted, ahead, config=config.start, motion=config.motion, backend=backend)
+        start = started(partition, trusted, displacements, config=config.start, motion=config.motion, backend=backend)
     with watch.stage("renew"):
         new = renewal(
             replace(partition, moving=displaced(partition.moving, start.displacements)),

@@ -65,7 +65,11 @@ class Partition:
 
 def focuses(partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend) -> dict[int, Focus]:
     """By index, the views that the moving part shows in, and where."""
-    which, moving, still = partition.which, partition.moving.baked(), partition.still.baked()
+    which, moving, still = (
+        partition.which,
+        partition.moving.with_folded_appearance(),
+        partition.still.with_folded_appearance(),
+    )
     k = moving.anchors.offsets_per_anchor
     rows = torch.cat([which.anchors.repeat_interleave(k), which.free])  # of the whole scene's Gaussians
     with torch.no_grad():
@@ -92,7 +96,7 @@ def _focus(
     # The loss looks ten pixels beyond a tile: a ring of tiles around them is drawn once and stays as it is.
     around = torch.nn.functional.max_pool2d(tiles.mask[None].float(), 3, stride=1, padding=1)[0] > 0
     ring = replace(tiles, mask=around)
-    at_rest = still.dressed(still.structured(camera, backend, tiles=ring))
+    at_rest = still.with_free_gaussians(still.structured(camera, backend, tiles=ring))
     nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=around.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
     drawn, behind = concatenate(in_motion, at_rest), still.background(camera)

@@ -12,7 +12,7 @@ from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 
 
 @dataclass(frozen=True)
-class Rate:
+class BitPrice:
     """An estimate of bits, to be paid for in the loss.
 
     Args:
@@ -30,7 +30,7 @@ class Rate:
     @classmethod
     def of(
         cls, parameters: Parameters, steps: Mapping[ParameterName, float], *, weight: float, free: bool
-    ) -> "Rate | None":
+    ) -> "BitPrice | None":
         """The price of leaving what ``parameters`` are now; None for nothing.
 
         With ``free`` a free Gaussian's bit costs what an anchor's does, else nothing.
@@ -44,7 +44,7 @@ class Rate:
         rows = len(parameters.values["anchor_positions"])
         return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
 
-    def kept(self, keep: Tensor) -> "Rate":
+    def kept(self, keep: Tensor) -> "BitPrice":
         """The price after free Gaussians without the mask ``keep`` have died; what was or is born behind those that had
         one has none."""
         before = {

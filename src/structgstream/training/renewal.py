@@ -67,7 +67,7 @@ def renewal(
         config: the rules.
         backend: what computes.
     """
-    moving = partition.moving.baked()
+    moving = partition.moving.with_folded_appearance()
     everything = torch.ones(len(moving.free), dtype=torch.bool, device=moving.free.means.device)
     none = Renewal(everything, FreeGaussians.empty(moving.free.means))
     if not config.enabled or not places:
@@ -93,7 +93,7 @@ def renewal(
             missing = [_missing_of(moving, view, places, backend, floor=floor, config=config) for view in views]
         if not _several(missing, config):
             return replace(none, kept=kept, missing_share=share)
-        still = partition.still.baked()
+        still = partition.still.with_folded_appearance()
         depths = {entry.view.index: _depths([moving, still], entry.view.camera, backend) for entry in missing}
         new = born(
             missing,

@@ -60,7 +60,7 @@ def residual_of(gaussians: Gaussians, view: View, scene: Scene, backend: Backend
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
     """What ``scene``, frame 0 as every receiver has it, misses in its pictures, at ``scale`` of their size."""
-    scene = scene.baked()
+    scene = scene.with_folded_appearance()
     maps = {}
     with torch.no_grad():
         for view in views:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.codec.entropy.table_choice import chosen_tables
-from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, geometric, normalised
+from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, geometric, normalize_counts
 from structgstream.errors import StreamError
 
 EVEN = FrequencyTables(np.full((2, 4), TOTAL // 4, np.uint16))
@@ -42,7 +42,7 @@ def test_choosing_again_for_the_same_counts_changes_nothing() -> None:
     again, more = chosen_tables(counts, tables)
     assert more == b""
     assert (again.rows == tables.rows).all()
-    assert chosen_tables(counts, normalised(counts))[1] == b"", "exact frequencies cannot be bettered"
+    assert chosen_tables(counts, normalize_counts(counts))[1] == b"", "exact frequencies cannot be bettered"
 
 
 @pytest.mark.parametrize("counts", [[[1, 2, 3]], [[1, 2, 3, -1], [0, 0, 0, 0]], [[1 << 30, 1 << 30, 0, 0], [0] * 4]])

@@ -12,7 +12,7 @@ from structgstream.codec.entropy.bits import fixed, packed_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
 from structgstream.codec.entropy.table_choice import chosen_tables
 from structgstream.codec.entropy.table_sets import decoded_tables, levels_of, top_level, weights_of
-from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, code_costs, geometric, logs, normalised
+from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, code_costs, geometric, logs, normalize_counts
 from structgstream.errors import StreamError
 
 COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 2**31)), min_size=1, max_size=32)
@@ -40,7 +40,7 @@ def laplace_counts(*, count: int, contexts: int, low: float, high: float, seed: 
 
 @given(COUNTS)
 def test_what_occurs_has_a_frequency_and_a_row_sums_to_4096(counts: list[int]) -> None:
-    row = normalised(np.array([counts])).rows[0]
+    row = normalize_counts(np.array([counts])).rows[0]
     assert row.sum() == TOTAL
     assert ((row > 0) == (np.array(counts) > 0)).all() or not any(counts)
 
@@ -49,7 +49,7 @@ def test_what_occurs_has_a_frequency_and_a_row_sums_to_4096(counts: list[int]) -
 def test_no_other_frequencies_code_noticeably_shorter(counts: list[int]) -> None:
     """The code length is convex in the frequencies: what is best nearby is best."""
     n = np.array(counts)
-    row = normalised(n[None]).rows[0].astype(int)
+    row = normalize_counts(n[None]).rows[0].astype(int)
     step = np.arange(-100, 101)
     first, second = np.meshgrid(row[0] + step, row[1] + step, indexing="ij")
     others = np.stack([first, second, TOTAL - first - second])
@@ -59,15 +59,15 @@ def test_no_other_frequencies_code_noticeably_shorter(counts: list[int]) -> None
 
 
 def test_equals_are_served_from_the_first_on() -> None:
-    assert normalised(np.array([[7, 7, 7]])).rows.tolist() == [[1366, 1365, 1365]]
-    assert normalised(np.array([[0, 0, 0]])).rows.tolist() == [[1366, 1365, 1365]]
-    assert normalised(np.array([[1, 0, 10**9, 1, 10**9]])).rows.tolist() == [[1, 0, 2047, 1, 2047]]
+    assert normalize_counts(np.array([[7, 7, 7]])).rows.tolist() == [[1366, 1365, 1365]]
+    assert normalize_counts(np.array([[0, 0, 0]])).rows.tolist() == [[1366, 1365, 1365]]
+    assert normalize_counts(np.array([[1, 0, 10**9, 1, 10**9]])).rows.tolist() == [[1, 0, 2047, 1, 2047]]
 
 
 def test_counts_and_tables_that_cannot_be_are_refused() -> None:
     for counts in ([[-1, 2]], [[1 << 40, 2]]):
         with pytest.raises(StreamError, match="Counts"):
-            normalised(np.array(counts))
+            normalize_counts(np.array(counts))
     for rows in (np.full((1, 2), 2000, np.uint16), np.full((1, 2), 2048), np.zeros((2, 0), np.uint16)):
         with pytest.raises(StreamError, match="must"):
             FrequencyTables(rows)
@@ -131,7 +131,7 @@ def test_chosen_tables_come_back_and_can_code_what_was_counted(data: st.DataObje
     )
     counts = np.array(data.draw(st.lists(row, min_size=contexts, max_size=contexts)))
     before = np.array(data.draw(st.lists(row, min_size=contexts, max_size=contexts)))
-    previous = normalised(before)
+    previous = normalize_counts(before)
     tables, bits = chosen_tables(counts, previous)
     assert (decoded_tables(bits, previous).rows == tables.rows).all()
     assert (tables.rows[counts > 0] > 0).all()
@@ -176,7 +176,7 @@ def test_a_peaked_row_of_no_family_takes_ten_bytes(seed: int) -> None:
     counts = np.rint(2000 * shape / shape.sum()).astype(int)[None]
     tables, bits = chosen_tables(counts, geometric(np.array([100]), alphabet=16))
     assert len(bits) <= 10
-    assert bits_for(counts, tables.rows) <= 1.01 * bits_for(counts, normalised(counts).rows)
+    assert bits_for(counts, tables.rows) <= 1.01 * bits_for(counts, normalize_counts(counts).rows)
 
 
 def test_precision_follows_the_number_of_symbols() -> None:
@@ -185,7 +185,7 @@ def test_precision_follows_the_number_of_symbols() -> None:
     excess = []
     for times in (1, 10, 1000):
         tables, bits = chosen_tables(shape * times, previous)
-        excess.append((len(bits), bits_for(shape, tables.rows) / bits_for(shape, normalised(shape).rows) - 1))
+        excess.append((len(bits), bits_for(shape, tables.rows) / bits_for(shape, normalize_counts(shape).rows) - 1))
     (few, rough), (_, better), (many, fine) = excess
     assert few < many <= 16
     assert rough > better > fine
@@ -259,7 +259,7 @@ def test_a_decoder_written_from_the_document_agrees(seed: int, alphabet: int, si
     g = np.random.default_rng(seed)
     shapes = np.exp(-np.arange(alphabet) / g.uniform(0.5, 8) + g.normal(0, 0.6, (4, alphabet)))
     counts = g.poisson(10**size * shapes * (g.random((4, alphabet)) < 0.8))
-    previous = normalised(g.poisson(500 * shapes))
+    previous = normalize_counts(g.poisson(500 * shapes))
     tables, data = chosen_tables(counts, previous)
     assert plain_tables(data, previous.rows.tolist()) == tables.rows.tolist()
 

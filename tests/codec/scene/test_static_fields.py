@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from properties import examples
 from streams import small_scene
 from structgstream.codec.entropy.coder import Encoder, Tables, varint
-from structgstream.codec.scene.bins import on_bins
+from structgstream.codec.scene.bins import round_to_bins
 from structgstream.codec.scene.static_fields import (
     FREE_NUMBERS,
     MOST_ANCHORS,
@@ -39,7 +39,7 @@ def fields_of(anchors: int = 5, *, seed: int = 0, scale: float = 1.0) -> dict[Fi
         with_appearance(small_scene(anchors, seed=seed), 2), environment=torch.arange(12.0).reshape(4, 3) - 5
     )
     state = state_of(scene)
-    return on_bins({name: state[name] * scale for name in CODED}, STEPS)
+    return round_to_bins({name: state[name] * scale for name in CODED}, STEPS)
 
 
 def row(**changes: torch.Tensor) -> dict[FieldName, torch.Tensor]:
@@ -107,7 +107,7 @@ def test_ordered_positions_take_fewer_bits() -> None:
     bins = torch.stack([places % 32, places // 32 % 32, places // 32**2], dim=1)
     positions = bins * STEPS["anchor_positions"]
     order = space_order(positions, step=STEPS["anchor_positions"])
-    fields = fields_of(2000) | on_bins({"anchor_positions": positions[order]}, STEPS)
+    fields = fields_of(2000) | round_to_bins({"anchor_positions": positions[order]}, STEPS)
     check(fields)
     size = len(encoded_fields(fields, STEPS)["anchor_positions"])
     # 2000 of 32768 places, in no particular order: log2 of the binomial is 10.7 kbit.

@@ -26,7 +26,7 @@ from structgstream.codec.entropy.tables import (
     code_costs,
     geometric_family,
     logs,
-    normalised,
+    normalize_counts,
     weighed,
 )
 from structgstream.errors import StreamError
@@ -93,7 +93,9 @@ def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
     rows, cost = np.where((parametric < keep)[:, None], family[number], kept), np.minimum(keep, parametric)
     pieces = ["10" + fixed(g, NUMBER_BITS) if new else "0" for g, new in zip(number.tolist(), parametric < keep)]
     # Where even exact frequencies would not pay for the head of an explicit row, none is tried.
-    least = _data_cost(counts, normalised(counts).rows.astype(np.int64)) + (_EXPLICIT_BITS + COUNT_BITS << COST_BITS)
+    least = _data_cost(counts, normalize_counts(counts).rows.astype(np.int64)) + (
+        _EXPLICIT_BITS + COUNT_BITS << COST_BITS
+    )
     tried = np.flatnonzero(least < cost)
     for geometric_reference, precision, order in product((False, True), range(1 << PRECISION_BITS), (0, 1)):
         references = family[number[tried]] if geometric_reference else kept[tried]

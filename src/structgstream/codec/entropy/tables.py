@@ -42,7 +42,9 @@ class FrequencyTables:
                 f"{dtype} {shape}."
             )
         if (self.rows.sum(1, dtype=np.int64) != TOTAL).any():
-            raise StreamError(f"Every row of frequencies must sum to {TOTAL}; normalise counts with normalised().")
+            raise StreamError(
+                f"Every row of frequencies must sum to {TOTAL}; normalise counts with normalize_counts()."
+            )
         object.__setattr__(self, "rows", np.ascontiguousarray(self.rows))
 
     @property
@@ -61,7 +63,7 @@ class FrequencyTables:
         return (np.cumsum(self.rows, axis=1, dtype=np.int64) - self.rows).astype(np.uint16)
 
 
-def normalised(counts: NDArray[np.integer]) -> FrequencyTables:
+def normalize_counts(counts: NDArray[np.integer]) -> FrequencyTables:
     """Frequencies for counted symbols that make the code nearly as short as it can be; a row without any is even.
 
     Symbols that occur get at least 1, others 0. From the floors of the quotas on, each further unit goes to the symbol
@@ -103,7 +105,7 @@ def weighed(weights: NDArray[np.int64]) -> NDArray[np.int64]:
     """Frequencies ``[..., A]`` for integer weights: the floors of the quotas, at least 1 where the weight is positive.
 
     What is missing from 4096, or too much, the first of the largest weights gets or gives. This is what a decoder does
-    with the weights in a table set; :func:`normalised` is for counts.
+    with the weights in a table set; :func:`normalize_counts` is for counts.
     """
     rows = np.where(weights > 0, np.maximum(weights * TOTAL // weights.sum(-1, keepdims=True), 1), 0)
     peak = weights.argmax(-1)[..., None]

@@ -14,7 +14,7 @@ from structgstream.codec.arrays import Bins
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import LARGEST, SceneBins, binned, rounded_fields, valued
+from structgstream.codec.scene.bins import LARGEST, SceneBins, dequantize_state, quantize_state, rounded_fields
 from structgstream.codec.scene.change import Change
 from structgstream.codec.scene.free_rows import coded_free
 from structgstream.codec.scene.rows import coded_change
@@ -88,7 +88,7 @@ class _Compact:
         self._header = header
         known: dict[FieldName, Tensor] = {**header.static, **header.reference}
         # What is not dynamic is not looked at; free Gaussians begin as none.
-        self._reference = binned(known, rows, header.steps)
+        self._reference = quantize_state(known, rows, header.steps)
         self.state: CompactState | None = None
 
     def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Models]:
@@ -121,7 +121,7 @@ class CompactEncoder(_Compact):
             StreamError: a value is out of range, or a delta packet does not follow the packet before it.
         """
         before, models = self._start(kind, index)
-        after = binned(state, self._header.dynamic, self._header.steps)
+        after = quantize_state(state, self._header.dynamic, self._header.steps)
         if after.anchors.shape != before.anchors.shape:
             raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
         for name, bins in after.weights.items():
@@ -149,4 +149,4 @@ class CompactDecoder(_Compact):
         bins = self._coded(decoder, None, before, index)
         decoder.end()
         self._keep(kind, index, bins, models)
-        return valued(bins, self._header.dynamic, self._header.steps)
+        return dequantize_state(bins, self._header.dynamic, self._header.steps)

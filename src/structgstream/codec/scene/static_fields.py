@@ -20,7 +20,7 @@ from structgstream.codec.arrays import Bins, Contexts, Naturals
 from structgstream.codec.entropy.bits import bit_lengths, unzigzag, zigzag
 from structgstream.codec.entropy.coder import Coder, Decoder, Encoder, Tables
 from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMBOL
-from structgstream.codec.scene.bins import LARGEST, nearest_bins, values_of
+from structgstream.codec.scene.bins import LARGEST, dequantize, quantize
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, InitCoding
@@ -71,8 +71,8 @@ def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName,
     for name in _coded_names(fields.keys()):
         if name not in steps:
             raise StreamError(f"The header states no step for {name} in the init record.")
-        found = nearest_bins(fields[name], steps[name])
-        if values_of(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
+        found = quantize(fields[name], steps[name])
+        if dequantize(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
             raise StreamError(f"The header's {name} are no multiples of their step {steps[name]:g}; round them first.")
         bins[name] = found
     encoder = Encoder(Tables())
@@ -101,7 +101,7 @@ def decoded_fields(
     decoder = Decoder(Tables(), coded, where=_WHERE)
     bins = _coded(decoder, None, coded.keys(), _Budget(_most_numbers(coded.values())))
     decoder.end()
-    return {name: values_of(found, steps[name]) for name, found in bins.items()}
+    return {name: dequantize(found, steps[name]) for name, found in bins.items()}
 
 
 def _coded_names(names: Set[FieldName]) -> list[FieldName]:

@@ -50,11 +50,11 @@ class Ablate(ExperimentOptions):
 def main(arguments: list[str]) -> None:
     """Runs, prints, draws."""
     options, rest = parsed_with_rest(Ablate, "ablate", arguments=arguments)
-    from structgstream.presets import DEFAULT_PRESET, PAPER_MODE
+    from structgstream.presets import DEFAULT_PRESET, PAPER_METHOD_PRESET
 
-    full, _ = resolved_config(options.preset or PAPER_MODE, rest, command="ablate", seed=None)
+    full, _ = resolved_config(options.preset or PAPER_METHOD_PRESET, rest, command="ablate", seed=None)
     compact, _ = resolved_config(options.preset or DEFAULT_PRESET, rest, command="ablate", seed=None)
-    paper, _ = resolved_config(PAPER_MODE, rest, command="ablate", seed=None)
+    paper, _ = resolved_config(PAPER_METHOD_PRESET, rest, command="ablate", seed=None)
     capture, frames = capture_part(options.scene, options)
     from structgstream.kernels.backend import select_backend
     from structgstream_studies.experiments.studies import COMPACT_TABLES, ablation_runs, needed, write_ablation

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from structgstream.errors import ConfigError
-from structgstream.presets import PAPER_DATA, PAPER_MODE, PRESETS, StreamConfig
+from structgstream.presets import PAPER_DATA, PAPER_METHOD_PRESET, PRESETS, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.effects import EFFECTS_TABLE, effects, effects_sheet
 from structgstream_studies.experiments.figures import Picture, write_comparison, write_curves, write_details
@@ -54,7 +54,7 @@ def ablation_runs(
     frames: int,
     seeds: Sequence[int],
     folder: Path,
-    paper: StreamConfig = PRESETS[PAPER_MODE],
+    paper: StreamConfig = PRESETS[PAPER_METHOD_PRESET],
 ) -> list[Variation]:
     """Every variant of the tables with every seed, seed by seed.
 
@@ -130,7 +130,7 @@ def comparison_runs(
             if name not in known:
                 raise ConfigError(f"There is no method {name!r}; there are {', '.join(known)}.")
             if name in PRESETS or name == "held":
-                config = replace(PRESETS[PAPER_MODE if name == "held" else name], seed=seed)
+                config = replace(PRESETS[PAPER_METHOD_PRESET if name == "held" else name], seed=seed)
                 variant = variants(config)["held" if name == "held" else FULL]
                 runs.append(Variation(method_key(name), capture, variant.config, folder, frames))
             else:
@@ -141,7 +141,7 @@ def comparison_runs(
 
 def method_key(name: str) -> str:
     """The key of a method's results: paper mode is the full method of the ablations."""
-    return FULL if name == PAPER_MODE else name
+    return FULL if name == PAPER_METHOD_PRESET else name
 
 
 def method_titles() -> dict[str, str]:
@@ -230,12 +230,12 @@ def write_methods(folder: Path, runs: Sequence[Variation | PeerRun], *, backend:
 
 def variant_titles() -> dict[str, str]:
     """Every variant's name in tables."""
-    return {key: variant.title for key, variant in variants(PRESETS[PAPER_MODE]).items()}
+    return {key: variant.title for key, variant in variants(PRESETS[PAPER_METHOD_PRESET]).items()}
 
 
 def effect_titles() -> dict[str, str]:
     """The rows of the table of effects, in its order."""
-    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_MODE])
+    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_METHOD_PRESET])
     return {key: variant.title for key, variant in found.items()}
 
 

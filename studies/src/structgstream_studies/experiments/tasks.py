@@ -128,7 +128,7 @@ class Variation:
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the tasks that come before it: frame 0, unless the stream has it already."""
-        return () if self._begun() else (self.first.name,)
+        return () if self._has_started() else (self.first.name,)
 
     @property
     def stream(self) -> Path:
@@ -142,20 +142,22 @@ class Variation:
 
     def done(self) -> bool:
         """Whether there is a result for this very question."""
-        return answers(self.result, self._asked(), self.capture, frames=self.frames)
+        return is_result_of(self.result, self._identity(), self.capture, frames=self.frames)
 
-    def _begun(self) -> bool:
+    def _has_started(self) -> bool:
         from structgstream.evaluation.run_log import read_log
 
         return self.stream.exists() and 0 in read_log(self.stream)
 
-    def _asked(self) -> dict[str, Any]:
+    def _identity(self) -> dict[str, Any]:
         return {"key": self.key, "method": "struct-gstream", "seed": self.config.seed, "config": to_json(self.config)}
 
     def run(self, backend: "Backend") -> None:
         """Reconstructs what is missing of the stream, then scores the file."""
         _reconstruct(self.capture, self.config, self.stream, backend, first=self.first)
-        write_result(self.result, scored(self.recording(), self.stream, self.capture, backend, asked=self._asked()))
+        write_result(
+            self.result, scored(self.recording(), self.stream, self.capture, backend, run_identity=self._identity())
+        )
 
     def recording(self) -> "Recording":
         """The stream, opened."""
@@ -164,7 +166,7 @@ class Variation:
         return open_stream(self.stream)
 
 
-def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart, *, frames: int) -> bool:
+def is_result_of(result: Path, run_identity: Mapping[str, Any], capture: CapturePart, *, frames: int) -> bool:
     """Whether a result is there and is the answer to this very question, on these ``frames`` of the capture."""
     found = read_result(result)
     if found is None:
@@ -175,11 +177,11 @@ def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart, *, fra
     same_part = part == (capture.start, rounded(capture.scale), capture.every, rounded(capture.near), frames)
     same_split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
     same_cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
-    return identity == rounded(asked) and same_part and same_split and same_cameras
+    return identity == rounded(run_identity) and same_part and same_split and same_cameras
 
 
 def scored(
-    recording: "Recording", stream: Path, capture: CapturePart, backend: "Backend", *, asked: Mapping[str, Any]
+    recording: "Recording", stream: Path, capture: CapturePart, backend: "Backend", *, run_identity: Mapping[str, Any]
 ) -> Result:
     """The scores of a finished file, with what was asked and who trained it."""
     from structgstream.evaluation.evaluate import evaluate
@@ -187,7 +189,7 @@ def scored(
 
     source, log = capture.open(), read_log(stream)
     report = evaluate(recording, source, backend=backend, cameras=capture.scored, log=log)
-    identity = {**asked, "capture": capture_facts(capture, source)}
+    identity = {**run_identity, "capture": capture_facts(capture, source)}
     return result_of(report, identity=identity, trained_by=log.get(0, {}).get("trained_by", {}))
 
 

@@ -15,7 +15,7 @@ from structgstream.scene.state import fields_of, parameters_of
 from structgstream.training.initial import rig_extent
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
-from structgstream.training.optim import Adam, Rate, constant, leaves
+from structgstream.training.optim import Adam, LearningRate, constant, leaves
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import neighbour_distances, voxel_centers
@@ -35,14 +35,14 @@ LOSSES = LossWeights(l1=0.8, ssim=0.2)
 class GaussiansRates:
     """Adam's rates of 3DGS, scheduled over the iterations of the fit."""
 
-    means: Rate = Rate(1.6e-4, 1.6e-6)
+    means: LearningRate = LearningRate(1.6e-4, 1.6e-6)
     """Times 1.1 rig radii."""
-    log_scales: Rate = constant(5e-3)
-    quats: Rate = constant(1e-3)
-    logit_opacities: Rate = constant(5e-2)
-    base_colors: Rate = constant(2.5e-3)
-    sh: Rate = constant(2.5e-3 / 20)
-    camera_color: Rate = Rate(2e-3, 1e-4)
+    log_scales: LearningRate = constant(5e-3)
+    quats: LearningRate = constant(1e-3)
+    logit_opacities: LearningRate = constant(5e-2)
+    base_colors: LearningRate = constant(2.5e-3)
+    sh: LearningRate = constant(2.5e-3 / 20)
+    camera_color: LearningRate = LearningRate(2e-3, 1e-4)
     """As this project's frame 0; unused when ``camera_color`` is off."""
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 
-class Settling:
+class EarlyStopping:
     """Watches how much lower each view's loss is than when the view was looked at last.
 
     Args:
@@ -28,12 +28,12 @@ class Settling:
         if last is not None:
             self._gains.append(1.0 - loss.detach() / last.clamp(min=1e-12))
 
-    def begin_again(self) -> None:
+    def reset(self) -> None:
         """What there is to gain has changed."""
         self._gains.clear()
 
     @property
-    def settled(self) -> bool:
+    def should_stop(self) -> bool:
         """Whether there is little more to gain; asked for every few views only, since a GPU has to be waited for."""
         full = len(self._gains) == self._gains.maxlen
         if self._least_gain <= 0.0 or not full or self._added % max(1, len(self._gains) // 3):

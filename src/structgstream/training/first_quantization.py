@@ -51,7 +51,7 @@ class Sensitivity:
     used: Tensor
 
 
-def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int) -> Sensitivity:
+def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int) -> Sensitivity:
     """What the training cameras of ``rig`` (in the scene's units) see of every number."""
     generator = torch.Generator().manual_seed(seed)
     state: dict[FieldName, Tensor] = {name: value.detach() for name, value in state_of(scene).items()}
@@ -67,7 +67,7 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
         structured = open_scene.structured(rig[name], backend)
         used[structured.anchors] |= structured.raw_opacities > 0
         behind = open_scene.background(rig[name])
-        image = draw(open_scene.dressed(structured), rig[name], backend, background=behind).image
+        image = draw(open_scene.with_free_gaussians(structured), rig[name], backend, background=behind).image
         count += image.numel()
         if not image.requires_grad:  # It shows nothing.
             continue
@@ -83,7 +83,7 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
     return Sensitivity(squares, products, used)
 
 
-def regauged(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
+def regauge(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
     """A scene that draws the same with numbers that cost less (Note [Gauges]), and what they are worth."""
     anchors, fields = scene.anchors, dict(sensitivity.fields)
     lengths = anchors.log_offset_scales.exp()[:, None]
@@ -93,8 +93,8 @@ def regauged(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity
     mean = features.mean(0) if len(features) else features.new_zeros(features.shape[1])
     products = back @ sensitivity.features @ back.T
     # Of an anchor's directions together as before, of all anchors together as now.
-    worth = products.diagonal().sum() / sensitivity.features.diagonal().sum().clamp(min=1e-300)
-    fields["anchor_features"] = fields["anchor_features"] * worth.to(fields["anchor_features"])
+    scaling = products.diagonal().sum() / sensitivity.features.diagonal().sum().clamp(min=1e-300)
+    fields["anchor_features"] = fields["anchor_features"] * scaling.to(fields["anchor_features"])
     return replace(
         scene,
         anchors=replace(
@@ -131,7 +131,7 @@ def _seeing(head: HeadWeights, mean: Tensor, back: Tensor) -> HeadWeights:
     return head._replace(w1=w1, b1=(head.b1.double() + seen @ mean).to(head.b1))
 
 
-def first_bins(
+def quantize_first_frame(
     scene: Scene,
     sensitivity: Sensitivity,
     *,
@@ -142,7 +142,7 @@ def first_bins(
     """The scene with all that the init record codes as whole numbers of steps, and these steps by field.
 
     Args:
-        scene: frame 0, as :func:`regauged` gave it.
+        scene: frame 0, as :func:`regauge` gave it.
         sensitivity: of ``scene``.
         config: how much may be lost.
         voxel_size: the grid of the anchors.
@@ -152,7 +152,8 @@ def first_bins(
     used = sensitivity.used[..., None].expand_as(state["anchor_offsets"])
     counted = {"anchor_offsets": used}
     numbers = sum(
-        int((worth > 0).logical_and(counted.get(name, worth > 0)).sum()) for name, worth in sensitivity.fields.items()
+        int((sensitivities > 0).logical_and(counted.get(name, sensitivities > 0)).sum())
+        for name, sensitivities in sensitivity.fields.items()
     )
     # A step has the error of its square over twelve; all numbers have the same.
     most = plain.first_noise_levels / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
@@ -163,8 +164,8 @@ def first_bins(
         shown = rounded(shown, steps["anchor_positions"])
     lost = (scene.anchors.positions - shown) / scene.anchors.log_offset_scales.exp()
     state["anchor_offsets"] = torch.where(used, state["anchor_offsets"] + lost[:, None], 0.0)
-    for name, worth in sensitivity.fields.items():
-        found[name], state[name] = _coarsened(state[name], worth, most, counted=counted.get(name))
+    for name, sensitivities in sensitivity.fields.items():
+        found[name], state[name] = _coarsened(state[name], sensitivities, most, counted=counted.get(name))
     if scene.appearance_basis is not None:
         shortest = float(scene.appearance_basis.norm(dim=1).min())
         found["appearance_basis"] = float32(max(shortest / 64, 1e-9))
@@ -178,10 +179,10 @@ def first_bins(
     return scene_of(state, distance_input=scene.distance_input), found
 
 
-def _coarsened(values: Tensor, worth: Tensor, most: float, *, counted: Tensor | None) -> tuple[float, Tensor]:
+def _coarsened(values: Tensor, sensitivities: Tensor, most: float, *, counted: Tensor | None) -> tuple[float, Tensor]:
     """A step, and values ``[M, ...]`` as multiples of it times a power of two for each row."""
-    counted = worth > 0 if counted is None else counted
-    flat, rows = worth * counted, tuple(range(1, worth.dim()))
+    counted = sensitivities > 0 if counted is None else counted
+    flat, rows = sensitivities * counted, tuple(range(1, sensitivities.dim()))
     mean = float(flat.sum() / counted.sum().clamp(min=1))
     if not mean > 0.0:
         mean = 1.0
