@@ -24,7 +24,8 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
     Args:
         extra: the extra of this package that a user should install when OpenCV is missing.
         refined: OpenCV's preset "medium"; else its "fast", down to half the pictures' size and without variational
-            refinement, which takes two fifths of the time and is as good where flow leads back (:func:`agreeing`).
+            refinement, which takes two fifths of the time and is as good where flow leads back
+            (:func:`consistency_mask`).
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -47,7 +48,7 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
     return flow
 
 
-def agreeing(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
+def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which pixels ``[H, W]`` lead back to themselves, so that they are not occluded (Sundaram et al., 2010).
 
     With ``f`` the flow of a picture to another and ``b`` the one of that other back, ``[H, W, 2]``:

@@ -17,7 +17,7 @@ from structgstream.scene.state import FieldName, scene_of, state_of
 from structgstream.training.first_quantization import (
     COARSEST,
     FINEST,
-    MEASURED,
+    SENSITIVITY_FIELDS,
     Sensitivity,
     estimate_sensitivity,
     quantize_first_frame,
@@ -163,7 +163,7 @@ def test_offsets_take_what_positions_lose() -> None:
 def test_a_higher_quality_is_finer_everywhere() -> None:
     _, plain = quantized(0.5)
     _, fine = quantized(0.5, quality=1.0)
-    for name in (*MEASURED, "opacity_mlp"):
+    for name in (*SENSITIVITY_FIELDS, "opacity_mlp"):
         assert fine[name] == pytest.approx(plain[name] / 2**0.5)
 
 

@@ -34,7 +34,7 @@ def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
     bit_price = BitPrice.of(parameters, steps, weight=1.0, free=True)
     assert bit_price is not None
     keep = torch.tensor([True, False, True, True, False, True])
-    bit_price, old = bit_price.kept(keep), parameters.values["free_means"]
+    bit_price, old = bit_price.after_pruning(keep), parameters.values["free_means"]
     values: dict = {name: value.detach()[keep] for name, value in parameters.values.items() if name in steps}
     values["free_means"] = torch.cat([values["free_means"], old[:3].detach() + 7.0])
     values["free_colors"] = torch.cat([values["free_colors"], values["free_colors"][:3]])

@@ -42,7 +42,7 @@ class EnvironmentConfig:
     """What the coefficients are whole multiples of, in streams with the codec ``compact``."""
 
 
-def fitted_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
+def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
     """Coefficients ``[(degree + 1)^2, 3]`` of the colours in the pictures' directions, by least squares.
 
     Args:

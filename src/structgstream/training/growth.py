@@ -182,7 +182,7 @@ def grow(
     ).strongest(most - len(anchors))
 
 
-def prunable(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
+def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
     """Mask ``[M]`` of anchors that were looked at often enough and are as good as transparent."""
     judged = statistics.visits > config.prune_visits
     return judged & (statistics.opacity < config.prune_opacity * statistics.visits)

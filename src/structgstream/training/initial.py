@@ -27,7 +27,7 @@ from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
 
-_JUDGED_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of them will do.
+_CONTRIBUTION_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of them will do.
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def rig_extent(rig: CameraRig) -> float:
 
 
 @dataclass
-class _FirstFrame(Hooks[View, SceneLoss]):
+class _FirstFrameHooks(Hooks[View, SceneLoss]):
     """What frame 0 does in an iteration: disturb what is drawn, grow and remove anchors."""
 
     config: InitialConfig
@@ -161,13 +161,13 @@ class _FirstFrame(Hooks[View, SceneLoss]):
             with self.watch.stage("densify"), torch.no_grad():
                 densifier.gradients.add(loss.rendering, screen_gradient)
                 densifier.opacities.add(loss.structured)
-                if densifier.due(iteration):
+                if densifier.is_due(iteration):
                     densifier.apply(self.scene, self.adam, self.generator, iteration=iteration)
-        if densifier.judges(iteration):
+        if densifier.prunes_by_contribution(iteration):
             with self.watch.stage("densify"), torch.no_grad():
                 cameras = [view.camera for view in self.views]
-                shares = contributions(self.scene, cameras, scale=_JUDGED_SCALE, backend=self.backend)
-                densifier.judge(shares, self.adam)
+                shares = contributions(self.scene, cameras, scale=_CONTRIBUTION_SCALE, backend=self.backend)
+                densifier.prune_by_contribution(shares, self.adam)
 
     def counts(self) -> tuple[int, int]:
         return len(self.adam.values["anchor_positions"]), 0
@@ -201,7 +201,7 @@ def fit_first_frame(
     adam = Adam(backend, parameters.values)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
     last_pass = LastPass(config.iterations - len(views))
-    hooks = _FirstFrame(
+    hooks = _FirstFrameHooks(
         config, backend, template, parameters, adam, densifier, views, extent, generator, watch, last_pass
     )
     samples = coarse_to_fine(

@@ -33,7 +33,7 @@ class LiftConfig:
 
 
 @dataclass(frozen=True)
-class MotionStart:
+class LiftedMotion:
     """Where movers ``[T]`` begin a frame.
 
     Args:
@@ -45,7 +45,7 @@ class MotionStart:
     lifted: Tensor
 
 
-def lifted_motion(
+def lift_motion(
     evidence: MotionEvidence,
     centers: Tensor,
     priors: Tensor,
@@ -53,7 +53,7 @@ def lifted_motion(
     *,
     config: LiftConfig,
     backend: Backend,
-) -> MotionStart:
+) -> LiftedMotion:
     """A displacement for each of ``T`` movers.
 
     Args:
@@ -69,7 +69,7 @@ def lifted_motion(
     """
     informed = (evidence.weights.amax(0) > 0).nonzero()[:, 0]
     if not len(informed):
-        return MotionStart(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
+        return LiftedMotion(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
     near, distances = _nearest(centers, centers[informed], config.neighbours)
     spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
     affinities = torch.exp(-0.5 * (distances / spread).square())
@@ -88,7 +88,7 @@ def lifted_motion(
     found = backend.lift(centers, seen, Neighbours(neighbours, affinities), priors, share=config.inlier_share)
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
-    return MotionStart(displacements, lifted)
+    return LiftedMotion(displacements, lifted)
 
 
 def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:

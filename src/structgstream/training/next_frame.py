@@ -25,7 +25,7 @@ from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
-class Start:
+class StartingPoint:
     """Where the optimisation of a frame starts.
 
     Args:
@@ -33,25 +33,25 @@ class Start:
         views: the pictures.
         displacements: ``[M + F, 3]`` how far from their places its movers (Note [Movers]) start.
         partition: what the scene is a part of.
-        places: the views, by index, that it shows in, and where; None for all of all.
-        born: what joins it.
+        focuses: the views, by index, that it shows in, and where; None for all of all.
+        new_free: what joins it.
     """
 
     scene: Scene
     views: list[View]
     displacements: Tensor
     partition: Partition | None = None
-    places: Mapping[int, Focus] | None = None
-    born: FreeGaussians | None = None
+    focuses: Mapping[int, Focus] | None = None
+    new_free: FreeGaussians | None = None
 
     @property
     def seen(self) -> list[View]:
         """The views that show it."""
-        return self.views if self.places is None else [view for view in self.views if view.index in self.places]
+        return self.views if self.focuses is None else [view for view in self.views if view.index in self.focuses]
 
 
 @dataclass
-class NextFrame(Hooks[View, SceneLoss]):
+class NextFrameHooks(Hooks[View, SceneLoss]):
     """What a later frame does in an iteration: pay for bits, patch once, and stop when there is little to gain.
 
     Args:
@@ -68,7 +68,7 @@ class NextFrame(Hooks[View, SceneLoss]):
         watch: seconds by stage.
     """
 
-    start: Start
+    start: StartingPoint
     parameters: Parameters
     losses: LossWeights
     bit_price: BitPrice | None
@@ -81,7 +81,7 @@ class NextFrame(Hooks[View, SceneLoss]):
     watch: Stopwatch
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
-        patching, places = self.population.config, self.start.places
+        patching, focuses = self.population.config, self.start.focuses
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
@@ -90,7 +90,7 @@ class NextFrame(Hooks[View, SceneLoss]):
             voxel_size=0.0,
             track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
             watch=self.watch,
-            focus=None if places is None else places[sample.index],
+            focus=None if focuses is None else focuses[sample.index],
         )
         self.early_stopping.add(sample.index, loss.total)
         if iteration < self.patch_at and self.early_stopping.should_stop:
@@ -108,7 +108,7 @@ class NextFrame(Hooks[View, SceneLoss]):
         if iteration == self.patch_at and self.patches:
             with self.watch.stage("patch"), torch.no_grad():
                 survivors = self.population.patch(sample)
-                self.bit_price = None if self.bit_price is None else self.bit_price.kept(survivors)
+                self.bit_price = None if self.bit_price is None else self.bit_price.after_pruning(survivors)
             self.early_stopping.reset()
 
     def finished(self, iteration: int) -> bool:

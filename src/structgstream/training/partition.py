@@ -18,7 +18,7 @@ from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, Moving
+from structgstream.training.motion import MotionConfig, MotionSegmentation
 from structgstream.training.views import View
 
 REACH_SCALE = 0.25
@@ -30,27 +30,27 @@ class Partition:
 
     Args:
         whole: as it was.
-        which: what the moving part holds.
+        segmentation: what the moving part holds.
         moving: that part.
         still: the rest, but for free Gaussians that are not seen.
     """
 
     whole: Scene
-    which: Moving
+    segmentation: MotionSegmentation
     moving: Scene
     still: Scene
 
     @classmethod
-    def of(cls, scene: Scene, which: Moving) -> "Partition":
+    def of(cls, scene: Scene, segmentation: MotionSegmentation) -> "Partition":
         """Take ``scene`` apart."""
 
         def part(anchors: Tensor, free: Tensor) -> Scene:
             return replace(scene, anchors=scene.anchors.select(anchors), free=scene.free.select(free))
 
-        moving = part(which.anchors, which.free)
-        return cls(scene, which, moving, part(~which.anchors, ~(which.free | which.unseen)))
+        moving = part(segmentation.anchors, segmentation.free)
+        return cls(scene, segmentation, moving, part(~segmentation.anchors, ~(segmentation.free | segmentation.unseen)))
 
-    def together(self, moved: Scene) -> Scene:
+    def merge(self, moved: Scene) -> Scene:
         """The whole scene, its moving part replaced by ``moved``; what stood still keeps its bits.
 
         ``moved`` has the anchors of ``moving``; free Gaussians may have come and gone.
@@ -58,37 +58,39 @@ class Partition:
         free = self.still.free.append(moved.free)
         return replace(
             self.whole,
-            anchors=self.whole.anchors.with_rows(self.which.anchors, moved.anchors),
+            anchors=self.whole.anchors.with_rows(self.segmentation.anchors, moved.anchors),
             free=free.select(free.births.argsort()),  # Births ascend, and are never used twice.
         )
 
 
-def focuses(partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend) -> dict[int, Focus]:
+def focus_views(
+    partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend
+) -> dict[int, Focus]:
     """By index, the views that the moving part shows in, and where."""
-    which, moving, still = (
-        partition.which,
+    segmentation, moving, still = (
+        partition.segmentation,
         partition.moving.with_folded_appearance(),
         partition.still.with_folded_appearance(),
     )
     k = moving.anchors.offsets_per_anchor
-    rows = torch.cat([which.anchors.repeat_interleave(k), which.free])  # of the whole scene's Gaussians
+    rows = torch.cat([segmentation.anchors.repeat_interleave(k), segmentation.free])  # of the whole scene's Gaussians
     with torch.no_grad():
         found = {
-            view.index: _focus(still, moving, which.shown[view.index][rows], view.camera, config, backend)
+            view.index: _focus(still, moving, segmentation.visible[view.index][rows], view.camera, config, backend)
             for view in views
         }
     return {index: focus for index, focus in found.items() if focus is not None}
 
 
 def _focus(
-    still: Scene, moving: Scene, shown: Tensor, camera: Camera, config: MotionConfig, backend: Backend
+    still: Scene, moving: Scene, visible: Tensor, camera: Camera, config: MotionConfig, backend: Backend
 ) -> Focus | None:
     in_motion = moving.gaussians(camera, backend)
     # How far Gaussians reach is as well told by a small picture, which costs a sixteenth.
     small = camera.resized(*(max(1, round(size * REACH_SCALE)) for size in (camera.width, camera.height)))
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
-    tiles = reached_tiles(reach, shown[in_motion.ids], camera, config.margin_pixels)
+    tiles = reached_tiles(reach, visible[in_motion.ids], camera, config.margin_pixels)
     if not tiles.mask.any():
         return None
     if not config.tiles:
@@ -105,13 +107,13 @@ def _focus(
     return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
 
 
-def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
-    """The tiles that drawn Gaussians of the mask ``shown`` reach, or could within ``margin_pixels``.
+def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
+    """The tiles that drawn Gaussians of the mask ``visible`` reach, or could within ``margin_pixels``.
 
     Two standard deviations of a Gaussian count: what lies beyond hardly shows.
     """
     rows, columns = tiles_of(camera.width, camera.height)
-    drawn = shown & (rendering.radii > 0)
+    drawn = visible & (rendering.radii > 0)
     means = rendering.gaussians.means[drawn]
     viewmat, K = camera.viewport(means)[:2]
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]

@@ -44,7 +44,7 @@ class BitPrice:
         rows = len(parameters.values["anchor_positions"])
         return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
 
-    def kept(self, keep: Tensor) -> "BitPrice":
+    def after_pruning(self, keep: Tensor) -> "BitPrice":
         """The price after free Gaussians without the mask ``keep`` have died; what was or is born behind those that had
         one has none."""
         before = {

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from properties import examples
 from rigs import random_scene
 from streams import STEPS
-from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state, rounded_fields
+from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state, quantized_fields
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
@@ -57,7 +57,7 @@ def test_a_value_that_no_bin_stands_for(value: float) -> None:
 
 
 def test_columns_stand_in_the_order_of_the_state_table() -> None:
-    assert rounded_fields("anchor") == ("anchor_positions", "offset_scales", "base_scales", "appearance")
+    assert quantized_fields("anchor") == ("anchor_positions", "offset_scales", "base_scales", "appearance")
     state = state_of(with_appearance(random_scene(2, free=1), 4))
     state["offset_scales"] = torch.tensor([[1.0, 2, 3], [4, 5, 6]]) / 64
     state["appearance"] = torch.arange(1, 9).reshape(2, 4) / 64

@@ -71,7 +71,7 @@ def test_a_reset_lowers_and_never_raises() -> None:
 
 
 def test_rounds_come_when_they_are_due() -> None:
-    assert [i for i in range(1, 1001) if DensifyConfig(start=500, stop=900).due(i)] == [600, 700, 800, 900]
+    assert [i for i in range(1, 1001) if DensifyConfig(start=500, stop=900).is_due(i)] == [600, 700, 800, 900]
     reset = replace(CONFIG, reset_at=2000)
     assert not reset.has_reset(2000)
     assert reset.has_reset(2001)

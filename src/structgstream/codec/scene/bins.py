@@ -77,9 +77,9 @@ class SceneBins:
         )
 
 
-def rounded_fields(granularity: Granularity) -> tuple[FieldName, ...]:
+def quantized_fields(granularity: Granularity) -> tuple[FieldName, ...]:
     """The fields that can change as bins: the anchors' as rows, shared ones as weights, in the order of the table."""
-    return tuple(name for name in fields_of(granularity) if FIELDS[name].rounded)
+    return tuple(name for name in fields_of(granularity) if FIELDS[name].quantized)
 
 
 def quantize_state(
@@ -90,7 +90,7 @@ def quantize_state(
     Raises:
         StreamError: a value is too many steps from zero.
     """
-    names: list[FieldName] = [name for name in rounded_fields("anchor") if name in dynamic]
+    names: list[FieldName] = [name for name in quantized_fields("anchor") if name in dynamic]
     rows = [quantize(state[name], steps[name]) for name in names]
     count = len(state["anchor_positions"])
     anchors = np.concatenate(rows, axis=1) if rows else np.zeros((count, 0), np.int32)
@@ -99,7 +99,7 @@ def quantize_state(
         (name, end - found.shape[1], end) for name, found, end in zip(names, rows, ends, strict=True)
     ]
     weights: dict[FieldName, Bins] = {
-        name: quantize(state[name], steps[name])[:, None] for name in rounded_fields("shared") if name in dynamic
+        name: quantize(state[name], steps[name])[:, None] for name in quantized_fields("shared") if name in dynamic
     }
     free = FreeBins.none()
     if "free" in dynamic:

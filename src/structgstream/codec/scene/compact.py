@@ -14,7 +14,7 @@ from structgstream.codec.arrays import Bins
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import LARGEST, SceneBins, dequantize_state, quantize_state, rounded_fields
+from structgstream.codec.scene.bins import LARGEST, SceneBins, dequantize_state, quantize_state, quantized_fields
 from structgstream.codec.scene.change import Change
 from structgstream.codec.scene.free_rows import coded_free
 from structgstream.codec.scene.rows import coded_change
@@ -23,7 +23,7 @@ from structgstream.scene.state import FieldName, fields_of, parameters_of
 
 FREE_FIELDS: frozenset[FieldName] = frozenset(fields_of("free"))
 """What becomes of free Gaussians is coded as a whole: all of these are dynamic, or none."""
-CODABLE: frozenset[FieldName] = frozenset(rounded_fields("anchor") + rounded_fields("shared")) | FREE_FIELDS
+CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized_fields("shared")) | FREE_FIELDS
 """Fields that may be dynamic."""
 
 

@@ -35,7 +35,7 @@ class DensifyConfig:
     max_gaussians: int = 120_000
     """Of more candidates than there is room for, those with the largest gradients are densified; not in 3DGS."""
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether the set changes after this iteration."""
         return self.start < iteration <= self.stop and iteration % self.interval == 0
 

@@ -234,7 +234,7 @@ class _FromScratch(Hooks[View, ViewLoss]):
         config = self.config.densify
         with self.watch.stage("densify"), torch.no_grad():
             self.statistics.add(loss.rendering, screen_gradient)
-            if config.due(iteration):
+            if config.is_due(iteration):
                 self._densify(prune_large=config.has_reset(iteration))
             if iteration == config.reset_at:
                 logits = reset_opacities(self.adam.values["logit_opacities"])
