@@ -67,6 +67,10 @@ def open_posed(
     for root in (path / name for name in ("images", *REDUCED, "")):
         if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
             poses = _poses(calibration, stills)
+            if poses and (unknown := sorted(stills.keys() - poses.keys(), key=natural)):
+                # Structure from motion often leaves out some photos; videos without a pose are a mistake.
+                log.warning("%s has no pose of %s of %s; left out", calibration.where, listed(unknown), root)
+                stills = {name: stills[name] for name in poses}
             return undistorted(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
