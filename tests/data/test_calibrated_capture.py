@@ -67,6 +67,16 @@ def test_names_that_differ_in_form_are_matched_by_number(tmp_path: Path) -> None
         np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name], atol=1e-6)
 
 
+def test_a_name_may_be_a_word_of_the_files(tmp_path: Path) -> None:
+    """What cameras write, beside serial numbers of a calibration that knows one camera more."""
+    write_anipose(tmp_path, truths(names=("23087", "23088", "26580", "1")))
+    write_videos(tmp_path, ["take 2_Miqus_7_23088", "take 2_Miqus_8_26580", "take 2_Miqus_9_23087"], frames=2)
+    source = open_capture(tmp_path)
+    expected = {camera.name: camera.center for camera in truths(names=("23087", "23088", "26580", "1"))}
+    for name in source.rig:
+        np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name[-5:]], atol=1e-6)
+
+
 @pytest.mark.parametrize("names", [("a1", "a2", "a3"), ("left", "middle", "right"), ("cam0", "cam0b", "cam1")])
 def test_names_that_do_not_belong_together(tmp_path: Path, names: tuple[str, ...]) -> None:
     write_anipose(tmp_path, truths(names=names))
