@@ -12,11 +12,13 @@ import torch
 from calibrations import WRITERS, Floats, Truth, truths, write_anipose, write_cmu, write_easymocap, write_opencv
 from captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
 from structgstream.data.clip import bundled_clip
+from structgstream.data.colmap import PARAMETERS
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import LAYOUTS, open_capture
 from structgstream.data.pose_check import check_poses
 from structgstream.data.undistortion import Undistorted, Undistortion
 from structgstream.errors import CalibrationError, CaptureError
+from structgstream.presets import PAPER_DATA
 
 NAMES = ["cam00", "cam01", "cam02"]
 EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(3)]
@@ -63,6 +65,16 @@ def test_names_that_differ_in_form_are_matched_by_number(tmp_path: Path) -> None
     expected = {camera.name: camera.center for camera in truths(names=("port_2", "port_0", "port_1"))}
     for name in source.rig:
         np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name], atol=1e-6)
+
+
+def test_a_name_may_be_a_word_of_the_files(tmp_path: Path) -> None:
+    """What cameras write, beside serial numbers of a calibration that knows one camera more."""
+    write_anipose(tmp_path, truths(names=("23087", "23088", "26580", "1")))
+    write_videos(tmp_path, ["take 2_Miqus_7_23088", "take 2_Miqus_8_26580", "take 2_Miqus_9_23087"], frames=2)
+    source = open_capture(tmp_path)
+    expected = {camera.name: camera.center for camera in truths(names=("23087", "23088", "26580", "1"))}
+    for name in source.rig:
+        np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name[-5:]], atol=1e-6)
 
 
 @pytest.mark.parametrize("names", [("a1", "a2", "a3"), ("left", "middle", "right"), ("cam0", "cam0b", "cam1")])
@@ -153,8 +165,18 @@ def test_pickles_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_can_be_read_is_listed() -> None:
+    page = (Path(__file__).parents[2] / "docs/captures.md").read_text()
     for name in ("aniposelib", "EasyMocap", "multical", "Kalibr", "CMU Panoptic", "Qualisys", "ZJU-MoCap", "OpenCV"):
         assert name in LAYOUTS
+        assert name in page
+    assert not [model for model in PARAMETERS if model not in page]
+    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    rows = {first: cells for first, *cells in table}
+    assert rows["preset"] == [f"`{name}`" for name in PAPER_DATA]
+    assert rows["held out"] == [f"`{data.held_out_camera}`" for data in PAPER_DATA.values()]
+    for cell, data in zip(rows["size that the paper trains on"], PAPER_DATA.values(), strict=True):
+        assert cell.startswith(f"{data.width} x {data.height}")
+        assert (f"`--scale {data.scale:g}`" in cell) == (data.scale != 1)
 
 
 def through_a_lens(image: Picture, K: Floats, dist: tuple[float, ...]) -> Picture:

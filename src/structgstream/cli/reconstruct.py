@@ -43,7 +43,7 @@ class Reconstruct:
     """
 
     scene: tyro.conf.Positional[Folder]
-    """The capture: a folder of one of the known layouts."""
+    """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
