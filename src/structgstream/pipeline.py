@@ -151,14 +151,14 @@ class StoredStream(Protocol[State_co]):
         ...
 
 
-class Coder(Protocol[State]):
+class FrameCoder(Protocol[State]):
     """Encodes and decodes the frames of one stream, in order; ``SceneEncoder`` is one."""
 
     def encode(self, state: State, /, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[State]:
         """The packet of a frame, and what the decoder makes of it."""
         ...
 
-    def follow(self, packet: Packet) -> State:
+    def replay(self, packet: Packet) -> State:
         """Decode a packet that is there already, and go on after it."""
         ...
 
@@ -183,7 +183,7 @@ class StreamCodec(Protocol[State]):
         """Frame 0 as the frames after it start from it, and the header of the stream."""
         ...
 
-    def coder(self, header: StreamHeader, device: torch.device) -> Coder[State]:
+    def coder(self, header: StreamHeader, device: torch.device) -> FrameCoder[State]:
         """What encodes and decodes the stream of this header; states that it decodes may lie on ``device``."""
         ...
 

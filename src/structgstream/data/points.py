@@ -23,7 +23,7 @@ from structgstream.data.matching import (
     guided_matches,
     inside,
     level_normal,
-    neighbour_views,
+    neighbor_views,
     project,
     sift_features,
     triangulate,
@@ -106,7 +106,7 @@ def initial_points(
     cameras = {name: rig[name] for name in rig.training}
     images = {name: frame.images[name] for name in rig.training}
     distance = viewing_distance(cameras)
-    neighbours = neighbour_views(cameras, count=config.neighbours, distance=distance)
+    neighbours = neighbor_views(cameras, count=config.neighbours, distance=distance)
     workers = max(1, min(len(cameras), os.cpu_count() or 1))
     positions, colors = _sift_points(cameras, images, neighbours, distance=distance, workers=workers, config=config)
     sources = np.zeros(len(positions), np.uint8)

@@ -24,7 +24,7 @@ from structgstream.data.matching import (
     epipolar_errors,
     fundamental_matrix,
     load_cv2,
-    neighbour_views,
+    neighbor_views,
     rays,
     sift_features,
     triangulate,
@@ -147,7 +147,7 @@ def _reread(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -
 
 def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[tuple[str, str]]:
     """Pairs of neighbours, spread over the rig."""
-    pairs = unique_pairs(neighbour_views(cameras, count=2, distance=viewing_distance(cameras)))
+    pairs = unique_pairs(neighbor_views(cameras, count=2, distance=viewing_distance(cameras)))
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), config.pairs)).round().astype(int)
     return [pairs[index] for index in chosen]
 

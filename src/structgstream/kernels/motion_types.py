@@ -25,7 +25,7 @@ class ViewFlows(NamedTuple):
     near: Tensor
 
 
-class Neighbours(NamedTuple):
+class Neighbors(NamedTuple):
     """Whose flow each of ``T`` targets follows.
 
     Args:

@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from structgstream.codec.container.stored import StoredFile
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.errors import CaptureError, StreamError
 from structgstream.player.bundle import bundle
 from structgstream.player.byte_range import UnsatisfiableRange, asked_bytes
@@ -121,7 +121,7 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
     return StreamingResponse(_closing(data, wanted), status, headers, "application/octet-stream")
 
 
-def _closing(data: StoredFile, wanted: range) -> Iterator[bytes | memoryview]:
+def _closing(data: FileBytes, wanted: range) -> Iterator[bytes | memoryview]:
     with data, suppress(StreamError):  # A file that has become shorter meanwhile ends the answer early.
         yield from pieces(data, wanted)
 

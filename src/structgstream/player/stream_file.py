@@ -5,8 +5,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, footer_offset, head_at, why_stopped
-from structgstream.codec.container.stored import Stored, StoredFile
+from structgstream.codec.container.byte_source import ByteSource, FileBytes
+from structgstream.codec.container.records import (
+    PREFIX,
+    RecordType,
+    check_prefix,
+    footer_offset,
+    incomplete_reason,
+    read_head,
+)
 from structgstream.errors import StreamError
 
 PIECE_BYTES = 256 * 1024
@@ -18,13 +25,13 @@ class StreamFile:
 
     path: Path
 
-    def opened(self) -> StoredFile:
+    def opened(self) -> FileBytes:
         """The file as long as it is now.
 
         Raises:
             StreamError: it cannot be read.
         """
-        return StoredFile(self.path)
+        return FileBytes(self.path)
 
     def state(self) -> tuple[int, bool]:
         """Bytes of the file, and whether its end has been written.
@@ -52,10 +59,10 @@ class StreamFile:
             if len(data) < PREFIX.size:
                 return False
             check_prefix(data, str(self.path))
-            return head_at(data, PREFIX.size) is not None
+            return read_head(data, PREFIX.size) is not None
 
 
-def check_has_header(data: Stored, name: str) -> None:
+def check_has_header(data: ByteSource, name: str) -> None:
     """Refuse what a player cannot show anything of.
 
     Raises:
@@ -64,12 +71,12 @@ def check_has_header(data: Stored, name: str) -> None:
     if not len(data):
         raise StreamError(f"{name} is empty; expected a stream made by structgstream reconstruct.")
     check_prefix(data, name)
-    head = head_at(data, PREFIX.size)
+    head = read_head(data, PREFIX.size)
     if head is None or head[0] != RecordType.INIT:
-        raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
+        raise StreamError(f"Nothing of {name} can be shown: {incomplete_reason(data, PREFIX.size)}.")
 
 
-def pieces(data: Stored, wanted: range) -> Iterator[bytes | memoryview]:
+def pieces(data: ByteSource, wanted: range) -> Iterator[bytes | memoryview]:
     """The bytes ``wanted`` of ``data``, a piece at a time."""
     for start in range(wanted.start, wanted.stop, PIECE_BYTES):
         yield data[start : min(start + PIECE_BYTES, wanted.stop)]

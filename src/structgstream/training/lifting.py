@@ -10,7 +10,7 @@ from torch import Tensor
 
 from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.motion_types import Neighbours, ViewFlows
+from structgstream.kernels.motion_types import Neighbors, ViewFlows
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View
 
@@ -85,7 +85,7 @@ def lift_motion(
         torch.stack([viewport.K for viewport in viewports]),
         centers.new_tensor([viewport.near for viewport in viewports]),
     )
-    found = backend.lift(centers, seen, Neighbours(neighbours, affinities), priors, share=config.inlier_share)
+    found = backend.lift(centers, seen, Neighbors(neighbours, affinities), priors, share=config.inlier_share)
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
     return LiftedMotion(displacements, lifted)

@@ -18,7 +18,7 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
-from structgstream.kernels.cuda_tiles import with_enough_room
+from structgstream.kernels.cuda_tiles import run_with_pair_budget
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.births import BirthConfig
@@ -155,7 +155,7 @@ def fit_next_frame(
     if backend.device.type != "cuda":
         return fit_with(backend)
     # The host runs ahead of a GPU as long as no iteration waits for it.
-    return with_enough_room(
+    return run_with_pair_budget(
         lambda budget: fit_with(nonblocking(backend, budget)),
         capacity=max(1 << 18, 8 * slot_count(scene)),
         device=backend.device,

@@ -14,7 +14,7 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
@@ -112,7 +112,7 @@ def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_
 
     Two standard deviations of a Gaussian count: what lies beyond hardly shows.
     """
-    rows, columns = tiles_of(camera.width, camera.height)
+    rows, columns = tile_grid(camera.width, camera.height)
     drawn = visible & (rendering.radii > 0)
     means = rendering.gaussians.means[drawn]
     viewmat, K = camera.viewport(means)[:2]

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.bits import fixed, golomb, packed_bits, signed_golomb, zigzag
+from structgstream.codec.entropy.bits import fixed, golomb, pack_bits, signed_golomb, zigzag
 from structgstream.codec.entropy.table_sets import (
     COUNT_BITS,
     NUMBER_BITS,
@@ -70,7 +70,7 @@ class _Explicit:
         return text + "".join(signed_golomb(step, order=self.order) for step in steps)
 
 
-def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
+def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
     """Tables for symbols that were counted, and the bits that make them of the previous ones.
 
     Args:
@@ -105,7 +105,7 @@ def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
                 context = tried[place]
                 rows[context], cost[context], pieces[context] = entry.rows[place], entry.cost[place], entry.bits(place)
     changes = any(piece != "0" for piece in pieces)
-    return FrequencyTables(rows.astype(np.uint16)), packed_bits(pieces) if changes else b""
+    return FrequencyTables(rows.astype(np.uint16)), pack_bits(pieces) if changes else b""
 
 
 def _explicit(

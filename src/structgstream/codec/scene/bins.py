@@ -42,7 +42,7 @@ class FreeBins:
         """No free Gaussians."""
         return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
 
-    def unmoved(self) -> "FreeBins":
+    def without_change(self) -> "FreeBins":
         """The same, without a last change: what a key frame starts from."""
         return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
 
@@ -67,13 +67,13 @@ class SceneBins:
     weight_changes: Mapping[FieldName, Change]
     free: FreeBins
 
-    def unmoved(self) -> "SceneBins":
+    def without_change(self) -> "SceneBins":
         """The same without a last change."""
         return replace(
             self,
             change=Change.none(*self.anchors.shape),
             weight_changes={name: Change.none(*bins.shape) for name, bins in self.weights.items()},
-            free=self.free.unmoved(),
+            free=self.free.without_change(),
         )
 
 

@@ -44,7 +44,7 @@ class Change:
         """Of the rows of a mask."""
         return Change(self.residuals[rows], self.history[rows], self.sizes[rows])
 
-    def grown(self, rows: int) -> "Change":
+    def extended(self, rows: int) -> "Change":
         """With so many rows more, which did not change."""
         more = Change.none(rows, self.residuals.shape[1])
         return Change(

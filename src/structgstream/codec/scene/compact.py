@@ -16,8 +16,8 @@ from structgstream.codec.entropy.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene.bins import LARGEST, SceneBins, dequantize_state, quantize_state, quantized_fields
 from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.free_rows import coded_free
-from structgstream.codec.scene.rows import coded_change
+from structgstream.codec.scene.free_rows import code_free
+from structgstream.codec.scene.rows import code_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName, fields_of, parameters_of
 
@@ -27,7 +27,7 @@ CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized
 """Fields that may be dynamic."""
 
 
-def coded_scene(
+def code_scene(
     coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, *, has_free: bool, where: str
 ) -> SceneBins:
     """Codes the bins of a frame after those of ``before``.
@@ -36,17 +36,17 @@ def coded_scene(
         StreamError: what is decoded contradicts itself.
     """
     given = None if after is None else Change.of(after.anchors - before.anchors)
-    change = coded_change(coder, given, before.change, groups=before.columns)
+    change = code_change(coder, given, before.change, groups=before.columns)
     anchors = before.anchors + change.residuals
     weights: dict[FieldName, Bins] = {}
     changes: dict[FieldName, Change] = {}
     for name, bins in before.weights.items():
         given = None if after is None else Change.of(after.weights[name] - bins)
-        changes[name] = coded_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
+        changes[name] = code_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
         weights[name] = bins + changes[name].residuals
     free = before.free
     if has_free:
-        free = coded_free(coder, None if after is None else after.free, before.free, where=where)
+        free = code_free(coder, None if after is None else after.free, before.free, where=where)
     for found in (anchors, *weights.values(), free.bins):
         if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
             raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
@@ -98,19 +98,19 @@ class _Compact:
             raise StreamError(f"Packet {index} needs packet {index - 1}, which was not decoded before it.")
         return self.state.bins, Models(self.state.models)
 
-    def _coded(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
+    def _code(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
         has_free = not FREE_FIELDS.isdisjoint(self._header.dynamic)
-        return coded_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
+        return code_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
 
     def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
         # What a key packet changes is everything since the reference, and tells nothing of what comes next.
-        self.state = CompactState(index, bins.unmoved() if kind is PacketKind.KEY else bins, models)
+        self.state = CompactState(index, bins.without_change() if kind is PacketKind.KEY else bins, models)
 
 
 class CompactEncoder(_Compact):
     """Encodes the frames of one stream, in order."""
 
-    def follow(self, state: CompactState | None) -> None:
+    def replay(self, state: CompactState | None) -> None:
         """Go on from what a decoder knows."""
         self.state = state
 
@@ -128,7 +128,7 @@ class CompactEncoder(_Compact):
             if bins.shape != before.weights[name].shape:
                 raise StreamError(f"Frame {index} has {name} of another size than the header.")
         encoder = AdaptiveEncoder(models, where=f"Frame {index}")
-        self._keep(kind, index, self._coded(encoder, after, before, index), models)
+        self._keep(kind, index, self._code(encoder, after, before, index), models)
         fields = encoder.fields()
         return {name: fields.get(name, b"") for name in self._header.dynamic}
 
@@ -146,7 +146,7 @@ class CompactDecoder(_Compact):
         """
         before, models = self._start(kind, index)
         decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
-        bins = self._coded(decoder, None, before, index)
+        bins = self._code(decoder, None, before, index)
         decoder.end()
         self._keep(kind, index, bins, models)
         return dequantize_state(bins, self._header.dynamic, self._header.steps)

@@ -18,7 +18,7 @@ from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, LearningRate, constant, leaves
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.result import FitResult, StepListener
-from structgstream.training.seeding import neighbour_distances, voxel_centers
+from structgstream.training.seeding import neighbor_distances, voxel_centers
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
@@ -112,7 +112,7 @@ def initial_gaussians(points: Tensor, views: list[View], config: GaussiansConfig
             f"Only {count} initial points remain at a voxel size of {config.voxel_size:g}; at least 4 are needed. "
             "Check the poses, or give a capture with more overlap between cameras."
         )
-    log_scales = neighbour_distances(points).log()[:, None].expand(count, 3).contiguous()
+    log_scales = neighbor_distances(points).log()[:, None].expand(count, 3).contiguous()
     means = points.to(device)
     quats = means.new_zeros(count, 4)
     quats[:, 0] = 1.0

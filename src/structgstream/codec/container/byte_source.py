@@ -10,15 +10,15 @@ from typing import Protocol
 from structgstream.errors import StreamError
 
 
-class Stored(Protocol):
-    """What ``bytes``, ``memoryview``, :class:`StoredFile` and :class:`Part` have in common: a length, and slices."""
+class ByteSource(Protocol):
+    """What ``bytes``, ``memoryview``, :class:`FileBytes` and :class:`ByteSlice` share: a length, and slices."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, key: slice, /) -> bytes | memoryview: ...
 
 
-class StoredFile:
+class FileBytes:
     """A file, read piece by piece; only the piece asked for is ever in memory.
 
     The length is that at opening: what a running reconstruction appends later is not seen. Several threads may read.
@@ -65,7 +65,7 @@ class StoredFile:
             count -= len(piece)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
-    def __enter__(self) -> "StoredFile":
+    def __enter__(self) -> "FileBytes":
         return self
 
     def __exit__(self, *raised: object) -> None:
@@ -76,10 +76,10 @@ class StoredFile:
         self._finalizer()
 
 
-class Part:
+class ByteSlice:
     """The bytes from ``start`` to ``end`` of others, without a copy."""
 
-    def __init__(self, data: Stored, start: int, end: int) -> None:
+    def __init__(self, data: ByteSource, start: int, end: int) -> None:
         self._data = data
         self._start = start
         self._size = max(min(end, len(data)) - start, 0)
