@@ -14,7 +14,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Read once, when torch loads OpenMP.
 
 from structgstream.codec.reader import open_stream
-from structgstream.data.wrappers import of_cameras
+from structgstream.data.wrappers import select_cameras
 from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import Picture, rendered
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
@@ -52,7 +52,7 @@ def main() -> None:
     scene = on_device(reader.scene(options.frame), backend.device)
     rig = reader.header.rig
     views = {name: reader.header.camera(name) for name in rig}
-    frames = of_cameras(capture_of(reader.header, options.capture, frames=None), tuple(rig)).frames()
+    frames = select_cameras(capture_of(reader.header, options.capture, frames=None), tuple(rig)).frames()
     truths = next(frame for number, frame in enumerate(frames) if number == options.frame).images
     own = {name: rendered(scene, views[name], backend)[0] for name in rig}
     sides = {"training": rig.training, "held out": rig.testing}

@@ -110,7 +110,7 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
     return config
 
 
-def decayed(rates: InitialRates, share: float) -> InitialRates:
+def with_decay(rates: InitialRates, share: float) -> InitialRates:
     """The same first rates, every one of them falling to ``share`` of itself over the schedule."""
     return InitialRates(
         **{name: LearningRate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
@@ -183,7 +183,7 @@ RIG = StreamConfig(
         schedule_iterations=4000,
         camera_color=True,
         coarse_iterations=2500,
-        rates=decayed(InitialRates(), 0.05),
+        rates=with_decay(InitialRates(), 0.05),
         growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=120_000),
         losses=LossWeights(offset_distance=0.005),
     ),

@@ -18,7 +18,7 @@ from structgstream.pipeline import Memory, Pipeline, State
 from structgstream.session import Session
 from structgstream.training.result import StepListener
 
-Remarks = Callable[[FrameReport], Mapping[str, Any]]
+LogExtras = Callable[[FrameReport], Mapping[str, Any]]
 """What a frame's line of the log holds beside its report."""
 
 
@@ -45,7 +45,7 @@ def record(
     resume: bool = False,
     metadata: Mapping[str, object] | None = None,
     on_step: StepListener | None = None,
-    remarks: Remarks | None = None,
+    remarks: LogExtras | None = None,
 ) -> Run:
     """Reconstructs a capture into a file, with a log beside it.
 
@@ -59,7 +59,7 @@ def record(
         resume: go on after the last whole frame of what is there.
         metadata: plain JSON values for the header, the same in every run that is to be resumed.
         on_step: called after every optimisation step.
-        remarks: see :data:`Remarks`.
+        remarks: see :data:`LogExtras`.
 
     Raises:
         ConfigError: what is to be resumed was made with another configuration or from another capture.
@@ -69,11 +69,11 @@ def record(
     sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
     session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
-    return Run(done, logged(session.run(), path, done=done, remarks=remarks))
+    return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
 
 
-def logged(
-    reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: Remarks | None = None
+def log_reports(
+    reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
     """The reports of a session, each noted in the log beside ``path`` before it is passed on.
 
@@ -81,17 +81,17 @@ def logged(
         reports: closed with the result.
         path: the file that the session writes.
         done: how many frames it holds already, whose lines of the log stay.
-        remarks: see :data:`Remarks`.
+        remarks: see :data:`LogExtras`.
 
     Raises:
         StorageError: the log cannot be written.
     """
     begin_log(path, frames=done)
-    return _noted(reports, path, remarks)
+    return _append_reports(reports, path, remarks)
 
 
-def _noted(
-    reports: Generator[FrameReport, None, None], path: Path, remarks: Remarks | None
+def _append_reports(
+    reports: Generator[FrameReport, None, None], path: Path, remarks: LogExtras | None
 ) -> Generator[FrameReport, None, None]:
     with closing(reports):
         for report in reports:

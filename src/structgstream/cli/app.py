@@ -41,7 +41,7 @@ class Interrupted(Exception):
 
 
 @contextmanager
-def usage_checked() -> Iterator[None]:
+def usage_errors() -> Iterator[None]:
     """What the options ask for is checked here: a value that cannot work is wrong usage.
 
     Raises:

@@ -100,7 +100,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
         return check
     # Under wrong poses the chosen pairs are no neighbours and hardly match: ask for the neighbours of each
     # mistake that is often made, too.
-    readings = {name: _reread(given, change) for name, change in _MISTAKES.items()}
+    readings = {name: _reinterpret(given, change) for name, change in _MISTAKES.items()}
     pairs = dict.fromkeys(pair for cameras in (given, *readings.values()) for pair in _pairs(cameras, config))
     matches = matcher.matches(list(pairs))
     check = _judge(given, matches, config)
@@ -141,7 +141,7 @@ _MISTAKES: Mapping[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def _reread(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -> dict[str, Camera]:
+def _reinterpret(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -> dict[str, Camera]:
     return {name: replace(camera, viewmat=change(camera.viewmat)) for name, camera in cameras.items()}
 
 

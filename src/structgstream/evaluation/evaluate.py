@@ -15,7 +15,7 @@ from structgstream.cameras import Camera
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import PacketInfo
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import of_cameras
+from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.affine import ChannelFit, channel_fit, psnr_affine, psnr_camera_color
 from structgstream.evaluation.environment import environment
@@ -35,8 +35,8 @@ from structgstream.evaluation.optional_metrics import (
     load_optional_metrics,
     optional_scores,
 )
-from structgstream.evaluation.recording import Drawable, Recording, placed
-from structgstream.evaluation.report import FrameScores, Report, Scores, course, drawing_facts, mean_scores
+from structgstream.evaluation.recording import Drawable, Recording, to_device
+from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
 from structgstream.frame_report import counts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
@@ -108,7 +108,7 @@ def evaluate(
     frames = []
     peaks = PeakMeter(backend.device)
     for frame, (info, scene, decode_seconds) in zip(
-        of_cameras(source, names).frames(), decoded(recording, backend.device)
+        select_cameras(source, names).frames(), decoded(recording, backend.device)
     ):
         compared = []
         for name in names:
@@ -134,7 +134,7 @@ def evaluate(
         frames.append(_frame_scores(info, scene, compared, decode_seconds, dict((log or {}).get(info.index, {}))))
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in names}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
-    facts = stream_facts(recording, names) | course([frame.mean.psnr for frame in frames])
+    facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames])
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
     facts |= {"camera_colors": {name: vars(fit) for name, fit in colors.items()}}
     facts |= {"metrics": metrics, "not_available": dict(optional_metrics.not_available) if optional_metrics else {}}
@@ -148,7 +148,7 @@ def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[Packet
     """Every frame on ``device``, with the seconds that it took from the file to there."""
     began = time.perf_counter()
     for info, drawable in recording.scenes(0):
-        drawable = placed(drawable, device)
+        drawable = to_device(drawable, device)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         yield info, drawable, time.perf_counter() - began
@@ -217,8 +217,8 @@ def compared_frames(
     """
     check_same_rig(recording.header, source, (camera,))
     view = recording.header.camera(camera)
-    for frame, (_, scene) in zip(of_cameras(source, (camera,)).frames(), recording.scenes(0)):
-        yield frame.images[camera], rendered(placed(scene, backend.device), view, backend)[0]
+    for frame, (_, scene) in zip(select_cameras(source, (camera,)).frames(), recording.scenes(0)):
+        yield frame.images[camera], rendered(to_device(scene, backend.device), view, backend)[0]
 
 
 def _frame_scores(

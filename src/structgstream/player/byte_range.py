@@ -10,7 +10,7 @@ class UnsatisfiableRange(Exception):
     """The range begins behind the last byte."""
 
 
-def asked_bytes(header: str | None, size_bytes: int) -> range | None:
+def requested_range(header: str | None, size_bytes: int) -> range | None:
     """Which bytes of ``size_bytes`` a ``Range`` header asks for.
 
     Several ranges at once, other units and what is not written as the RFC says count as no range: a server may always

@@ -22,7 +22,7 @@ from starlette.routing import Route
 from structgstream.codec.container.byte_source import FileBytes
 from structgstream.errors import CaptureError, StreamError
 from structgstream.player.bundle import bundle
-from structgstream.player.byte_range import UnsatisfiableRange, asked_bytes
+from structgstream.player.byte_range import UnsatisfiableRange, requested_range
 from structgstream.player.page import SERVED_POLICY, linked_page, policy
 from structgstream.player.stream_file import StreamFile, pieces
 from structgstream.player.truth import Truth
@@ -106,7 +106,7 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
     # If-Range asks for a range of a version that is known by a validator, and none was ever given.
     header = None if "if-range" in request.headers else request.headers.get("range")
     try:
-        asked = asked_bytes(header, size)
+        asked = requested_range(header, size)
     except UnsatisfiableRange:
         data.close()
         return Response(status_code=416, headers={**headers, "Content-Range": f"bytes */{size}"})

@@ -142,9 +142,9 @@ def grow(
     for level in range(config.levels):
         if level > 0 and not added:
             break
-        thinned = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
+        every_nth_frame = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
         threshold = config.grad_threshold * 2**level
-        chosen = (eligible & (mean_gradient >= threshold) & thinned).nonzero()[:, 0]
+        chosen = (eligible & (mean_gradient >= threshold) & every_nth_frame).nonzero()[:, 0]
         if chosen.numel() == 0:
             continue
         cell = voxel_size * 16 / 4**level

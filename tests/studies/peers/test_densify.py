@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from structgstream_studies.peers.densify import DensifyConfig, candidates, densified, reset_opacities
+from structgstream_studies.peers.densify import DensifyConfig, candidates, densify, reset_opacities
 from structgstream_studies.peers.plain import PlainGaussians
 
 CONFIG = DensifyConfig()
@@ -29,7 +29,7 @@ def rows(scales: list[float], opacities: list[float]) -> PlainGaussians:
 
 def run(gaussians: PlainGaussians, gradient: list[float], *, prune_large: bool = False, config: DensifyConfig = CONFIG):
     generator = torch.Generator().manual_seed(0)
-    return densified(
+    return densify(
         gaussians, torch.tensor(gradient), config=config, extent=1.0, prune_large=prune_large, generator=generator
     )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from structgstream.presets import to_json
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import write_result
-from structgstream_studies.experiments.tasks import is_result_of, scored
+from structgstream_studies.experiments.tasks import is_result_of, score_recording
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
@@ -72,7 +72,8 @@ class PeerRun:
         """Reconstructs what is missing of the file, then scores it."""
         self._reconstruct(backend)
         write_result(
-            self.result, scored(self.recording(), self.stream, self.capture, backend, run_identity=self._identity())
+            self.result,
+            score_recording(self.recording(), self.stream, self.capture, backend, run_identity=self._identity()),
         )
 
     def _reconstruct(self, backend: "Backend") -> None:

@@ -15,7 +15,7 @@ from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.online import OnlineConfig
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.captures import CapturePart, capture_facts
-from structgstream_studies.experiments.results import Result, read_result, result_of, rounded, write_result
+from structgstream_studies.experiments.results import Result, read_result, result_of, round_floats, write_result
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FirstFrame:
+class FirstFrameRun:
     """Fits frame 0 once for all the variants that begin with it."""
 
     capture: CapturePart
@@ -101,7 +101,7 @@ class FirstFrame:
 
 
 @dataclass(frozen=True)
-class Variation:
+class VariantRun:
     """Reconstructs and scores one variant of the method with one seed."""
 
     key: str
@@ -121,9 +121,9 @@ class Variation:
         return self.config.seed
 
     @property
-    def first(self) -> FirstFrame:
+    def first(self) -> FirstFrameRun:
         """Its frame 0, which other variants may share."""
-        return FirstFrame(self.capture, self.config, self.folder)
+        return FirstFrameRun(self.capture, self.config, self.folder)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -156,7 +156,8 @@ class Variation:
         """Reconstructs what is missing of the stream, then scores the file."""
         _reconstruct(self.capture, self.config, self.stream, backend, first=self.first)
         write_result(
-            self.result, scored(self.recording(), self.stream, self.capture, backend, run_identity=self._identity())
+            self.result,
+            score_recording(self.recording(), self.stream, self.capture, backend, run_identity=self._identity()),
         )
 
     def recording(self) -> "Recording":
@@ -174,13 +175,13 @@ def is_result_of(result: Path, run_identity: Mapping[str, Any], capture: Capture
     identity = dict(found.identity)
     of = identity.pop("capture")
     part = (of["start"], of["scale"], of["every"], of.get("near"), of["frames"])
-    same_part = part == (capture.start, rounded(capture.scale), capture.every, rounded(capture.near), frames)
+    same_part = part == (capture.start, round_floats(capture.scale), capture.every, round_floats(capture.near), frames)
     same_split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
     same_cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
-    return identity == rounded(run_identity) and same_part and same_split and same_cameras
+    return identity == round_floats(run_identity) and same_part and same_split and same_cameras
 
 
-def scored(
+def score_recording(
     recording: "Recording", stream: Path, capture: CapturePart, backend: "Backend", *, run_identity: Mapping[str, Any]
 ) -> Result:
     """The scores of a finished file, with what was asked and who trained it."""
@@ -194,7 +195,7 @@ def scored(
 
 
 def _reconstruct(
-    capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrame | None
+    capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrameRun | None
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
     from structgstream.evaluation.environment import environment

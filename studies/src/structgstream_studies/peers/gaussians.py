@@ -23,7 +23,7 @@ from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
-from structgstream_studies.peers.densify import DensifyConfig, densified, reset_opacities
+from structgstream_studies.peers.densify import DensifyConfig, densify, reset_opacities
 from structgstream_studies.peers.plain import Y0, PlainGaussians
 
 CAMERA = parameters_of(fields_of("camera"))
@@ -178,7 +178,7 @@ def fit_gaussians(
         )
     adam = Adam(backend, leaves(start.tensors() | camera))
     statistics, last_pass = GradientStatistics(len(start), backend.device), LastPass(config.iterations - len(views))
-    hooks = _FromScratch(config, adam, identity, statistics, extent, generator, watch, last_pass)
+    hooks = _FromScratchHooks(config, adam, identity, statistics, extent, generator, watch, last_pass)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
     iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     gaussians, color = hooks.parts()
@@ -194,7 +194,7 @@ def fit_gaussians(
 
 
 @dataclass
-class _FromScratch(Hooks[View, ViewLoss]):
+class _FromScratchHooks(Hooks[View, ViewLoss]):
     """What 3DGS does in an iteration; ``identity`` is the colour correction where none is learned."""
 
     config: GaussiansConfig
@@ -241,7 +241,7 @@ class _FromScratch(Hooks[View, ViewLoss]):
                 self.adam.replace_values("logit_opacities", logits)
 
     def _densify(self, *, prune_large: bool) -> None:
-        change = densified(
+        change = densify(
             self.parts()[0],
             self.statistics.mean(),
             config=self.config.densify,

@@ -53,7 +53,7 @@ class PeerMethod(Method[State, Memory], Protocol[State, Memory]):
         ...
 
 
-class LooksAtPicturesOnly:
+class PicturesOnly:
     """What peers share: of the pictures they want no more than the training views, and of the past one frame."""
 
     needs_before = False
@@ -66,7 +66,7 @@ class LooksAtPicturesOnly:
         return FramePictures(training_views(frame, rig, backend.device), None)
 
 
-class EveryFrameAlone(LooksAtPicturesOnly, ABC, Generic[State]):
+class IndependentFrames(PicturesOnly, ABC, Generic[State]):
     """A method that fits every frame as the first and remembers nothing."""
 
     stands_alone = True
