@@ -70,7 +70,7 @@ def test_exhausted_memory_is_one_sentence(command, error: MemoryError, capsys: p
     text = capsys.readouterr().err
     assert text.startswith("structgstream: ")
     assert text.count("\n") == 1
-    assert "emory does not suffice" in text
+    assert "ot enough memory" in text
     assert "--scale" in text
 
 

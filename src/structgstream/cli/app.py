@@ -92,9 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         said = f" ({error})" if str(error) else ""
-        _say(
-            f"structgstream: memory does not suffice{said}; end other programs, or take smaller pictures (--scale 0.5)."
-        )
+        _say(f"structgstream: not enough memory{said}; close other programs, or use smaller pictures (--scale 0.5).")
         return PROBLEM
     except Exception as error:
         if debug:
