@@ -57,7 +57,7 @@ def test_a_broken_file(tmp_path: Path) -> None:
     entries = json.loads((tmp_path / "models.json").read_text())
     del entries[1]["focal_length"]
     (tmp_path / "models.json").write_text(json.dumps(entries))
-    with pytest.raises(CalibrationError, match=r"models\.json cannot be read \(KeyError: 'focal_length'\); expected"):
+    with pytest.raises(CalibrationError, match=r"'camera_0002' of .*models\.json .*no 'focal_length'.*; expected"):
         open_immersive(tmp_path)
 
 

@@ -18,15 +18,19 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
+from structgstream.data.calibration_files.reading import each_camera, readable
 from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid, rotation_matrix
 from structgstream.data.posed_capture import open_posed
 from structgstream.data.source import FrameSource
-from structgstream.errors import CalibrationError
 
 MODELS = "models.json"
 HELD_OUT = "camera_0001"
 FOCAL_SHARE = 0.5
+EXPECTED = (
+    "a list of cameras with name, width, height, focal_length, principal_point, radial_distortion, orientation "
+    "and position"
+)
 
 
 def recognises_immersive(path: Path) -> bool:
@@ -55,22 +59,17 @@ def read_models(file: Path) -> Calibration:
     Raises:
         CalibrationError: the file cannot be read.
     """
-    try:
-        cameras = tuple(_camera(entry) for entry in json.loads(file.read_text()))
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise CalibrationError(
-            f"{file} cannot be read ({type(error).__name__}: {error}); expected a list of cameras with name, width, "
-            "height, focal_length, principal_point, radial_distortion, orientation and position."
-        ) from None
-    return Calibration(file, cameras, held_out=(HELD_OUT,))
+    with readable(file, EXPECTED):
+        entries = [(str(entry["name"]), entry) for entry in json.loads(file.read_text())]
+    return Calibration(file, each_camera(entries, _camera, file=file, expected=EXPECTED), held_out=(HELD_OUT,))
 
 
-def _camera(entry: dict[str, Any]) -> PosedCamera:
+def _camera(name: str, entry: dict[str, Any]) -> PosedCamera:
     focal, (cx, cy) = float(entry["focal_length"]), entry["principal_point"]
     rotation = rotation_matrix(np.array(entry["orientation"], dtype=np.float64).reshape(3))
     viewmat = rigid(rotation, -rotation @ np.array(entry["position"], dtype=np.float64))
     return PosedCamera(
-        name=str(entry["name"]),
+        name=name,
         viewmat=viewmat,
         K=from_integer_centers(intrinsics(focal, focal * float(entry.get("pixel_aspect_ratio", 1)), cx, cy)),
         size=(round(entry["width"]), round(entry["height"])),

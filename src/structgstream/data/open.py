@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+from structgstream.data.calibrated_capture import open_calibrated, recognises_calibrated
 from structgstream.data.calibration import with_near
 from structgstream.data.colmap_capture import open_colmap, recognises_colmap
 from structgstream.data.immersive import open_immersive, recognises_immersive
@@ -10,6 +11,7 @@ from structgstream.data.json_videos import open_json_videos, recognises_json_vid
 from structgstream.data.n3dv import open_n3dv, recognises_n3dv
 from structgstream.data.panoptic import open_panoptic, recognises_panoptic
 from structgstream.data.source import FrameSource
+from structgstream.data.transforms_capture import open_transforms, recognises_transforms
 from structgstream.data.wrappers import WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError
 
@@ -19,7 +21,10 @@ LAYOUTS = """Supported layouts:
   Neural 3D Video  poses_bounds.npy, camXX.mp4 (Meet Room: cam_X.mp4), with or without a COLMAP model
   Immersive        models.json, camera_XXXX.mp4, of fisheye lenses
   COLMAP           sparse/0/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
-                   frames/FRAME/CAMERA.ext, CAMERA.mp4, or images/CAMERA.ext for one frame"""
+                   frames/FRAME/CAMERA.ext, CAMERA.mp4, or images/CAMERA.ext for one frame
+  transforms.json  of Blender, instant-ngp, nerfstudio, with pictures as COLMAP or with a time each
+  other tools      calibration of aniposelib, EasyMocap, multical, Kalibr, CMU Panoptic, Qualisys, ZJU-MoCap or
+                   OpenCV, with pictures or videos as COLMAP"""
 
 FORMATS = (
     (recognises_panoptic, open_panoptic),
@@ -27,6 +32,8 @@ FORMATS = (
     (recognises_n3dv, open_n3dv),
     (recognises_immersive, open_immersive),
     (recognises_colmap, open_colmap),
+    (recognises_transforms, open_transforms),
+    (recognises_calibrated, open_calibrated),
 )
 
 

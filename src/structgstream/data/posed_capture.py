@@ -29,7 +29,7 @@ from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import rectilinear, undistorted
-from structgstream.data.video import VIDEO_SUFFIXES, scan_videos, synchronised
+from structgstream.data.video import VIDEO_SUFFIXES, VideoSource, scan_videos, synchronised
 from structgstream.errors import CalibrationError, CaptureError
 
 log = logging.getLogger(__name__)
@@ -63,11 +63,11 @@ def open_posed(
             return undistorted(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := _folders(root):
             files, poses = _layout(folders, calibration, root)
-            return undistorted(*_of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
+            return undistorted(*of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
     for root in (path / name for name in ("images", *REDUCED, "")):
         if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
             poses = _poses(calibration, stills)
-            return undistorted(*_of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
+            return undistorted(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."
@@ -76,7 +76,7 @@ def open_posed(
 
 def _of_videos(
     path: Path, videos: Mapping[str, Path], *, root: Path, calibration: Calibration
-) -> tuple[FrameSource, Mapping[str, LensCamera]]:
+) -> tuple[VideoSource, Mapping[str, LensCamera]]:
     """The videos as they are, and their cameras with lenses."""
     poses = _poses(calibration, videos)
     _check(poses, videos, calibration=calibration, root=root)
@@ -86,10 +86,15 @@ def _of_videos(
     return synchronised(tracks, rig, where=path, points=calibration.points), filmed
 
 
-def _of_pictures(
+def of_pictures(
     path: Path, files: Pictures, poses: Mapping[str, PosedCamera], *, root: Path, calibration: Calibration
-) -> tuple[FrameSource, Mapping[str, LensCamera]]:
-    """The pictures as they are, and their cameras with lenses."""
+) -> tuple[ImageSource, Mapping[str, LensCamera]]:
+    """The pictures of the cameras of ``poses`` as they are, and these cameras with lenses.
+
+    Raises:
+        CaptureError: a picture is missing or cannot be read.
+        CalibrationError: ``files`` are of other cameras, or have other proportions.
+    """
     _check(poses, files, calibration=calibration, root=root)
     common = common_pictures({name: files[name] for name in sorted(poses, key=natural)}, where=path)
     filmed = _filmed(poses, {name: picture_size(pictures[0]) for name, pictures in common.items()}, calibration)

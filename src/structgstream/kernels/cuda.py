@@ -43,26 +43,10 @@ def rasterize(
     on every back-end. ``trained`` saves no work here: the other gradients are computed and dropped. With a ``budget``
     there is no host synchronisation (``kernels.cuda_tiles``, Note [Pairs without waiting]).
     """
-    from gsplat.cuda._wrapper import (  # pyright: ignore[reportMissingImports]
-        fully_fused_projection,
-        rasterize_to_pixels,
-    )
+    from gsplat.cuda._wrapper import rasterize_to_pixels  # pyright: ignore[reportMissingImports]
 
     gaussians, screen_offsets = trained_alone(gaussians, screen_offsets, trained)
-    radii, means2d, depths, conics, _ = fully_fused_projection(
-        gaussians.means,
-        None,
-        gaussians.quats,
-        gaussians.scales,
-        viewport.viewmat[None],
-        viewport.K[None],
-        viewport.width,
-        viewport.height,
-        eps2d=0.3,
-        near_plane=viewport.near,
-        packed=False,
-        opacities=gaussians.opacities,
-    )  # [1, N, 2], [1, N, 2], [1, N], [1, N, 3]
+    radii, means2d, depths, conics = _projected(gaussians, viewport)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[None]
     starts, ids, masks = _pair_lists(means2d, radii, depths, viewport, tiles, budget)
@@ -85,6 +69,27 @@ def rasterize(
         center = means2d[0].detach()
         drawn = torch.where(reaching(center - radii[0], center + radii[0], tiles), drawn, 0.0)
     return in_tiles(image[0], alpha[0, :, :, 0], drawn, tiles, onto)
+
+
+def _projected(gaussians: Gaussians, viewport: Viewport) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Radii ``[1, N, 2]`` int32, means ``[1, N, 2]``, depths ``[1, N]`` and conics ``[1, N, 3]`` on the picture."""
+    from gsplat.cuda._wrapper import fully_fused_projection  # pyright: ignore[reportMissingImports]
+
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        gaussians.means,
+        None,
+        gaussians.quats,
+        gaussians.scales,
+        viewport.viewmat[None],
+        viewport.K[None],
+        viewport.width,
+        viewport.height,
+        eps2d=0.3,
+        near_plane=viewport.near,
+        packed=False,
+        opacities=gaussians.opacities,
+    )
+    return radii, means2d, depths, conics
 
 
 def _pair_lists(

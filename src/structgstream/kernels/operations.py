@@ -31,7 +31,19 @@ from structgstream.kernels.raster_types import RasterOutput, TileSelection
 
 
 class Rasterize(Protocol):
-    """Rasterisation of Gaussians."""
+    """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
+
+    Args:
+        gaussians: to draw; their ids are not read.
+        viewport: the camera.
+        background: ``[3]``, black when None.
+        screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
+            gradient.
+        tiles: the tiles to draw, all when None. A Gaussian that reaches none of them has radius 0.
+        onto: ``[H, W, 3]`` without gradient, contiguous, only with ``tiles``: the picture that is drawn into in
+            place (Note [Ownership]), so that the other tiles keep its pixels; they are zero when None.
+        trained: only the first ``trained`` Gaussians get gradients; all when None.
+    """
 
     def __call__(
         self,
@@ -43,39 +55,33 @@ class Rasterize(Protocol):
         tiles: TileSelection | None = None,
         onto: Tensor | None = None,
         trained: int | None = None,
-    ) -> RasterOutput:
-        """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
-
-        Args:
-            gaussians: to draw; their ids are not read.
-            viewport: the camera.
-            background: ``[3]``, black when None.
-            screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
-                gradient.
-            tiles: the tiles to draw, all when None. A Gaussian that reaches none of them has radius 0.
-            onto: ``[H, W, 3]`` without gradient, contiguous, only with ``tiles``: the picture that is drawn into in
-                place (Note [Ownership]), so that the other tiles keep its pixels; they are zero when None.
-            trained: only the first ``trained`` Gaussians get gradients; all when None.
-        """
-        ...
+    ) -> RasterOutput: ...
 
 
 class BlendingWeights(Protocol):
-    """Sums of maps weighted by the Gaussians' blending weights."""
+    """Sums ``[N, C]`` over the pixels of each Gaussian's blending weight times each map, without graph.
 
-    def __call__(self, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
-        """Sums ``[N, C]`` over the pixels of each Gaussian's blending weight times each map, without graph.
+    Args:
+        gaussians: to draw; their colours and ids are not read.
+        viewport: the camera.
+        maps: ``[H, W, C]`` of the viewport's size, C at least 1.
+    """
 
-        Args:
-            gaussians: to draw; their colours and ids are not read.
-            viewport: the camera.
-            maps: ``[H, W, C]`` of the viewport's size, C at least 1.
-        """
-        ...
+    def __call__(self, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor: ...
 
 
 class L1SSIM(Protocol):
-    """The image loss: L1 and SSIM."""
+    """Mean absolute difference and mean SSIM of ``gains * image + biases`` against ``target``.
+
+    Args:
+        image: ``[H, W, 3]``; the only argument with a gradient.
+        target: ``[H, W, 3]``, float in [0, 1] or uint8.
+        gains: ``[3]``; one when None.
+        biases: ``[3]``; given with ``gains``.
+        tiles: if given, pixels of the other tiles count as equal (difference 0, SSIM 1); those up to ten pixels
+            from the selected tiles are still read. The gradient is that of the whole picture in the selected
+            tiles, and zero in the others.
+    """
 
     def __call__(
         self,
@@ -85,83 +91,78 @@ class L1SSIM(Protocol):
         gains: Tensor | None = None,
         biases: Tensor | None = None,
         tiles: TileSelection | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Mean absolute difference and mean SSIM of ``gains * image + biases`` against ``target``.
-
-        Args:
-            image: ``[H, W, 3]``; the only argument with a gradient.
-            target: ``[H, W, 3]``, float in [0, 1] or uint8.
-            gains: ``[3]``; one when None.
-            biases: ``[3]``; given with ``gains``.
-            tiles: if given, pixels of the other tiles count as equal (difference 0, SSIM 1); those up to ten pixels
-                from the selected tiles are still read. The gradient is that of the whole picture in the selected
-                tiles, and zero in the others.
-        """
-        ...
+    ) -> tuple[Tensor, Tensor]: ...
 
 
 class Volume(Protocol):
-    """The volume loss (the paper's L_vol), before division."""
+    """Sum of the products of the three scales ``[N, 3]``, and the number of opacities ``[N]`` above zero.
 
-    def __call__(self, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-        """Sum of the products of the three scales ``[N, 3]``, and the number of opacities ``[N]`` above zero.
+    Gradients flow to ``scales``.
+    """
 
-        Gradients flow to ``scales``.
-        """
-        ...
+    def __call__(self, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
 class Excess(Protocol):
-    """The loss on offsets beyond a limit."""
+    """Sum ``[]`` of max(|offsets ``[M, K, 3]`` x exp(log_scales ``[M, 3]``)| - ``limit``, 0)."""
 
-    def __call__(self, offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor:
-        """Sum ``[]`` of max(|offsets ``[M, K, 3]`` x exp(log_scales ``[M, 3]``)| - ``limit``, 0)."""
-        ...
+    def __call__(self, offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor: ...
 
 
 class ChangedPixels(Protocol):
-    """Change detection between two pictures."""
+    """Dilated mask ``[H, W]`` of the pixels that changed between two pictures ``[H, W, 3]`` uint8.
 
-    def __call__(self, before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor:
-        """Dilated mask ``[H, W]`` of the pixels that changed between two pictures ``[H, W, 3]`` uint8.
+    A pixel has changed when the mean absolute difference over its 3 x 3 neighbourhood (inside the picture) and the
+    channels exceeds ``threshold``. Sums are of integers, so every back-end gives the same mask.
 
-        A pixel has changed when the mean absolute difference over its 3 x 3 neighbourhood (inside the picture) and the
-        channels exceeds ``threshold``. Sums are of integers, so every back-end gives the same mask.
+    Args:
+        before: the camera's earlier picture.
+        now: its later picture.
+        threshold: in 0 ... 1, above the sensor's noise.
+        reach_pixels: half width of the square by which the mask is dilated, pixels.
+    """
 
-        Args:
-            before: the camera's earlier picture.
-            now: its later picture.
-            threshold: in 0 ... 1, above the sensor's noise.
-            reach_pixels: half width of the square by which the mask is dilated, pixels.
-        """
-        ...
+    def __call__(self, before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor: ...
 
 
 class Lift(Protocol):
-    """Fit of 3D displacements to optical flow."""
+    """For each of ``T`` targets the 3D displacement d that fits its neighbours' optical flow in all views.
+
+    Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views by iteratively reweighted least
+    squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / s^2)^2`` of decreasing
+    scale s (``reference_lift.ROBUST_PIXELS``). ``reg`` is ``0.02 sum + 0.05`` times the mean square of J, with the
+    sum of the present weights.
+
+    Args:
+        centers: ``[E, 3]`` of movers.
+        seen: W and f of the movers in each view.
+        neighbours: of each target, and g.
+        priors: ``[T, 3]`` displacements.
+        share: as in :class:`Lifted`.
+    """
 
     def __call__(
         self, centers: Tensor, seen: ViewFlows, neighbours: Neighbours, priors: Tensor, *, share: float
-    ) -> Lifted:
-        """For each of ``T`` targets the 3D displacement d that fits its neighbours' optical flow in all views.
-
-        Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views by iteratively reweighted least
-        squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / s^2)^2`` of decreasing
-        scale s (``reference_lift.ROBUST_PIXELS``). ``reg`` is ``0.02 sum + 0.05`` times the mean square of J, with the
-        sum of the present weights.
-
-        Args:
-            centers: ``[E, 3]`` of movers.
-            seen: W and f of the movers in each view.
-            neighbours: of each target, and g.
-            priors: ``[T, 3]`` displacements.
-            share: as in :class:`Lifted`.
-        """
-        ...
+    ) -> Lifted: ...
 
 
 class Sweep(Protocol):
-    """Plane sweep for new content."""
+    """For each ray the depth of least cost among ``planes`` candidates, evenly spaced in inverse depth.
+
+    A view supports a point that projects to a pixel with missing content, in front of the rendered depth; it
+    contradicts a point that projects to a pixel without missing content and would be visible. The cost is the mean
+    colour difference over the supports (each at most 0.3) + 0.15 times the share of contradictions + 0.05 / number
+    of supports. Of the run of depths around the minimum that cost at most 0.01 more, the middle one is taken.
+
+    Args:
+        views: all of them.
+        view_index: the view whose pixels' rays are swept.
+        pixels: ``[P, 2]`` int64, column and row.
+        farthest: ``[P]`` depth at which each ray ends; it starts at the view's near plane.
+        planes: candidate depths per ray.
+        least_supports: number of supports that a valid point needs.
+        most_contradictions: largest share of contradictions among supports and contradictions of a valid point.
+    """
 
     def __call__(
         self,
@@ -173,28 +174,23 @@ class Sweep(Protocol):
         planes: int,
         least_supports: int,
         most_contradictions: float,
-    ) -> Swept:
-        """For each ray the depth of least cost among ``planes`` candidates, evenly spaced in inverse depth.
-
-        A view supports a point that projects to a pixel with missing content, in front of the rendered depth; it
-        contradicts a point that projects to a pixel without missing content and would be visible. The cost is the mean
-        colour difference over the supports (each at most 0.3) + 0.15 times the share of contradictions + 0.05 / number
-        of supports. Of the run of depths around the minimum that cost at most 0.01 more, the middle one is taken.
-
-        Args:
-            views: all of them.
-            view_index: the view whose pixels' rays are swept.
-            pixels: ``[P, 2]`` int64, column and row.
-            farthest: ``[P]`` depth at which each ray ends; it starts at the view's near plane.
-            planes: candidate depths per ray.
-            least_supports: number of supports that a valid point needs.
-            most_contradictions: largest share of contradictions among supports and contradictions of a valid point.
-        """
-        ...
+    ) -> Swept: ...
 
 
 class GenerateStructured(Protocol):
-    """Generation of structured Gaussians from anchors."""
+    """The Gaussians of the anchors in a camera's view (paper, equations for mu' and Sigma').
+
+    Opacity is the tanh output; only positive ones are drawn. The scale is the base scale times a sigmoid. Culling
+    changes the cost of a rendering, never its pixels: it tests a ball that contains all Gaussians of an anchor.
+
+    Args:
+        anchors: all of the scene's.
+        mlps: the three heads; inputs are the feature (D), the direction (3) and optionally the distance (1).
+        viewport: the camera.
+        distance_input: whether the distance is an input of the heads.
+        tiles: if given, only anchors that reach one of these tiles.
+        seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
+    """
 
     def __call__(
         self,
@@ -205,25 +201,23 @@ class GenerateStructured(Protocol):
         distance_input: bool,
         tiles: TileSelection | None = None,
         seen_from: Tensor | None = None,
-    ) -> StructuredGaussians:
-        """The Gaussians of the anchors in a camera's view (paper, equations for mu' and Sigma').
-
-        Opacity is the tanh output; only positive ones are drawn. The scale is the base scale times a sigmoid. Culling
-        changes the cost of a rendering, never its pixels: it tests a ball that contains all Gaussians of an anchor.
-
-        Args:
-            anchors: all of the scene's.
-            mlps: the three heads; inputs are the feature (D), the direction (3) and optionally the distance (1).
-            viewport: the camera.
-            distance_input: whether the distance is an input of the heads.
-            tiles: if given, only anchors that reach one of these tiles.
-            seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
-        """
-        ...
+    ) -> StructuredGaussians: ...
 
 
 class AdamStep(Protocol):
-    """One optimiser step."""
+    """Update ``param`` in place by one step of ``torch.optim.Adam`` (Note [Ownership]).
+
+    Args:
+        param: any shape.
+        grad: like ``param``.
+        exp_avg: first moment, updated in place.
+        exp_avg_sq: second moment, updated in place.
+        lr: learning rate.
+        step: number of this step, from 1.
+        betas: decay of the moments.
+        eps: added to the root of the corrected second moment.
+        rows: ``[r]`` int64, unique; only these rows (first dimension) are updated. None: all.
+    """
 
     def __call__(
         self,
@@ -237,18 +231,4 @@ class AdamStep(Protocol):
         betas: tuple[float, float],
         eps: float,
         rows: Tensor | None = None,
-    ) -> None:
-        """Update ``param`` in place by one step of ``torch.optim.Adam`` (Note [Ownership]).
-
-        Args:
-            param: any shape.
-            grad: like ``param``.
-            exp_avg: first moment, updated in place.
-            exp_avg_sq: second moment, updated in place.
-            lr: learning rate.
-            step: number of this step, from 1.
-            betas: decay of the moments.
-            eps: added to the root of the corrected second moment.
-            rows: ``[r]`` int64, unique; only these rows (first dimension) are updated. None: all.
-        """
-        ...
+    ) -> None: ...

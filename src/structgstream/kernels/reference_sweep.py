@@ -61,12 +61,18 @@ def sweep(
     some = supports.clamp(min=1.0)
     costs = difference / some + MISS_COST * share + LONELY_COST / some
     costs = torch.where((supports >= least_supports) & (share <= most_contradictions), costs, torch.inf)
+    least, plane = _middle_of_cheapest(costs)
+    return Swept(torch.where(least.isfinite(), z.gather(1, plane)[:, 0], 0.0), least)
+
+
+def _middle_of_cheapest(costs: Tensor) -> tuple[Tensor, Tensor]:
+    """Least cost ``[P]`` of each row of ``costs`` ``[P, planes]``, and the middle plane ``[P, 1]`` of the run of nearly
+    equal costs around it, as on textureless surfaces."""
+    planes = costs.shape[1]
     best = costs.argmin(1, keepdim=True)
     least = costs.gather(1, best)
-    # On a textureless surface a range of depths has nearly equal cost: take its middle.
     worse = ~(costs <= least + EQUAL_COST)
     plane = torch.arange(planes, device=costs.device).expand_as(costs)
     first = torch.where(worse & (plane < best), plane, -1).amax(1, keepdim=True) + 1
     last = torch.where(worse & (plane > best), plane, planes).amin(1, keepdim=True) - 1
-    least = least[:, 0]
-    return Swept(torch.where(least.isfinite(), z.gather(1, (first + last) // 2)[:, 0], 0.0), least)
+    return least[:, 0], (first + last) // 2

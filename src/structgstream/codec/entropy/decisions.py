@@ -44,9 +44,9 @@ def code_activity(
     state, blocks, rows = arithmetic.native(), models[0].native, models[1].native
     result = native_library().sgs_code_activity(
         *map(ctypes.byref, (state, blocks, rows)),
-        ctypes.c_int(arithmetic.encodes),
-        ctypes.c_int64(len(active)),
-        *map(_pointer, (history, sizes, active)),
+        arithmetic.encodes,
+        len(active),
+        *map(_address, (history, sizes, active)),
     )
     arithmetic.take(state)
     _check(result)
@@ -77,10 +77,10 @@ def code_residuals(
     state, its_model = arithmetic.native(), model.native
     result = native_library().sgs_code_residuals(
         *map(ctypes.byref, (state, its_model)),
-        ctypes.c_int(arithmetic.encodes),
-        ctypes.c_int64(len(residuals)),
-        ctypes.c_int(residuals.shape[1]),
-        *map(_pointer, (last, others, residuals)),
+        arithmetic.encodes,
+        len(residuals),
+        residuals.shape[1],
+        *map(_address, (last, others, residuals)),
     )
     arithmetic.take(state)
     return _check(result)
@@ -111,19 +111,19 @@ def code_numbers(
     state, its_model = arithmetic.native(), model.native
     result = native_library().sgs_code_numbers(
         *map(ctypes.byref, (state, its_model)),
-        ctypes.c_int(arithmetic.encodes),
-        ctypes.c_int64(len(values)),
-        _pointer(contexts),
-        ctypes.c_int(flags),
-        _pointer(values),
+        arithmetic.encodes,
+        len(values),
+        _address(contexts),
+        flags,
+        _address(values),
     )
     arithmetic.take(state)
     return _check(result)
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+def _address(array: np.ndarray) -> int:
     assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.ctypes.data)
+    return array.ctypes.data
 
 
 def _check(result: int) -> bool:

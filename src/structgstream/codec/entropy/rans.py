@@ -169,8 +169,8 @@ def takes_native(native: bool | None) -> bool:
     return has_native() if native is None else native
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
+def _address(array: np.ndarray) -> int:
+    return array.ctypes.data
 
 
 def _native_encode(
@@ -178,13 +178,13 @@ def _native_encode(
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
     states, words, word_count = np.empty(lanes, np.uint32), np.empty(len(symbols), np.uint16), ctypes.c_int64()
     result = native_library().sgs_rans_encode(
-        _pointer(symbols),
-        _pointer(contexts),
-        ctypes.c_int64(len(symbols)),
+        _address(symbols),
+        _address(contexts),
+        len(symbols),
         *_table_arguments(tables),
-        ctypes.c_int(lanes),
-        _pointer(states),
-        _pointer(words),
+        lanes,
+        _address(states),
+        _address(words),
         ctypes.byref(word_count),
     )
     if result == _NO_MEMORY:
@@ -199,19 +199,19 @@ def _native_decode(
 ) -> NDArray[np.uint8] | None:
     symbols = np.empty(len(contexts), np.uint8)
     result = native_library().sgs_rans_decode(
-        _pointer(words),
-        ctypes.c_int64(len(words)),
-        _pointer(states),
-        ctypes.c_int(len(states)),
-        _pointer(contexts),
-        ctypes.c_int64(len(contexts)),
+        _address(words),
+        len(words),
+        _address(states),
+        len(states),
+        _address(contexts),
+        len(contexts),
         *_table_arguments(tables),
-        _pointer(symbols),
+        _address(symbols),
     )
     if result == _NO_MEMORY:
         raise OutOfMemoryError("to decode symbols")
     return None if result else symbols
 
 
-def _table_arguments(tables: FrequencyTables) -> tuple[ctypes.c_void_p, ctypes.c_int64, ctypes.c_int]:
-    return _pointer(tables.rows), ctypes.c_int64(tables.contexts), ctypes.c_int(tables.alphabet)
+def _table_arguments(tables: FrequencyTables) -> tuple[int, int, int]:
+    return _address(tables.rows), tables.contexts, tables.alphabet

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Captures with a calibration file of another tool beside pictures or videos."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from structgstream.data.calibration_files import (
+    anipose,
+    cmu_panoptic,
+    easymocap,
+    kalibr,
+    multical,
+    opencv_cameras,
+    qualisys,
+    zju_mocap,
+)
+from structgstream.data.posed import Calibration
+from structgstream.data.posed_capture import open_posed
+from structgstream.data.source import FrameSource
+from structgstream.errors import CalibrationError
+
+PICKLES = (".pickle", ".pkl")
+
+
+class Converter(NamedTuple):
+    """``find`` says which files of a folder are a tool's, ``read`` what cameras they hold."""
+
+    find: Callable[[Path], tuple[Path, ...]]
+    read: Callable[[tuple[Path, ...]], Calibration]
+
+
+CONVERTERS = tuple(
+    Converter(tool.find, tool.read)
+    for tool in (anipose, easymocap, multical, kalibr, cmu_panoptic, qualisys, zju_mocap, opencv_cameras)
+)
+
+
+def recognises_calibrated(path: Path) -> bool:
+    """Whether the folder has a calibration file that is known here, or one that is refused."""
+    return _found(path) is not None or bool(_pickles(path))
+
+
+def open_calibrated(path: Path) -> FrameSource:
+    """The capture at ``path``, undistorted.
+
+    Raises:
+        CaptureError: no pictures or videos, or not of the calibrated cameras.
+        CalibrationError: a broken file, or one that only running it could read.
+    """
+    if (found := _found(path)) is not None:
+        converter, files = found
+        return open_posed(path, converter.read(files))
+    pickles = _pickles(path)
+    raise CalibrationError(
+        f"{pickles[0] if pickles else path} is a pickle, and opening it could run any program; it is refused. "
+        "Convert it, with a program that you trust, to one of the formats of docs/captures.md."
+    )
+
+
+def _found(path: Path) -> tuple[Converter, tuple[Path, ...]] | None:
+    return next(((converter, files) for converter in CONVERTERS if (files := converter.find(path))), None)
+
+
+def _pickles(path: Path) -> list[Path]:
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in PICKLES)

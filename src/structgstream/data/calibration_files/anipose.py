@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The TOML of aniposelib, which anipose, caliscope, Pose2Sim and FreeMoCap write.
+
+A table per camera with ``name``, ``size`` (width, height), ``matrix``, ``distortions`` (OpenCV's order), ``rotation``
+(vector, or matrix, world to camera), ``translation`` and ``fisheye``. The unit is that of the board that was filmed.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
+from structgstream.data.posed import Calibration, PosedCamera, rigid
+
+EXPECTED = "a table per camera with name, size, matrix, distortions, rotation and translation, as aniposelib writes it"
+
+
+def find(folder: Path) -> tuple[Path, ...]:
+    """The first TOML file that has tables of cameras, or is named as if it had."""
+    for file in sorted(folder.glob("*.toml")):
+        try:
+            if _tables(tomllib.loads(file.read_text())):
+                return (file,)
+        except (OSError, ValueError):
+            if "calib" in file.stem.lower():
+                return (file,)
+    return ()
+
+
+def read(files: tuple[Path, ...]) -> Calibration:
+    """The cameras of the file.
+
+    Raises:
+        CalibrationError: it is broken.
+    """
+    (file,) = files
+    with readable(file, EXPECTED):
+        tables = _tables(tomllib.loads(file.read_text()))
+    return Calibration(file, each_camera(tables.items(), _camera, file=file, expected=EXPECTED))
+
+
+def _tables(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Tables of cameras by name, at the top or below ``cameras``."""
+    inner = content.get("cameras", content)
+    tables = inner.items() if isinstance(inner, dict) else ()
+    return {
+        str(table.get("name", key)): table for key, table in tables if isinstance(table, dict) and "matrix" in table
+    }
+
+
+def _camera(name: str, table: dict[str, Any]) -> PosedCamera:
+    width, height = table["size"]
+    coefficients = np.ravel(table["distortions"]).tolist()
+    return PosedCamera(
+        name=name,
+        viewmat=rigid(table["rotation"], table["translation"]),
+        K=from_integer_centers(table["matrix"]),
+        size=(round(width), round(height)),
+        lens=(fisheye_lens if table.get("fisheye") else opencv_lens)(coefficients),
+    )

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``calibration_SEQUENCE.json`` of the CMU Panoptic Studio, in centimetres; here they become metres.
+
+``cameras`` is a list with ``name`` (panel_node), ``type`` (hd, vga, kinect-color), ``resolution``, ``K``,
+``distCoef`` (OpenCV's order), ``R`` and ``t``, world to camera. Videos are ``hdVideos/hd_00_00.mp4``, pictures
+``hdImgs/00_00/00_00_00000000.jpg``.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.data.calibration_files.multical import LARGEST_BYTES
+from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.lenses import from_integer_centers, opencv_lens
+from structgstream.data.posed import Calibration, PosedCamera, rigid
+
+EXPECTED = "a list of cameras with name, type, resolution, K, distCoef, R and t, as the Panoptic Studio has it"
+METRES = 0.01
+
+
+def find(folder: Path) -> tuple[Path, ...]:
+    """The first JSON file with such cameras."""
+    for file in sorted(folder.glob("*.json")):
+        if file.stat().st_size < LARGEST_BYTES and b'"distCoef"' in file.read_bytes():
+            return (file,)
+    return ()
+
+
+def read(files: tuple[Path, ...]) -> Calibration:
+    """The cameras of the file.
+
+    Raises:
+        CalibrationError: it is broken.
+    """
+    (file,) = files
+    with readable(file, EXPECTED):
+        entries = [(str(entry["name"]), entry) for entry in json.loads(file.read_text())["cameras"]]
+    return Calibration(file, each_camera(entries, _camera, file=file, expected=EXPECTED))
+
+
+def _camera(name: str, entry: dict[str, Any]) -> PosedCamera:
+    width, height = entry["resolution"]
+    return PosedCamera(
+        name=f"{entry['type']}_{name}/{name}",  # of a video, or of a folder
+        viewmat=rigid(entry["R"], METRES * np.array(entry["t"], dtype=np.float64)),
+        K=from_integer_centers(entry["K"]),
+        size=(round(width), round(height)),
+        lens=opencv_lens(np.ravel(entry["distCoef"]).tolist()),
+    )

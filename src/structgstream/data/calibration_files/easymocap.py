@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``intri.yml`` and ``extri.yml`` of EasyMocap and EasyVolcap, as ENeRF-Outdoor and others are given.
+
+``names``; for each name ``K_``, ``dist_`` or ``D_`` (OpenCV's order), sometimes ``H_`` and ``W_``; ``R_`` (vector) or
+``Rot_`` (matrix) and ``T_``, world to camera.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.data.calibration_files.opencv_storage import read_storage
+from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.lenses import from_integer_centers, opencv_lens
+from structgstream.data.posed import Calibration, PosedCamera, rigid
+
+INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+EXPECTED = "names, K_NAME and D_NAME in intri.yml, and R_NAME or Rot_NAME and T_NAME in extri.yml"
+
+
+def find(folder: Path) -> tuple[Path, ...]:
+    """The two files, when the first is there."""
+    return (folder / INTRINSICS, folder / EXTRINSICS) if (folder / INTRINSICS).is_file() else ()
+
+
+def read(files: tuple[Path, ...]) -> Calibration:
+    """The cameras of the two files.
+
+    Raises:
+        CalibrationError: one is missing or broken.
+    """
+    content: dict[str, Any] = {}
+    for file in files:
+        with readable(file, EXPECTED):
+            content |= read_storage(file)
+    names = [str(name) for name in content.get("names", ())]
+    cameras = each_camera(((name, name) for name in names), partial(_camera, content), file=files[0], expected=EXPECTED)
+    return Calibration(files[0], cameras)
+
+
+def _camera(content: dict[str, Any], name: str, _: str) -> PosedCamera:
+    coefficients = content.get(f"D_{name}", content.get(f"dist_{name}"))
+    turned = content[f"Rot_{name}"] if f"Rot_{name}" in content else content[f"R_{name}"]
+    width, height = content.get(f"W_{name}", 0), content.get(f"H_{name}", 0)
+    return PosedCamera(
+        name=name,
+        viewmat=rigid(turned, content[f"T_{name}"]),
+        K=from_integer_centers(content[f"K_{name}"]),
+        size=(round(width), round(height)) if width > 0 and height > 0 else None,
+        lens=opencv_lens([] if coefficients is None else np.ravel(coefficients).tolist()),
+    )

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ``calibration.json`` of multical.
+
+``cameras``: ``image_size``, ``K``, ``dist`` (OpenCV's order) by name; ``camera_poses``: ``R`` and ``T`` by name, or by
+``NAME_to_OTHER``. Poses map the rig, or the other camera's axes, to the camera's: despite the name of the second form.
+"""
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.lenses import from_integer_centers, opencv_lens
+from structgstream.data.posed import Calibration, PosedCamera, rigid
+
+EXPECTED = "cameras with image_size, K and dist, and camera_poses with R and T, as multical writes it"
+LARGEST_BYTES = 50_000_000  # of a JSON that is looked into, to tell what it is
+
+
+def find(folder: Path) -> tuple[Path, ...]:
+    """The first JSON file that has both keys."""
+    for file in sorted(folder.glob("*.json")):
+        if file.stat().st_size < LARGEST_BYTES and b'"camera_poses"' in file.read_bytes():
+            return (file,)
+    return ()
+
+
+def read(files: tuple[Path, ...]) -> Calibration:
+    """The cameras of the file that have a pose.
+
+    Raises:
+        CalibrationError: it is broken.
+    """
+    (file,) = files
+    with readable(file, EXPECTED):
+        content = json.loads(file.read_text())
+        poses = _absolute(content["camera_poses"])
+        entries = [(name, entry) for name, entry in content["cameras"].items() if name in poses]
+    return Calibration(file, each_camera(entries, partial(_camera, poses), file=file, expected=EXPECTED))
+
+
+def _absolute(entries: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    """World to camera by name; each relative pose after the one that it refers to."""
+    poses: dict[str, NDArray[np.float64]] = {}
+    waiting = dict(entries)
+    while waiting:
+        ready = {key: key.split("_to_") for key in waiting if "_to_" not in key or key.split("_to_")[1] in poses}
+        if not ready:
+            raise ValueError(f"the poses {', '.join(waiting)} refer to no camera that has one")
+        for key, (name, *other) in ready.items():
+            pose = waiting.pop(key)
+            viewmat = rigid(pose["R"], pose["T"])
+            poses[name] = viewmat @ poses[other[0]] if other else viewmat
+    return poses
+
+
+def _camera(poses: Mapping[str, NDArray[np.float64]], name: str, entry: dict[str, Any]) -> PosedCamera:
+    width, height = entry["image_size"]
+    return PosedCamera(
+        name=name,
+        viewmat=poses[name],
+        K=from_integer_centers(entry["K"]),
+        size=(round(width), round(height)),
+        lens=opencv_lens(np.ravel(entry["dist"]).tolist()),
+    )

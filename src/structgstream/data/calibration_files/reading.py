@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Broken files become one sentence that names file, camera and remedy."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from structgstream.data.posed import PosedCamera
+from structgstream.errors import CalibrationError
+
+Entry = TypeVar("Entry")
+BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError)
+
+
+@contextmanager
+def readable(file: Path, expected: str) -> Iterator[None]:
+    """What the body raises for a broken file, as a sentence that says what the file should hold.
+
+    Raises:
+        CalibrationError: the file is broken.
+    """
+    try:
+        yield
+    except CalibrationError:
+        raise
+    except BROKEN as error:
+        raise CalibrationError(f"{file} cannot be read ({_reason(error)}); expected {expected}.") from None
+
+
+def each_camera(
+    entries: Iterable[tuple[str, Entry]], read: Callable[[str, Entry], PosedCamera], *, file: Path, expected: str
+) -> tuple[PosedCamera, ...]:
+    """The cameras of a file, in its order.
+
+    Raises:
+        CalibrationError: an entry is broken, naming its camera; or there is none.
+    """
+    cameras = []
+    for name, entry in entries:
+        try:
+            cameras.append(read(name, entry))
+        except CalibrationError:
+            raise
+        except BROKEN as error:
+            raise CalibrationError(
+                f"Camera {name!r} of {file} cannot be read ({_reason(error)}); expected {expected}."
+            ) from None
+    if not cameras:
+        raise CalibrationError(f"{file} holds no cameras; expected {expected}.")
+    return tuple(cameras)
+
+
+def _reason(error: Exception) -> str:
+    return f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"

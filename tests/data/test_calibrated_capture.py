@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of videos or pictures with a calibration of another tool, through the door."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from calibrations import WRITERS, truths, write_anipose, write_cmu, write_easymocap
+from captures import all_numbers, picture, write_picture, write_videos
+from structgstream.data.open import LAYOUTS, open_capture
+from structgstream.data.undistortion import Undistorted
+from structgstream.errors import CalibrationError, CaptureError
+
+NAMES = ["cam00", "cam01", "cam02"]
+EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(3)]
+
+
+def write_pictures(path: Path, pattern: str = "images/NAME/FRAME.png") -> None:
+    for number, name in enumerate(NAMES):
+        for frame in range(3):
+            file = pattern.replace("NAME", name).replace("FRAME", f"{frame:06d}")
+            write_picture(path / file, picture(number, frame))
+
+
+@pytest.mark.parametrize("videos", [True, False])
+@pytest.mark.parametrize("tool", WRITERS)
+def test_every_tool_with_videos_and_with_pictures(tool: str, videos: bool, tmp_path: Path) -> None:
+    """Undistorted, at the poses of the file, with the pictures of the right cameras."""
+    cameras = truths(dist=(-0.1, 0.03, 0.002, -0.001, 0.0))
+    WRITERS[tool](tmp_path, cameras)
+    names = [f"hd_{name}" for name in NAMES] if tool == "cmu_panoptic" and videos else NAMES
+    if videos:
+        write_videos(tmp_path / ("hdVideos" if tool == "cmu_panoptic" else ""), names, frames=3)
+    else:
+        write_pictures(tmp_path)
+    source = open_capture(tmp_path)
+    assert isinstance(source, Undistorted)
+    assert list(source.rig) == names
+    assert source.rig.testing == ()
+    first = source.rig[names[0]].viewmat
+    for name, truth in zip(names, cameras):
+        expected = torch.eye(4, dtype=torch.float64)
+        expected[:3, :3], expected[:3, 3] = torch.from_numpy(truth.R), torch.from_numpy(truth.T)
+        if tool in ("multical", "kalibr"):
+            start = torch.eye(4, dtype=torch.float64)
+            start[:3, :3], start[:3, 3] = torch.from_numpy(cameras[0].R), torch.from_numpy(cameras[0].T)
+            expected = expected @ start.inverse() @ first
+        torch.testing.assert_close(source.rig[name].viewmat, expected, atol=1e-6, rtol=0)
+    assert all_numbers(source.frames()) == EXPECTED
+
+
+def test_names_that_differ_in_form_are_matched_by_number(tmp_path: Path) -> None:
+    write_anipose(tmp_path, truths(names=("Camera 2", "Camera 0", "Camera 1")))
+    write_videos(tmp_path, ["port_0", "port_1", "port_2"], frames=2)
+    source = open_capture(tmp_path)
+    expected = {camera.name: camera.center for camera in truths(names=("port_2", "port_0", "port_1"))}
+    for name in source.rig:
+        np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name], atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [("a1", "a2", "a3"), ("left", "middle", "right"), ("cam0", "cam0b", "cam1")])
+def test_names_that_do_not_belong_together(tmp_path: Path, names: tuple[str, ...]) -> None:
+    write_anipose(tmp_path, truths(names=names))
+    write_videos(tmp_path, NAMES, frames=2)
+    with pytest.raises(CalibrationError, match=r"No camera of .*calibration\.toml belongs to the pictures in .*'cam0"):
+        open_capture(tmp_path)
+
+
+def test_a_video_without_calibration(tmp_path: Path) -> None:
+    write_anipose(tmp_path, truths(names=("cam00", "cam01", "spare")))
+    write_videos(tmp_path, NAMES, frames=2)
+    with pytest.raises(CalibrationError, match=r"pictures of camera 'cam02', for which .*calibration\.toml has no cal"):
+        open_capture(tmp_path)
+
+
+def test_a_calibrated_camera_that_did_not_film_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_anipose(tmp_path, truths(names=(*NAMES, "cam03")))
+    write_videos(tmp_path, NAMES, frames=2)
+    assert list(open_capture(tmp_path).rig) == NAMES
+    assert "has no pictures of camera 'cam03' of " in caplog.text
+
+
+def test_a_calibration_of_another_mode(tmp_path: Path) -> None:
+    """A uniform reduction is one; a 4:3 calibration of a 16:9 video is a crop that nobody knows."""
+    file = write_anipose(tmp_path, truths())
+    write_videos(tmp_path, NAMES, frames=2)
+    full = open_capture(tmp_path).rig["cam00"]
+    text = file.read_text()
+    file.write_text(text.replace("size = [ 64, 48,]", "size = [ 64, 36,]"))
+    with pytest.raises(CalibrationError, match=r"'cam00' have 64x48 pixels, .*calibration\.toml is for 64x36"):
+        open_capture(tmp_path)
+    file.write_text(text.replace("size = [ 64, 48,]", "size = [ 1280, 960,]"))
+    with pytest.raises(CalibrationError, match=r"Camera 'cam00' of .*principal point .* scale the intrinsics"):
+        open_capture(tmp_path)
+    for number in ("41.0", "40.0", "31.1", "24.7"):
+        text = text.replace(number, str(2 * float(number)))
+    file.write_text(text.replace("size = [ 64, 48,]", "size = [ 128, 96,]"))
+    half = open_capture(tmp_path).rig["cam00"]
+    assert (half.width, half.height) == (64, 48)
+    torch.testing.assert_close(half.K[0, 0], full.K[0, 0], atol=0.3, rtol=0)  # half a pixel of its centre differs
+
+
+def test_a_camera_that_is_broken_is_named(tmp_path: Path) -> None:
+    file = write_anipose(tmp_path, truths())
+    write_videos(tmp_path, NAMES, frames=2)
+    text = file.read_text()
+    file.write_text(text.replace("rotation = ", "turned = ", 1))
+    with pytest.raises(CalibrationError, match=r"Camera 'cam00' of .*calibration\.toml cannot be read \(no 'rotation'"):
+        open_capture(tmp_path)
+    file.write_text(text.replace("distortions = [", "distortions = [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, ", 1))
+    with pytest.raises(CalibrationError, match=r"'cam00' of .*12 distortion coefficients; expected 4, 5 or 8"):
+        open_capture(tmp_path)
+    file.write_text(text[:200])
+    with pytest.raises(CalibrationError, match=r"calibration\.toml cannot be read .*aniposelib"):
+        open_capture(tmp_path)
+
+
+def test_a_calibration_without_frames(tmp_path: Path) -> None:
+    write_anipose(tmp_path, truths())
+    with pytest.raises(CaptureError, match=r"has the calibration .*calibration\.toml but no frames; expected images/"):
+        open_capture(tmp_path)
+
+
+def test_half_of_easymocap(tmp_path: Path) -> None:
+    write_easymocap(tmp_path, truths())
+    (tmp_path / "extri.yml").unlink()
+    with pytest.raises(CalibrationError, match=r"extri\.yml cannot be read \(FileNotFoundError"):
+        open_capture(tmp_path)
+
+
+def test_the_studio_of_cmu_in_its_folders(tmp_path: Path) -> None:
+    """hd_00_00.mp4 below hdVideos, of hundreds of cameras that are calibrated."""
+    names = ("00_00", "00_01", "00_02")
+    write_cmu(tmp_path, truths(names=names))
+    write_videos(tmp_path / "hdVideos", [f"hd_{name}" for name in names], frames=2)
+    assert list(open_capture(tmp_path).rig) == ["hd_00_00", "hd_00_01", "hd_00_02"]
+
+
+def test_pickles_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "cam0.pickle").write_bytes(pickle.dumps({"K": 1}))
+    write_videos(tmp_path, NAMES, frames=2)
+    with pytest.raises(
+        CalibrationError, match=r"cam0\.pickle is a pickle, and opening it could run any program; it is"
+    ):
+        open_capture(tmp_path)
+
+
+def test_what_can_be_read_is_listed() -> None:
+    for name in ("aniposelib", "EasyMocap", "multical", "Kalibr", "CMU Panoptic", "Qualisys", "ZJU-MoCap", "OpenCV"):
+        assert name in LAYOUTS

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from calibrations import Truth, truths, write_transforms
+from captures import HEIGHT, WIDTH, all_numbers, picture, write_picture, write_videos
+from structgstream.data.open import open_capture
+from structgstream.data.transforms_capture import open_transforms
+from structgstream.errors import CalibrationError, CaptureError
+
+CAMERAS = truths(dist=())
+FRAMES = 3
+
+
+def pose(camera: Truth) -> list[list[float]]:
+    """Camera to world in OpenGL axes."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = camera.R.T @ np.diag([1, -1, -1]), camera.center
+    return matrix.tolist()
+
+
+def write(path: Path, pattern: str, *, name: str = "transforms.json", cameras: range = range(3), **top: object) -> None:
+    """Pictures and a file that lists all of them with times; Blender's has an angle and no size."""
+    frames = []
+    for number in cameras:
+        for frame in range(FRAMES):
+            file = pattern.replace("CAM", f"cam{number:02d}").replace("FRAME", f"{frame:04d}")
+            write_picture(path / file, picture(number, frame))
+            entry = {"file_path": file, "transform_matrix": pose(CAMERAS[number]), "time": frame / FRAMES}
+            frames.append(entry)
+    angle = 2 * math.atan(WIDTH / 2 / 40)
+    (path / name).write_text(json.dumps({"camera_angle_x": angle, **top, "frames": frames}))
+
+
+def edit(file: Path, change) -> None:
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("pattern", ["rgb/CAM/FRAME.png", "FRAME/CAM.png", "images/CAM_FRAME.png", "all/FRAME_CAM.jpg"])
+def test_pictures_with_times(tmp_path: Path, pattern: str) -> None:
+    """Pictures of one pose are of one camera, whatever the folders; the time says which instant they belong to."""
+    write(tmp_path, pattern, fps=25.0)
+    source = open_capture(tmp_path)
+    assert (len(source), source.fps, source.rig.testing) == (FRAMES, 25.0, ())
+    for camera, name in zip(CAMERAS, source.rig, strict=True):
+        np.testing.assert_allclose(source.rig[name].center.numpy(), camera.center, atol=1e-9)
+        expected = [[40.0, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]]
+        torch.testing.assert_close(source.rig[name].K, torch.tensor(expected, dtype=torch.float64))
+    assert all_numbers(source.frames()) == [[(camera, frame) for camera in range(3)] for frame in range(FRAMES)]
+
+
+def test_times_order_the_pictures_not_their_names(tmp_path: Path) -> None:
+    write(tmp_path, "rgb/CAM/FRAME.png")
+
+    def backwards(content: dict) -> None:
+        for entry in content["frames"]:
+            entry["time"] = 1 - entry["time"]
+
+    edit(tmp_path / "transforms.json", backwards)
+    expected = [[(camera, frame) for camera in range(3)] for frame in reversed(range(FRAMES))]
+    assert all_numbers(open_transforms(tmp_path).frames()) == expected
+
+
+def test_blenders_two_files(tmp_path: Path) -> None:
+    """Paths without a suffix; what the second lists is held out."""
+    write(tmp_path, "train/CAM_FRAME.png", name="transforms_train.json", cameras=range(2))
+    write(tmp_path, "test/CAM_FRAME.png", name="transforms_test.json", cameras=range(2, 3))
+
+    def without_suffix(content: dict) -> None:
+        for entry in content["frames"]:
+            entry["file_path"] = f"./{entry['file_path'].removesuffix('.png')}"
+
+    for name in ("transforms_train.json", "transforms_test.json"):
+        edit(tmp_path / name, without_suffix)
+    source = open_capture(tmp_path)
+    assert [len(source.rig.training), len(source.rig.testing)] == [2, 1]
+    center = source.rig[source.rig.testing[0]].center
+    np.testing.assert_allclose(center.numpy(), CAMERAS[2].center, atol=1e-9)
+
+
+def test_a_static_scene_of_blender(tmp_path: Path) -> None:
+    """One picture a camera, no times."""
+    write(tmp_path, "train/CAM_FRAME.png", name="transforms_train.json")
+
+    def first_only(content: dict) -> None:
+        content["frames"] = [dict(entry) for entry in content["frames"][::FRAMES]]
+        for entry in content["frames"]:
+            del entry["time"]
+
+    edit(tmp_path / "transforms_train.json", first_only)
+    source = open_capture(tmp_path)
+    assert (len(source), len(source.rig)) == (1, 3)
+
+
+def test_one_instant_serves_for_all(tmp_path: Path) -> None:
+    """nerfstudio's file names the pictures of one instant; the folders hold more."""
+    for number in range(3):
+        for frame in range(FRAMES):
+            write_picture(tmp_path / f"images/cam{number:02d}/{frame:06d}.png", picture(number, frame))
+    write_transforms(tmp_path, CAMERAS)
+    assert all_numbers(open_transforms(tmp_path).frames())[2] == [(0, 2), (1, 2), (2, 2)]
+
+
+def test_videos(tmp_path: Path) -> None:
+    write_videos(tmp_path, [camera.name for camera in CAMERAS], frames=FRAMES)
+    write_transforms(tmp_path, CAMERAS, pattern="NAME.mp4")
+    assert len(open_transforms(tmp_path)) == FRAMES
+
+
+def test_one_camera_that_moves(tmp_path: Path) -> None:
+    write(tmp_path, "rgb/CAM_FRAME.png")
+
+    def moving(content: dict) -> None:
+        for number, entry in enumerate(content["frames"]):
+            entry["transform_matrix"][0][3] += 0.1 * number
+            entry["time"] = number / 9
+
+    edit(tmp_path / "transforms.json", moving)
+    with pytest.raises(CalibrationError, match="one camera that moves; expected several that stand still"):
+        open_transforms(tmp_path)
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    write(tmp_path, "rgb/CAM_FRAME.png")
+    file = tmp_path / "transforms.json"
+    whole = file.read_text()
+    edit(file, lambda content: content["frames"][4].pop("transform_matrix"))
+    with pytest.raises(CalibrationError, match=r"'rgb/cam01_0001\.png' of .*transforms\.json .*no 'transform_matrix'"):
+        open_transforms(tmp_path)
+    file.write_text(whole)
+    edit(file, lambda content: content.pop("camera_angle_x"))
+    with pytest.raises(CalibrationError, match="no 'camera_angle_x'"):
+        open_transforms(tmp_path)
+    file.write_text(whole)
+    (tmp_path / "rgb/cam02_0001.png").unlink()
+    with pytest.raises(CalibrationError, match=r"'rgb/cam02_0001\.png' of .*no 'w and h'"):
+        open_transforms(tmp_path)
+    edit(file, lambda content: content.update(w=WIDTH, h=HEIGHT))
+    with pytest.raises(CaptureError, match=r"cam02_0001\.png cannot be read"):
+        list(open_transforms(tmp_path).frames())
+    file.write_text("{")
+    with pytest.raises(CalibrationError, match=r"transforms\.json cannot be read .*expected frames with file_path"):
+        open_transforms(tmp_path)
+
+
+@pytest.mark.parametrize("change", [{"camera_model": "EQUIRECTANGULAR"}, {"k4": 0.1}])
+def test_lenses_that_are_not_known(tmp_path: Path, change: dict) -> None:
+    write(tmp_path, "rgb/CAM_FRAME.png", **change)
+    with pytest.raises(CalibrationError, match="which is not known here; expected PINHOLE, OPENCV"):
+        open_transforms(tmp_path)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of a capture that a stream was made from is found again by its header."""
+
+from dataclasses import replace
+
+import pytest
+
+from streams import header_for, small_scene
+from structgstream.data.clip import bundled_clip_path
+from structgstream.data.open import open_capture
+from structgstream.errors import CaptureError
+from structgstream.evaluation.capture import capture_of
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(2, 2), (99, 9), (None, 9)])
+def test_start_frames_and_scale_are_those_of_the_stream(frames: int | None, expected: int) -> None:
+    made_from = open_capture(bundled_clip_path(), start=3, scale=0.25)
+    header = replace(header_for(small_scene()), rig=made_from.rig, metadata={"start": 3})
+    found = capture_of(header, bundled_clip_path(), frames=frames)
+    assert len(found) == expected
+    camera = found.rig["cam01"]
+    assert (camera.width, camera.height) == (80, 60)
+    first, wanted = next(iter(found.frames())), next(iter(made_from.frames()))
+    assert (first.images["cam01"] == wanted.images["cam01"]).all()
+
+
+def test_a_capture_that_ends_before_the_stream_begins_is_told() -> None:
+    header = replace(header_for(small_scene()), metadata={"start": 12})
+    with pytest.raises(CaptureError, match="12 frames"):
+        capture_of(header, bundled_clip_path(), frames=1)

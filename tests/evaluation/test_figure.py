@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all plots share: a figure of a size, axes without ornament, one sentence where it cannot be stored."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from drawn import pixels_of
+from structgstream.errors import MissingExtraError, StorageError
+from structgstream.evaluation.figure import COLOURS, figure_of, save_figure, without_frame
+
+
+def test_a_figure_has_its_size_and_makes_its_folder(tmp_path: Path) -> None:
+    figure = figure_of(2.0, 1.0)
+    axis = figure.subplots()
+    without_frame(axis)
+    assert not axis.spines["top"].get_visible()
+    assert axis.spines["left"].get_visible()
+    save_figure(figure, tmp_path / "new" / "x.png")
+    assert pixels_of(tmp_path / "new" / "x.png").shape == (110, 220, 3)
+
+
+def test_no_two_colours_are_alike() -> None:
+    values = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in COLOURS]
+    apart = [max(abs(a - b) for a, b in zip(one, other)) for one in values for other in values if one is not other]
+    assert min(apart) > 40
+
+
+def test_what_is_in_the_way_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        save_figure(figure_of(1.0, 1.0), tmp_path / "file" / "x.png")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match="report"):
+        figure_of(1.0, 1.0)
