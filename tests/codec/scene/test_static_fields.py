@@ -172,7 +172,7 @@ def test_fields_without_a_coding() -> None:
     with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_positions"):
         decoded_fields(less, STEPS)
     less = {name: data for name, data in coded.items() if name != "appearance"}
-    with pytest.raises(StreamError, match="holds appearance_basis without appearance, which tells its shape"):
+    with pytest.raises(StreamError, match="holds appearance_basis without appearance, which determines its shape"):
         decoded_fields(less, STEPS)
 
 

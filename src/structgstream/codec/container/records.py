@@ -72,7 +72,7 @@ def check_prefix(data: Stored, name: str) -> None:
     if not prefix().startswith(bytes(data[: len(MAGIC)])):
         raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
     if len(data) < PREFIX.size:
-        raise StreamError(f"{name} is truncated at byte {len(data)}, before its first frame.")
+        raise StreamError(f"{name} is cut at byte {len(data)}, before its first frame.")
     _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
         newer, older = (
