@@ -1,24 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a stream begins: where points come from, and what the header says of the scene that goes on."""
-
-from dataclasses import replace
+"""Where a frame starts that has nothing before it: its seed and its points."""
 
 import numpy as np
 import pytest
 import torch
 
 from memory_captures import MemoryCapture
-from rigs import random_scene
-from small_presets import TINY_RIG
-from streams import same
 from structgstream import beginning
-from structgstream.beginning import begun, frame_seed, initial_points_of
-from structgstream.codec.packets import StreamHeader
+from structgstream.beginning import frame_seed, initial_points_of
 from structgstream.data.points import PointsConfig
-from structgstream.kernels.backend import reference_backend
-from structgstream.presets import TINY, StreamConfig, to_json
-from structgstream.scene.scene import Scene
-from structgstream.scene.state import state_of
 from structgstream.similarity import Similarity
 from worlds import moving_world
 
@@ -28,18 +18,6 @@ SIMILARITY = Similarity((0.0, 0.1, 0.0), 2.0)
 
 def source(points: np.ndarray | None = None) -> MemoryCapture:
     return MemoryCapture(WORLD.rig, WORLD.frames, fps=25.0, points=points)
-
-
-def begin(config: StreamConfig, scene: Scene) -> tuple[Scene, StreamHeader]:
-    return begun(
-        scene,
-        source(),
-        frame=WORLD.frames[0],
-        config=config,
-        metadata={"capture": "world"},
-        similarity=SIMILARITY,
-        backend=reference_backend(),
-    )
 
 
 def test_seeds_of_frames_and_of_streams_are_apart() -> None:
@@ -64,37 +42,3 @@ def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.Monk
     points = initial_points_of(source(), WORLD.frames[0], **options)
     torch.testing.assert_close(points.double(), torch.tensor([[2.0, 1.8, 2.0]]).double().expand(4, 3))
     assert asked == [5]
-
-
-def test_a_raw_stream_goes_on_with_the_scene_as_it_is() -> None:
-    scene = random_scene(20, seed=2)
-    found, header = begin(TINY_RIG, scene)
-    assert same(found, scene)
-    state = state_of(scene)
-    assert header.static.keys() == state.keys() - TINY_RIG.online.dynamic
-    assert all(torch.equal(value, state[name]) for name, value in header.static.items())
-    assert (header.codec, header.fps, header.rig, header.similarity) == ("raw", 25.0, WORLD.rig, SIMILARITY)
-    assert not header.steps
-    assert not header.reference
-    assert not header.init_steps
-    assert header.config == to_json(TINY_RIG)
-
-
-def test_a_compact_stream_goes_on_with_numbers_on_their_bins() -> None:
-    """Every number is a whole number of its step, and the header's reference is what goes on."""
-    config = replace(TINY, environment=replace(TINY.environment, enabled=False))
-    scene = random_scene(20, seed=2)
-    found, header = begin(config, scene)
-    assert len(found.anchors) == 20
-    state = state_of(found)
-    assert header.reference.keys() == config.online.dynamic - {"free", "free_births"}
-    assert all(torch.equal(value, state[name]) for name, value in header.reference.items())
-    assert set(header.static) | set(config.online.dynamic) >= state.keys()
-    assert header.init_steps
-    for name, step in header.init_steps.items():
-        bins = state[name].double() / step
-        torch.testing.assert_close(bins, bins.round(), atol=1e-3, rtol=0)
-    assert all(step == float(np.float32(step)) for step in (*header.steps.values(), *header.init_steps.values()))
-    again, its_header = begin(config, scene)
-    assert same(again, found)
-    assert its_header.init_steps == header.init_steps

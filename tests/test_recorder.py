@@ -9,8 +9,8 @@ import pytest
 from reports import frame_report
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, log_path, read_log
+from structgstream.frame_report import FrameReport
 from structgstream.recorder import check_output, logged
-from structgstream.session import FrameReport
 
 
 def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]:

@@ -11,7 +11,7 @@ import torch
 from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
 from streams import moved, same, small_scene
-from structgstream import session
+from structgstream import struct_gstream as method
 from structgstream.beginning import frame_seed
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import scanned
@@ -20,11 +20,13 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry
+from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import Session
+from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
 from worlds import moving_world
 
@@ -53,15 +55,16 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         seeds.append(seed)
         return FitResult(moved(scene, seed % 7), 1, 21.0, spawned=2, pruned=1, seconds={"render": 0.5})
 
-    monkeypatch.setattr(session, "fit_first_frame", first)
-    monkeypatch.setattr(session, "fit_next_frame", following)
+    monkeypatch.setattr(method, "fit_first_frame", first)
+    monkeypatch.setattr(method, "fit_next_frame", following)
     return seeds
 
 
 def run(
     source: MemoryCapture, sink, *, resumed=None, config: StreamConfig = TINY_RIG, metadata=None
-) -> list[session.FrameReport]:
-    return list(Session(source, sink, config, reference_backend(), resumed=resumed, metadata=metadata).run())
+) -> list[FrameReport]:
+    pipeline = stream_pipeline(config)
+    return list(Session(source, sink, pipeline, reference_backend(), resumed=resumed, metadata=metadata).run())
 
 
 def uninterrupted(frames: int = 5) -> bytes:
@@ -101,7 +104,7 @@ def test_each_frame_starts_from_what_a_reader_sees(quick_fits: list[int], monkey
             replace(fitted, anchors=replace(fitted.anchors, features=fitted.anchors.features + 1)), 1, 21.0
         )
 
-    monkeypatch.setattr(session, "fit_next_frame", following)
+    monkeypatch.setattr(method, "fit_next_frame", following)
     sink = MemorySink()
     run(capture(), sink)
     seen = [scene for _, scene in StreamReader(sink.data).scenes()]
@@ -177,14 +180,14 @@ def test_another_run_is_not_continued(quick_fits: list[int], tmp_path: Path, cha
 
 def interrupted_at(frame: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C while ``frame`` is fitted."""
-    fit = session.fit_next_frame
+    fit = method.fit_next_frame
 
     def following(scene, at, rig, **options):
         if at.index == frame:
             raise KeyboardInterrupt
         return fit(scene, at, rig, **options)
 
-    monkeypatch.setattr(session, "fit_next_frame", following)
+    monkeypatch.setattr(method, "fit_next_frame", following)
 
 
 def test_ctrl_c_leaves_a_complete_file(quick_fits: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +200,7 @@ def test_ctrl_c_leaves_a_complete_file(quick_fits: list[int], tmp_path: Path, mo
 
 def test_a_consumer_that_stops_leaves_a_complete_file(quick_fits: list[int]) -> None:
     sink = MemorySink()
-    reports = Session(capture(), sink, TINY_RIG, reference_backend()).run()
+    reports = Session(capture(), sink, stream_pipeline(TINY_RIG), reference_backend()).run()
     next(reports)
     reports.close()  # type: ignore[attr-defined]
     reader = StreamReader(sink.data)
@@ -235,7 +238,7 @@ def test_a_failure_in_the_first_frame_leaves_the_old_file(
     def first(*_: object, **__: object) -> FitResult:
         raise OSError(errno.EIO, "the capture went away")
 
-    monkeypatch.setattr(session, "fit_first_frame", first)
+    monkeypatch.setattr(method, "fit_first_frame", first)
     with pytest.raises(OSError, match="went away"):
         run(capture(), FileSink(path, overwrite=True))
     assert path.read_text() == "an older result"

@@ -13,7 +13,7 @@ from backends import quickest_backend
 from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
 from streams import same
-from structgstream import session
+from structgstream import struct_gstream as method
 from structgstream.codec.container.records import scanned
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
@@ -24,6 +24,7 @@ from structgstream.scene.order import space_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
 from structgstream.session import FrameReport, Session
+from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.motion import MotionConfig
 from structgstream.training.rounding import RoundingConfig, pixel_size
@@ -53,13 +54,13 @@ CONFIG = replace(
 
 def run(sink, *, config: StreamConfig = CONFIG, resumed=None, frames: int = FRAMES) -> list[FrameReport]:
     capture = MemoryCapture(WORLD.rig, WORLD.frames[:frames], points=WORLD.scene.anchors.positions.numpy())
-    return list(Session(capture, sink, config, quickest_backend(), resumed=resumed).run())
+    return list(Session(capture, sink, stream_pipeline(config), quickest_backend(), resumed=resumed).run())
 
 
 @cache
 def whole() -> tuple[bytes, list[FrameReport], list[Scene], list[Scene]]:
     """The stream, the reports, where each later frame's fit started, and what it came to."""
-    started, fitted, fit = [], [], session.fit_next_frame
+    started, fitted, fit = [], [], method.fit_next_frame
 
     def following(scene, *arguments, **options):
         started.append(scene)
@@ -67,11 +68,11 @@ def whole() -> tuple[bytes, list[FrameReport], list[Scene], list[Scene]]:
         fitted.append(found.scene)
         return found
 
-    session.fit_next_frame = following  # type: ignore[assignment]
+    method.fit_next_frame = following  # type: ignore[assignment]
     try:
         reports = run(sink := MemorySink())
     finally:
-        session.fit_next_frame = fit
+        method.fit_next_frame = fit
     return sink.data, reports, started, fitted
 
 
@@ -180,7 +181,7 @@ def test_another_codec_does_not_continue_it(tmp_path: Path) -> None:
     path = tmp_path / "a.sgs"
     path.write_bytes(whole()[0])
     sink, resumed = FileSink.resume(path)
-    with pytest.raises(ConfigError, match="another configuration: codec differ"):
+    with pytest.raises(ConfigError, match="another method or codec, .compact. instead of .raw."):
         run(sink, resumed=resumed, config=replace(CONFIG, codec="raw"))
     sink.close()
 

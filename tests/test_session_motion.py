@@ -12,6 +12,7 @@ from structgstream.codec.sinks import FileSink
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.session import FrameReport, Session
+from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.motion import MotionConfig
 from worlds import moving_world
 
@@ -46,7 +47,7 @@ def capture(length: int) -> Capture:
 
 
 def run(source: Capture, sink: FileSink, *, resumed: StreamReader | None = None) -> list[FrameReport]:
-    return list(Session(source, sink, CONFIG, reference_backend(), resumed=resumed).run())
+    return list(Session(source, sink, stream_pipeline(CONFIG), reference_backend(), resumed=resumed).run())
 
 
 def test_a_resumed_stream_is_the_uninterrupted_one_byte_for_byte(tmp_path: Path) -> None:

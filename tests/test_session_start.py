@@ -17,6 +17,7 @@ from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
 from structgstream.presets import COMPACT
 from structgstream.session import FrameReport, Session
+from structgstream.struct_gstream import stream_pipeline
 from worlds import moving_world
 
 FRAMES = 4
@@ -36,7 +37,7 @@ CONFIG = replace(
 
 def run(sink, *, resumed=None, pictures: list[MultiViewFrame] = WORLD.frames) -> list[FrameReport]:
     capture = MemoryCapture(WORLD.rig, pictures, points=POINTS)
-    return list(Session(capture, sink, CONFIG, quickest_backend(), resumed=resumed).run())
+    return list(Session(capture, sink, stream_pipeline(CONFIG), quickest_backend(), resumed=resumed).run())
 
 
 @cache

@@ -23,21 +23,24 @@ if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.errors import StructGStreamError
     from structgstream.evaluation.report import FrameScores, Report, Scores
+    from structgstream.frame_report import FrameReport
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
+    from structgstream.pipeline import Pipeline
     from structgstream.presets import PRESETS, StreamConfig
     from structgstream.scene.render import Rendering, render
     from structgstream.scene.scene import Scene
-    from structgstream.session import FrameReport, Session
+    from structgstream.session import Session
     from structgstream.similarity import Similarity
+    from structgstream.struct_gstream import stream_pipeline
 
 _HOMES = {
     "Backend": "kernels.backend",
     "Camera": "cameras",
     "CameraRig": "cameras",
     "FileSink": "codec.sinks",
-    "FrameReport": "session",
+    "FrameReport": "frame_report",
     "FrameScores": "evaluation.report",
     "FrameSource": "data.source",
     "MemorySink": "codec.sinks",
@@ -47,6 +50,7 @@ _HOMES = {
     "PacketInfo": "codec.reader",
     "PacketKind": "codec.packets",
     "PeakKind": "memory",
+    "Pipeline": "pipeline",
     "Rendering": "scene.render",
     "Report": "evaluation.report",
     "Scene": "scene.scene",
@@ -64,6 +68,7 @@ _HOMES = {
     "reconstruct": "api",
     "render": "scene.render",
     "select_backend": "kernels.backend",
+    "stream_pipeline": "struct_gstream",
 }
 
 __all__ = [
@@ -81,6 +86,7 @@ __all__ = [
     "PacketInfo",
     "PacketKind",
     "PeakKind",
+    "Pipeline",
     "Rendering",
     "Report",
     "Scene",
@@ -98,6 +104,7 @@ __all__ = [
     "reconstruct",
     "render",
     "select_backend",
+    "stream_pipeline",
 ]
 
 

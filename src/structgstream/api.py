@@ -22,12 +22,13 @@ from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, PageFormat
 from structgstream.exporters.frames import write_frames
 from structgstream.exporters.request import check_page, checked_degree, chosen_frames, destination
+from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.player.stream_file import StreamFile
 from structgstream.player.write import write_page, write_site
 from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
-from structgstream.recorder import Recorder, check_output
-from structgstream.session import FrameReport
+from structgstream.recorder import check_output, record
+from structgstream.struct_gstream import stream_pipeline
 
 
 def reconstruct(
@@ -102,9 +103,9 @@ def reconstruct(
         )
     else:
         source = capture
-    recorder = Recorder(path, resume=resume)
+    run = record(path, source, stream_pipeline(config), select_backend(backend), resume=resume, metadata=metadata)
     reports = []
-    with closing(recorder.record(source, config, select_backend(backend), metadata=metadata)) as recording:
+    with closing(run.reports) as recording:
         for report in recording:
             reports.append(report)
             if on_frame is not None:

@@ -1,95 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream on the disk and the log beside it: begun, gone on with, and written frame by frame."""
+"""A stream on the disk and the log beside it, written frame by frame: for commands, functions and studies."""
 
 import os
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from structgstream.codec.sinks import FileSink
 from structgstream.data.prefetch import Prefetch
 from structgstream.data.source import FrameSource
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
+from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend
-from structgstream.presets import StreamConfig
-from structgstream.session import FrameReport, Session
-from structgstream.training.result import FitResult, StepListener
+from structgstream.pipeline import Memory, Pipeline, State
+from structgstream.session import Session
+from structgstream.training.result import StepListener
 
 Remarks = Callable[[FrameReport], Mapping[str, Any]]
 """What a frame's line of the log holds beside its report."""
 
 
-class Recorder:
-    """A stream file and its log, which :meth:`record` writes.
-
-    Nothing is written before :meth:`record` is called.
+@dataclass(frozen=True)
+class Run:
+    """A reconstruction into a file.
 
     Args:
-        path: the stream; what is there is replaced unless it is resumed.
-        resume: go on after the last whole frame of what is there.
-
-    Attributes:
-        done: how many frames are there already.
-
-    Raises:
-        StreamError: what is to be resumed is no stream, or damaged where nothing can be saved.
+        done: how many frames the file held before.
+        reports: of the frames that are not there yet; each comes as the generator is advanced, when the frame is stored
+            and noted in the log.
     """
 
-    def __init__(self, path: Path, *, resume: bool = False) -> None:
-        self._path = path
-        self._sink, self._resumed = FileSink.resume(path) if resume else (FileSink(path, overwrite=True), None)
-        self.done = 0 if self._resumed is None else len(self._resumed)
+    done: int
+    reports: Generator[FrameReport, None, None]
 
-    def record(
-        self,
-        source: FrameSource,
-        config: StreamConfig,
-        backend: Backend,
-        *,
-        metadata: Mapping[str, object] | None = None,
-        first: FitResult | None = None,
-        on_step: StepListener | None = None,
-        remarks: Remarks | None = None,
-    ) -> Generator[FrameReport, None, None]:
-        """Reconstructs every frame that is not there yet, stores it, notes it in the log, and reports it.
 
-        The configuration is checked and the log begun in the call; frames come as the generator is advanced.
+def record(
+    path: Path,
+    source: FrameSource,
+    pipeline: Pipeline[State, Memory],
+    backend: Backend,
+    *,
+    resume: bool = False,
+    metadata: Mapping[str, object] | None = None,
+    on_step: StepListener | None = None,
+    remarks: Remarks | None = None,
+) -> Run:
+    """Reconstructs a capture into a file, with a log beside it.
 
-        Args:
-            source: the capture; its frames are read ahead.
-            config: everything that decides the result.
-            backend: what computes.
-            metadata: plain JSON values for the header, the same in every run that is to be resumed.
-            first: frame 0 as it was fitted before.
-            on_step: called after every optimisation step.
-            remarks: see :data:`Remarks`.
+    What is there is checked and the log begun in the call; the file is written as the reports are taken.
 
-        Raises:
-            ConfigError: the stream to resume was made with another configuration or from another capture.
-            StorageError: stream or log cannot be written; whole frames are in the file.
-        """
-        session = Session(
-            Prefetch(source),
-            self._sink,
-            config,
-            backend,
-            resumed=self._resumed,
-            metadata=metadata,
-            first=first,
-            on_step=on_step,
-        )
-        return logged(session.run(), self._path, done=self.done, remarks=remarks)
+    Args:
+        path: the file; what is there is replaced unless it is resumed.
+        source: the capture; its frames are read ahead.
+        pipeline: how frames are fitted and stored.
+        backend: what computes.
+        resume: go on after the last whole frame of what is there.
+        metadata: plain JSON values for the header, the same in every run that is to be resumed.
+        on_step: called after every optimisation step.
+        remarks: see :data:`Remarks`.
+
+    Raises:
+        ConfigError: what is to be resumed was made with another configuration or from another capture.
+        StreamError: what is to be resumed is no stream, or damaged where nothing can be saved.
+        StorageError: the file or the log cannot be written; whole frames are in the file.
+    """
+    sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
+    session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
+    done = 0 if resumed is None else len(resumed)
+    return Run(done, logged(session.run(), path, done=done, remarks=remarks))
 
 
 def logged(
     reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: Remarks | None = None
 ) -> Generator[FrameReport, None, None]:
-    """The reports of a run, each noted in the log beside ``path`` before it is passed on.
+    """The reports of a session, each noted in the log beside ``path`` before it is passed on.
 
     Args:
-        reports: of a session of this method or of another; closed with the result.
+        reports: closed with the result.
         path: the file that the session writes.
         done: how many frames it holds already, whose lines of the log stay.
         remarks: see :data:`Remarks`.

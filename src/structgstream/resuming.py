@@ -5,26 +5,28 @@ from collections.abc import Iterator, Mapping
 
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import StreamHeader
-from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError
-from structgstream.presets import StreamConfig, to_json
+from structgstream.pipeline import StreamFacts
 
 
-def check_resumable(
-    header: StreamHeader, source: FrameSource, *, config: StreamConfig, metadata: Mapping[str, object]
-) -> None:
-    """Refuses to continue a stream with another configuration or capture.
+def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
+    """Refuses to continue a stream with another method, configuration or capture.
 
     Raises:
         ConfigError: naming what differs.
     """
-    differing = list(_differences(dict(header.config), to_json(config)))
+    if header.codec != facts.codec:
+        raise ConfigError(
+            f"The stream was made by another method or codec, {header.codec!r} instead of {facts.codec!r}. "
+            "Resume with the same, or start again with --overwrite."
+        )
+    differing = list(_differences(dict(header.config), dict(facts.config)))
     if differing:
         raise ConfigError(
             f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
             "Resume with the same preset and options, or start again with --overwrite."
         )
-    ours = _capture_facts(source.rig, source.fps, metadata)
+    ours = _capture_facts(facts.rig, facts.fps, facts.metadata)
     differing = list(_differences(_capture_facts(header.rig, header.fps, header.metadata), ours))
     if differing:
         raise ConfigError(

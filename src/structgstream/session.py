@@ -1,310 +1,199 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop: frames in, packets out, and the decoded scene is where the next frame starts (Note [Closed loop]).
+"""The loop: frames in, packets out, and the decoded frame is where the next one starts (Note [Closed loop]).
 
-While a frame is fitted, the next one is read and what moves in its pictures is looked for (``lookahead``)."""
+While a frame is fitted, the next one is read and its pictures are observed (``lookahead``).
+"""
 
-import time
+from collections import deque
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from functools import partial
+from typing import Generic
 
-from structgstream.beginning import begun, frame_seed, initial_points_of
-from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.packets import PacketKind, PacketSink
-from structgstream.codec.reader import StreamReader
+from structgstream.beginning import frame_seed, initial_points_of
+from structgstream.codec.encoder import Encoded
+from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.source import FrameSource
-from structgstream.errors import ConfigError, StorageError
+from structgstream.errors import StorageError
+from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
-from structgstream.memory import PeakKind, PeakMeter
-from structgstream.presets import StreamConfig
-from structgstream.rate_control import RateController, pressed
+from structgstream.pipeline import Coder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
+from structgstream.rate_control import RateController
 from structgstream.resuming import check_resumable
-from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, on_device
 from structgstream.similarity import normalising_similarity
-from structgstream.training.initial import fit_first_frame
-from structgstream.training.online import fit_next_frame, remembers
-from structgstream.training.pictures import FramePictures, pictures_of
-from structgstream.training.residuals import ResidualFloor, residual_floor
-from structgstream.training.result import FitResult, StepListener
-from structgstream.training.views import training_views
+from structgstream.training.pictures import FramePictures
+from structgstream.training.result import StepListener
 
 
-@dataclass(frozen=True)
-class FrameReport:
-    """What happened to one frame.
-
-    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors.
-
-    Peaks of memory are by stage: ``read``, ``fit``, and ``store`` for encoding and writing. ``peak_memory_kind`` says
-    whether they are each stage's own (Note [Peaks]); ``peak_device_bytes`` has the GPU's, when there is one.
-    ``cpu_seconds`` is the time of all the process's threads together, which other processes do not lengthen.
-    """
-
-    index: int
-    pts_seconds: float
-    kind: PacketKind
-    bytes: int
-    field_bytes: Mapping[FieldName, int]
-    train_psnr: float
-    anchors: int
-    moving: int
-    free: int
-    spawned: int
-    pruned: int
-    grown: int = 0
-    removed: int = 0
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    peak_memory_bytes: Mapping[str, int] = field(default_factory=dict)
-    peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
-    peak_memory_kind: PeakKind = PeakKind.NONE
-    cpu_seconds: float = 0.0
-    counts: Mapping[str, int] = field(default_factory=dict)
-
-
-@dataclass
-class _Past:
-    """What a frame is fitted after: the last scene, the one before it, what frame 0 missed, as far as they count."""
-
-    scene: Scene | None = None
-    older: Scene | None = None
-    floor: ResidualFloor | None = None
-
-
-class Session:
+class Session(Generic[State, Memory]):
     """Reconstructs a capture into a sink, frame by frame.
 
     Args:
         source: the capture.
         sink: where packets go.
-        config: everything that decides the result.
+        pipeline: how frames are fitted and stored, such as ``stream_pipeline(PRESETS["compact"])``.
         backend: what computes.
         resumed: the reader of what the sink already holds, to continue after it.
         metadata: plain JSON values for the header (nothing that differs between runs: resuming is exact).
-        first: frame 0 as it was fitted before, with the same capture, seed and ``config.initial``; variants that differ
-            in later frames alone can share it.
         on_step: called after every optimisation step.
 
     Raises:
-        ConfigError: the stream to resume was made with another configuration or from another capture.
+        ConfigError: the stream to resume was made with another configuration or from another capture, or a target rate
+            cannot be kept.
     """
 
     def __init__(
         self,
         source: FrameSource,
         sink: PacketSink,
-        config: StreamConfig,
+        pipeline: Pipeline[State, Memory],
         backend: Backend,
         *,
-        resumed: StreamReader | None = None,
+        resumed: StoredStream[State] | None = None,
         metadata: Mapping[str, object] | None = None,
-        first: FitResult | None = None,
         on_step: StepListener | None = None,
     ) -> None:
         self._source = source
         self._sink = sink
-        self._config = config
+        self._pipeline = pipeline
         self._backend = backend
-        self._resumed = resumed
-        self._metadata = {"capture": source.name, **(metadata or {})}
-        self._first = first
+        self._resumed = resumed if resumed is not None and len(resumed) else None
         self._on_step = on_step
-        self._similarity = normalising_similarity(source.rig, radius=config.normalised_radius)
+        self._similarity = normalising_similarity(source.rig, radius=pipeline.normalised_radius)
         self._rig = self._similarity.rig(source.rig)
-        if config.rate.target_mbits is not None and config.codec != "compact":
-            raise ConfigError(
-                f"A target of {config.rate.target_mbits:g} Mbit/s was given for a stream with codec {config.codec!r}, "
-                "whose packets are as large as they are; take --preset compact, or leave the target out."
-            )
+        self._facts = StreamFacts(
+            codec=pipeline.codec.name,
+            rig=source.rig,
+            similarity=self._similarity,
+            fps=source.fps,
+            config=pipeline.config,
+            metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
+        )
+        self._key_interval = pipeline.codec.key_interval(source.fps)
+        self._controller = RateController(pipeline.rate, source.fps, key_interval=self._key_interval)
+        self._coder: Coder[State] | None = None
+        self._steps: Mapping[str, float] = {}
         if resumed is not None:
-            check_resumable(resumed.header, source, config=config, metadata=self._metadata)
+            check_resumable(resumed.header, self._facts)
 
     def run(self) -> Generator[FrameReport, None, None]:
         """Fit, encode and write every frame that the sink does not hold yet; yields a report for each.
 
-        The sink is closed, with its index, however the loop ends; only a sink that could not write gets no index.
+        A stream that is whole and complete is not touched. Otherwise the sink is closed, with its index, however the
+        loop ends; only a sink that could not write gets no index.
         """
+        resumed = self._resumed
+        if resumed is not None and resumed.complete and len(resumed) >= len(self._source):
+            return
         try:
-            yield from self._frames()
+            if resumed is None:
+                yield from self._frames(None, 0)
+            else:
+                self._reopen(resumed)
+                if len(resumed) < len(self._source):
+                    yield from self._frames(self._past(resumed), len(resumed))
         except BaseException:
             with suppress(StorageError):  # What went wrong first is what the user must see.
                 self._sink.close()
             raise
         self._sink.close()
 
-    def _frames(self) -> Iterator[FrameReport]:
-        encoder: SceneEncoder | None = None
-        past, online = _Past(), self._config.online
-        steps: Mapping[str, float] = {}
-        controller = RateController(self._config.rate, self._source.fps, key_interval=self._key_interval)
-        start = 0
-        if self._resumed is not None:
-            encoder, steps = SceneEncoder(self._resumed.header), self._resumed.header.steps
-            self._sink.open(self._resumed.header)
-            start = len(self._resumed)
-            for info in self._resumed.packets:
-                controller.add(info.bytes, info.kind)
-            for packet in self._resumed.group(start - 1) if start else ():
-                past.scene = encoder.follow(packet)
-            if remembers(online) and start > 1:
-                past.older = self._resumed.scene(start - 2)
-        if start >= len(self._source):
-            return
-        if start > 0 and online.motion.residual_threshold > 0.0:
-            assert self._resumed is not None
-            past.floor = self._floor(self._resumed.scene(0), next(self._source.frames(0)))
+    def _frames(self, past: Past[State, Memory] | None, start: int) -> Iterator[FrameReport]:
+        method = self._pipeline.method
+        with Lookahead(self._observed(start)) as observed:
+            for meter, task in metered(self._tasks(observed), self._backend.device):
+                fit = method.first(task) if past is None else method.next(past, task)
+                meter.end("fit", peak="fit")
+                encoded = self._encode(fit.scene, task)
+                meter.end("encode")
+                size = self._write(encoded.packet)
+                meter.end("write", peak="store")
+                past = self._after(past, encoded.reconstruction, task)
+                meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
+                yield meter.report(fit, encoded, size)
+
+    def _observed(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
+        """Each frame from ``start`` on and what its pictures tell by themselves."""
+        method = self._pipeline.method
         # What moves shows against the frame before, so a resumed stream reads that one once more.
-        again = start > 0 and online.motion.enabled
+        again = start > 0 and method.needs_before
         frames = self._source.frames(start - again)
-        last = next(frames) if again else None
-        with Lookahead(self._shown(frames, last)) as shown:
-            yield from self._fitted(shown, past, encoder, steps, controller)
-
-    def _fitted(
-        self,
-        shown: Iterator[tuple[MultiViewFrame, FramePictures | None]],
-        past: _Past,
-        encoder: SceneEncoder | None,
-        steps: Mapping[str, float],
-        controller: RateController,
-    ) -> Iterator[FrameReport]:
-        """Fit, encode and write every frame that is ``shown``, beginning after ``past``."""
-        online = self._config.online
-        while True:
-            peaks = PeakMeter(self._backend.device)
-            started, cpu_started = time.perf_counter(), time.process_time()
-            found = next(shown, None)
-            if found is None:
-                return
-            frame, pictures = found
-            peaks.end("read")
-            read = time.perf_counter()
-            fit = self._fit(past, frame, pictures, steps, controller.pressure)
-            peaks.end("fit")
-            fitted = time.perf_counter()
-            fitted_scene = fit.scene
-            if past.scene is None:
-                fitted_scene, header = begun(
-                    fitted_scene,
-                    self._source,
-                    frame=frame,
-                    config=self._config,
-                    metadata=self._metadata,
-                    similarity=self._similarity,
-                    backend=self._backend,
-                )
-                if encoder is None:
-                    encoder, steps = SceneEncoder(header), header.steps
-                    self._sink.open(header)
-            assert encoder is not None, "there is one with a scene"
-            kind = PacketKind.KEY if frame.index % self._key_interval == 0 else PacketKind.DELTA
-            encoded = encoder.encode(fitted_scene, index=frame.index, pts_seconds=frame.pts_seconds, kind=kind)
-            scene = encoded.reconstruction
-            if frame.index == 0 and online.motion.residual_threshold > 0.0:
-                past.floor = self._floor(scene, frame)
-            past = _Past(
-                scene,
-                floor=past.floor,
-                older=past.scene if remembers(online) else None,
-            )
-            coded = time.perf_counter()
-            size = self._sink.write(encoded.packet)
-            controller.add(size, kind)
-            peaks.end("store")
-            done = time.perf_counter()
-            yield FrameReport(
-                index=frame.index,
-                pts_seconds=frame.pts_seconds,
-                kind=kind,
-                bytes=size,
-                field_bytes=encoded.packet.field_bytes,
-                train_psnr=fit.train_psnr,
-                anchors=len(scene.anchors),
-                moving=fit.moving,
-                free=len(scene.free),
-                spawned=fit.spawned,
-                pruned=fit.pruned,
-                counts=dict(fit.counts),
-                grown=fit.grown,
-                removed=fit.removed,
-                seconds={
-                    "read": read - started,
-                    **fit.seconds,
-                    "fit": fitted - read,
-                    "encode": coded - fitted,
-                    "write": done - coded,
-                    "total": done - started,
-                },
-                peak_memory_bytes=peaks.process_bytes,
-                peak_device_bytes=peaks.device_bytes,
-                peak_memory_kind=peaks.kind,
-                cpu_seconds=time.process_time() - cpu_started,
-            )
-
-    def _shown(
-        self, frames: Iterator[MultiViewFrame], last: MultiViewFrame | None
-    ) -> Iterator[tuple[MultiViewFrame, FramePictures | None]]:
-        """Each frame, and what its pictures tell by themselves; nothing of the frame that a stream begins with."""
-        online = self._config.online
+        before = next(frames) if again else None
         for frame in frames:
-            pictures = None
-            if frame.index > 0:
-                pictures = pictures_of(
-                    frame, self._rig, before=last, motion=online.motion, start=online.start, backend=self._backend
-                )
-            last = frame
-            yield frame, pictures
+            yield frame, method.observe(frame, before, rig=self._rig, backend=self._backend)
+            before = frame if method.needs_before else None
 
-    def _floor(self, scene: Scene, frame: MultiViewFrame) -> ResidualFloor:
-        device, scale = self._backend.device, self._config.online.motion.picture_scale
-        views = training_views(frame, self._rig, device)
-        return residual_floor(on_device(scene, device), views, scale=scale, backend=self._backend)
+    def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
+        """The tasks of frames; each is made when the frame before is written, on which its pressure depends."""
+        for frame, pictures in observed:
+            yield self._task(frame, pictures)
 
-    @property
-    def _key_interval(self) -> int:
-        return max(1, round(self._source.fps * self._config.key_interval_seconds))
-
-    def _fit(
-        self,
-        past: _Past,
-        frame: MultiViewFrame,
-        pictures: FramePictures | None,
-        steps: Mapping[str, float],
-        pressure: float,
-    ) -> FitResult:
-        seed = frame_seed(self._config.seed, frame.index)
-        if past.scene is None:
-            if self._first is not None:
-                return self._first
-            points = initial_points_of(
-                self._source,
-                frame,
-                config=self._config.points,
-                seed=self._config.seed,
-                similarity=self._similarity,
-            )
-            return fit_first_frame(
-                frame,
-                self._rig,
-                points,
-                config=self._config.initial,
-                backend=self._backend,
-                seed=seed,
-                on_step=self._on_step,
-            )
-        device = self._backend.device
-        return fit_next_frame(
-            on_device(past.scene, device),
+    def _task(self, frame: MultiViewFrame, pictures: FramePictures) -> FrameTask:
+        pipeline = self._pipeline
+        points = partial(
+            initial_points_of,
+            self._source,
             frame,
+            config=pipeline.points,
+            seed=pipeline.seed,
+            similarity=self._similarity,
+        )
+        return FrameTask(
+            frame,
+            pictures,
             self._rig,
-            config=pressed(self._config.online, pressure),
-            backend=self._backend,
-            seed=seed,
-            pictures=pictures,
-            steps=steps,
-            floor=past.floor,
-            older=None if past.older is None else on_device(past.older, device),
+            points,
+            self._backend,
+            seed=frame_seed(pipeline.seed, frame.index),
+            steps=self._steps,
+            pressure=self._controller.pressure,
             on_step=self._on_step,
         )
+
+    def _encode(self, fitted: State, task: FrameTask) -> Encoded[State]:
+        """The packet of a frame; frame 0 begins the stream."""
+        if self._coder is None:
+            fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
+            self._coder = self._open(header)
+        index = task.frame.index
+        kind = PacketKind.KEY if index % self._key_interval == 0 else PacketKind.DELTA
+        return self._coder.encode(fitted, index=index, pts_seconds=task.frame.pts_seconds, kind=kind)
+
+    def _write(self, packet: Packet) -> int:
+        size = self._sink.write(packet)
+        self._controller.add(size, packet.kind)
+        return size
+
+    def _open(self, header: StreamHeader) -> Coder[State]:
+        self._steps = header.steps
+        coder = self._pipeline.codec.coder(header, self._backend.device)
+        self._sink.open(header)
+        return coder
+
+    def _after(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
+        """What the next frame is fitted after."""
+        method = self._pipeline.method
+        if past is None:
+            return Past(state, method.prepare(state, lambda: task))
+        return Past(state, past.memory, past.state if method.needs_older else None)
+
+    def _reopen(self, resumed: StoredStream[State]) -> None:
+        """Go on with what is there."""
+        self._coder = self._open(resumed.header)
+        for info in resumed.packets:
+            self._controller.add(info.bytes, info.kind)
+
+    def _past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
+        """What the next frame is fitted after, from what is there."""
+        assert self._coder is not None, "reopened before"
+        method, count = self._pipeline.method, len(resumed)
+        state = deque(map(self._coder.follow, resumed.group(count - 1)), maxlen=1).pop()
+        older = resumed.scene(count - 2) if method.needs_older and count > 1 else None
+        return Past(state, method.prepare(resumed.scene(0), self._first_task), older)
+
+    def _first_task(self) -> FrameTask:
+        """Frame 0's, read once more."""
+        frame = next(self._source.frames(0))
+        return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))

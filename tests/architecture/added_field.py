@@ -53,9 +53,9 @@ def fitted(scene: Scene) -> Scene:
     backend = reference_backend()
     steps: dict[Any, float] = {NAME: RoundingConfig().steps(0.01)[NAME]}
     parameters = Parameters.of(scene, trained=parameters_of_fields({NAME}), steps=steps)
-    assert parameters.trained == [NAME]
+    assert [name for name, value in parameters.values.items() if value.requires_grad] == [NAME]
     drawn, camera = parameters.scene(scene), arc_rig()["cam00"]
     image = draw(drawn.gaussians(camera, backend), camera, backend).image
     (gradient,) = torch.autograd.grad(-image.sum(), [parameters.values[NAME]])
-    Adam(backend).step(parameters, {NAME: gradient}, online_rates(OnlineConfig(), 0.0))
+    Adam(backend, parameters.values).step({NAME: gradient}, online_rates(OnlineConfig(), 0.0))
     return detached(parameters.scene(scene))

@@ -37,13 +37,13 @@ class Truth:
 
     @property
     def center(self) -> Floats:
-        return np.asarray(-self.R.T @ self.T, np.float64)
+        return (-self.R.T @ self.T).astype(np.float64)
 
     def pixels(self, points: Floats) -> Floats:
         """What OpenCV projects, in the package's convention."""
         project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
         found, _ = project(points[:, None], self.rvec, self.T, self.K, np.array(self.dist))
-        return found[:, 0] + 0.5
+        return (found[:, 0] + 0.5).astype(np.float64)
 
 
 def truths(*, names: Sequence[str] = NAMES, dist: tuple[float, ...] = (-0.1, 0.03, 0.002, -0.001, 0.01)) -> list[Truth]:

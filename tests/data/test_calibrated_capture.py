@@ -4,15 +4,21 @@
 import pickle
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from calibrations import WRITERS, truths, write_anipose, write_cmu, write_easymocap
-from captures import all_numbers, picture, write_picture, write_videos
+from calibrations import WRITERS, Floats, Truth, truths, write_anipose, write_cmu, write_easymocap, write_opencv
+from captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
+from structgstream.data.clip import bundled_clip
+from structgstream.data.colmap import PARAMETERS
+from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import LAYOUTS, open_capture
-from structgstream.data.undistortion import Undistorted
+from structgstream.data.pose_check import check_poses
+from structgstream.data.undistortion import Undistorted, Undistortion
 from structgstream.errors import CalibrationError, CaptureError
+from structgstream.presets import PAPER_DATA
 
 NAMES = ["cam00", "cam01", "cam02"]
 EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(3)]
@@ -59,6 +65,16 @@ def test_names_that_differ_in_form_are_matched_by_number(tmp_path: Path) -> None
     expected = {camera.name: camera.center for camera in truths(names=("port_2", "port_0", "port_1"))}
     for name in source.rig:
         np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name], atol=1e-6)
+
+
+def test_a_name_may_be_a_word_of_the_files(tmp_path: Path) -> None:
+    """What cameras write, beside serial numbers of a calibration that knows one camera more."""
+    write_anipose(tmp_path, truths(names=("23087", "23088", "26580", "1")))
+    write_videos(tmp_path, ["take 2_Miqus_7_23088", "take 2_Miqus_8_26580", "take 2_Miqus_9_23087"], frames=2)
+    source = open_capture(tmp_path)
+    expected = {camera.name: camera.center for camera in truths(names=("23087", "23088", "26580", "1"))}
+    for name in source.rig:
+        np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name[-5:]], atol=1e-6)
 
 
 @pytest.mark.parametrize("names", [("a1", "a2", "a3"), ("left", "middle", "right"), ("cam0", "cam0b", "cam1")])
@@ -149,5 +165,72 @@ def test_pickles_are_refused(tmp_path: Path) -> None:
 
 
 def test_what_can_be_read_is_listed() -> None:
+    page = (Path(__file__).parents[2] / "docs/captures.md").read_text()
     for name in ("aniposelib", "EasyMocap", "multical", "Kalibr", "CMU Panoptic", "Qualisys", "ZJU-MoCap", "OpenCV"):
         assert name in LAYOUTS
+        assert name in page
+    assert not [model for model in PARAMETERS if model not in page]
+    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    rows = {first: cells for first, *cells in table}
+    assert rows["preset"] == [f"`{name}`" for name in PAPER_DATA]
+    assert rows["held out"] == [f"`{data.held_out_camera}`" for data in PAPER_DATA.values()]
+    for cell, data in zip(rows["size that the paper trains on"], PAPER_DATA.values(), strict=True):
+        assert cell.startswith(f"{data.width} x {data.height}")
+        assert (f"`--scale {data.scale:g}`" in cell) == (data.scale != 1)
+
+
+def through_a_lens(image: Picture, K: Floats, dist: tuple[float, ...]) -> Picture:
+    """The picture that a lens would have taken, by OpenCV: its pixels undistorted are those of ``image``."""
+    height, width = image.shape[:2]
+    centers = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float64).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(centers, K, np.array(dist), P=K).reshape(height, width, 2).astype(np.float32)
+    return np.asarray(cv2.remap(image, straight[..., 0], straight[..., 1], cv2.INTER_CUBIC), np.uint8)
+
+
+def test_the_clip_through_a_lens(tmp_path: Path) -> None:
+    """Pictures of a known scene, distorted, and the calibration in a file: they come back and agree with the poses."""
+    clip = bundled_clip()
+    frame = next(clip.frames())
+    dist = (0.12, -0.03, 0.001, -0.001, 0.0)
+    cameras = []
+    for name in clip.rig:
+        camera = clip.rig[name]
+        K = camera.K.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        cameras.append(Truth(name, K, dist, camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()))
+        write_picture(tmp_path / "images" / f"{name}.png", through_a_lens(frame.images[name], K, dist))
+    write_anipose(tmp_path, cameras)
+    file = tmp_path / "calibration.toml"
+    file.write_text(file.read_text().replace(f"size = [ {WIDTH}, {HEIGHT},]", "size = [ 320, 240,]"))
+    source = open_capture(tmp_path)
+    (made,) = source.frames()
+    for name in source.rig:
+        straight = Undistortion(LensCamera(clip.rig[name], Pinhole()), source.rig[name])
+        assert straight.shown is None  # within the picture that the clip has
+        truth = straight(frame.images[name])
+        error = ((made.images[name].astype(float) - truth.astype(float)) ** 2).mean()
+        assert 10 * np.log10(255**2 / error) > 33
+    check = check_poses(made, source.rig)
+    assert check.conclusive
+    assert check.share_violating < 0.1
+    assert check.median_epipolar_error_pixels < 0.7
+
+
+def test_a_file_with_camera_to_world_in_place_of_world_to_camera(tmp_path: Path) -> None:
+    """Only the pictures can tell."""
+    clip = bundled_clip()
+    frame = next(clip.frames())
+    cameras = []
+    for name in clip.rig:
+        camera = clip.rig[name]
+        pose = camera.viewmat.inverse().numpy()
+        cameras.append(Truth(name, camera.K.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], (0, 0, 0, 0),
+                             pose[:3, :3], pose[:3, 3]))  # fmt: skip
+        write_picture(tmp_path / "images" / f"{name}.png", frame.images[name])
+    write_opencv(tmp_path, cameras)
+    for name in clip.rig:
+        file = tmp_path / f"{name}.yml"
+        text = file.read_text().replace(f"image_width: {WIDTH}", "image_width: 320")
+        file.write_text(text.replace(f"image_height: {HEIGHT}", "image_height: 240"))
+    source = open_capture(tmp_path)
+    with pytest.raises(CalibrationError, match="look like camera-to-world matrices given as world-to-camera"):
+        check_poses(next(source.frames()), source.rig)

@@ -136,6 +136,15 @@ def test_a_static_folder_is_a_capture_of_one_frame(tmp_path: Path, folder: str, 
     assert all_numbers(source.frames()) == [[(camera, 7) for camera in range(3)]]
 
 
+def test_photos_that_the_model_could_not_place_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for number, name in enumerate(RIG):
+        write_picture(tmp_path / "images" / f"{name}.png", picture(number, 7))
+    write_picture(tmp_path / "images/blurred.png", picture(9, 7))
+    write_text_model(tmp_path / "sparse/0", RIG, [(f"{name}.png", name) for name in RIG])
+    assert list(open_colmap(tmp_path).rig) == list(RIG)
+    assert "has no pose of camera 'blurred' of " in caplog.text
+
+
 @pytest.mark.parametrize("videos", [False, True])
 def test_a_model_with_lenses_is_undistorted(tmp_path: Path, videos: bool) -> None:
     """The pose stays, nothing is black, and the pictures are those of the right camera and frame."""

@@ -7,7 +7,8 @@ import torch
 from streams import small_scene
 from structgstream.cameras import Camera
 from structgstream.errors import BackendError
-from structgstream.evaluation.recording import counts, placed
+from structgstream.evaluation.recording import placed
+from structgstream.frame_report import counts
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 

@@ -19,11 +19,11 @@ def prepared():
     scene = with_appearance(random_scene(30), 2)
     parameters = Parameters.of(scene, trained=frozenset(ANCHOR_ROWS))
     densifier = Densifier.of(scene, config=CONFIG, iterations=1000, voxel_size=0.01)
-    adam = Adam(reference_backend())
+    adam = Adam(reference_backend(), parameters.values)
     gradients: dict[ParameterName, torch.Tensor] = {
         name: torch.ones_like(parameters.values[name]) for name in ANCHOR_ROWS
     }
-    adam.step(parameters, gradients, dict.fromkeys(ANCHOR_ROWS, 1e-9))
+    adam.step(gradients, dict.fromkeys(ANCHOR_ROWS, 1e-9))
     return scene, parameters, densifier, adam
 
 
@@ -53,7 +53,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
     densifier.gradients.count.fill_(1.0)
     densifier.opacities.visits.fill_(1.0)
     densifier.opacities.opacity[:] = torch.where(torch.arange(30) < 4, 0.0, 1.0)
-    grown, pruned = densifier.apply(scene, parameters, adam, torch.Generator().manual_seed(0), iteration=5)
+    grown, pruned = densifier.apply(scene, adam, torch.Generator().manual_seed(0), iteration=5)
     assert pruned == 4
     assert grown > 0
     assert (densifier.grown, densifier.pruned) == (grown, pruned)
@@ -75,7 +75,7 @@ def test_every_table_keeps_its_rows_in_step() -> None:
 def test_base_scales_are_bounded() -> None:
     scene, parameters, densifier, adam = prepared()
     parameters.values["base_scales"].detach().fill_(3.0)
-    densifier.apply(scene, parameters, adam, torch.Generator(), iteration=5)
+    densifier.apply(scene, adam, torch.Generator(), iteration=5)
     assert parameters.values["base_scales"].max() <= 0.05
 
 
@@ -96,7 +96,7 @@ def test_who_hardly_contributes_goes_from_every_table() -> None:
     assert not replace(densifier, config=CONFIG).judges(7)
     shares = torch.ones(30)
     shares[:6] = 0.1
-    assert densifier.judge(shares, parameters, adam) == densifier.pruned == 6
+    assert densifier.judge(shares, adam) == densifier.pruned == 6
     assert densifier.grown == 0
     for name in ANCHOR_ROWS:
         assert len(parameters.values[name]) == len(adam.first[name]) == 24

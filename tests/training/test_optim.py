@@ -4,7 +4,7 @@ import torch
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.optim import BETAS, EPS, Adam, Rate, constant
+from structgstream.training.optim import BETAS, EPS, Adam, Rate, constant, leaves
 from structgstream.training.parameters import Parameters
 
 
@@ -22,12 +22,12 @@ def test_steps_are_those_of_torch() -> None:
     parameters = Parameters.of(scene, trained=frozenset({"anchor_positions", "anchor_offsets"}))
     twin = parameters.values["anchor_positions"].detach().clone().requires_grad_()
     theirs = torch.optim.Adam([twin], lr=1e-2, betas=BETAS, eps=EPS)
-    ours = Adam(reference_backend())
+    ours = Adam(reference_backend(), parameters.values)
     for _ in range(5):
         gradient = torch.randn_like(twin) * 1e-6
         twin.grad = gradient.clone()
         theirs.step()
-        ours.step(parameters, {"anchor_positions": gradient}, {"anchor_positions": 1e-2})
+        ours.step({"anchor_positions": gradient}, {"anchor_positions": 1e-2})
     assert torch.allclose(parameters.values["anchor_positions"], twin, atol=1e-6)
     assert torch.equal(parameters.values["anchor_offsets"], scene.anchors.offsets)
 
@@ -35,16 +35,38 @@ def test_steps_are_those_of_torch() -> None:
 def test_rows_come_and_go_with_their_state() -> None:
     scene = random_scene(4)
     parameters = Parameters.of(scene, trained=frozenset({"anchor_positions"}))
-    adam = Adam(reference_backend())
-    adam.step(parameters, {"anchor_positions": torch.ones(4, 3)}, {"anchor_positions": 0.1})
+    adam = Adam(reference_backend(), parameters.values)
+    adam.step({"anchor_positions": torch.ones(4, 3)}, {"anchor_positions": 0.1})
     keep = torch.tensor([True, False, True, True])
     before = adam.first["anchor_positions"].clone()
-    adam.replace_rows(["anchor_positions"], keep=keep, added=2)
+    kept = parameters.values["anchor_positions"].detach()[keep]
+    adam.replace_rows({"anchor_positions": torch.full((2, 3), 7.0)}, keep=keep)
+    assert torch.equal(parameters.values["anchor_positions"], torch.cat([kept, torch.full((2, 3), 7.0)]))
+    assert parameters.values["anchor_positions"].requires_grad
     assert torch.equal(adam.first["anchor_positions"], torch.cat([before[keep], torch.zeros(2, 3)]))
 
 
 def test_a_rate_of_zero_moves_nothing() -> None:
     parameters = Parameters.of(random_scene(3), trained=frozenset({"anchor_positions"}))
     before = parameters.values["anchor_positions"].detach().clone()
-    Adam(reference_backend()).step(parameters, {"anchor_positions": torch.ones(3, 3)}, {"anchor_positions": 0.0})
+    Adam(reference_backend(), parameters.values).step({"anchor_positions": torch.ones(3, 3)}, {"anchor_positions": 0.0})
     assert torch.equal(parameters.values["anchor_positions"], before)
+
+
+def test_a_leaf_that_is_put_in_anew_has_no_moments_and_counts_on() -> None:
+    adam = Adam(reference_backend(), leaves({"x": torch.zeros(3), "y": torch.zeros(2)}))
+    adam.step({"x": torch.ones(3), "y": torch.ones(2)}, {"x": 0.1, "y": 0.1})
+    adam.replace_values("x", torch.full((3,), 5.0))
+    assert adam.values["x"].tolist() == [5.0] * 3
+    assert adam.values["x"].requires_grad
+    assert not adam.first["x"].any()
+    assert adam.first["y"].all()
+    assert adam.steps == {"x": 1, "y": 1}
+
+
+def test_leaves_are_copies() -> None:
+    value = torch.zeros(3)
+    leaf = leaves({"x": value})["x"]
+    assert leaf.requires_grad
+    leaf.detach().add_(1.0)
+    assert not value.any()

@@ -33,11 +33,6 @@ def test_parameters_are_copies() -> None:
     assert torch.equal(scene.anchors.positions, random_scene(free=2).anchors.positions)
 
 
-def test_empty_sets_are_not_trained() -> None:
-    parameters = Parameters.of(random_scene(), trained=frozenset(FREE_ROWS))
-    assert parameters.trained == []
-
-
 def test_the_gauge_holds_while_colour_is_trained() -> None:
     color = CameraColor(gains=torch.rand(3, 3) + 1.0, biases=torch.rand(3, 3))
     scene = replace(random_scene(), camera_color=color)

@@ -15,9 +15,10 @@ from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, Moving
+from structgstream.training.optimize import gradients_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.partition import Partition, focuses
-from structgstream.training.step import gradients_of, view_loss
+from structgstream.training.step import view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import training_views
 from worlds import moving_world
@@ -96,7 +97,7 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
                 watch=Stopwatch(CPU),
                 focus=place,
             )
-            found.append(gradients_of(loss, parameters, Stopwatch(CPU))[0])
+            found.append(gradients_of(loss, parameters.values, Stopwatch(CPU))[0])
         for name, theirs in found[1].items():
             rows = partition.which.free if name.startswith("free") else partition.which.anchors
             ours = found[0][name][rows]

@@ -11,7 +11,7 @@ from structgstream.scene.state import ParameterName
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
-from structgstream.training.population import patched
+from structgstream.training.population import Population
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.views import training_views
 from worlds import moving_world
@@ -37,53 +37,54 @@ def ones(parameters: Parameters) -> dict[ParameterName, torch.Tensor]:
     return {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
 
 
-def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[Parameters, Adam, torch.Tensor, int]:
+def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[Population, torch.Tensor]:
     parameters = Parameters.of(SCENE, trained=parameters_of_fields({"free"}))
-    adam = Adam(BACKEND)
-    adam.step(parameters, ones(parameters), dict.fromkeys(FREE_ROWS, 0.0))
+    adam = Adam(BACKEND, parameters.values)
+    adam.step(ones(parameters), dict.fromkeys(FREE_ROWS, 0.0))
     statistics = GradientStatistics(SLOTS + 3, CPU)
     statistics.total[SLOTS] = 1.0  # Two free ones have large gradients, ...
     statistics.total[SLOTS + 1] = dying_gradient
     statistics.total[SLOTS + 2] = 2.0  # ... the last the largest.
     statistics.count[SLOTS:] = 1.0
-    keep, born = patched(
-        parameters,
-        adam,
-        scene=SCENE,
+    views = training_views(WORLD.frames[0], WORLD.rig, CPU)
+    population = Population(
+        config=PatchingConfig(),
+        template=SCENE,
+        parameters=parameters,
+        adam=adam,
         statistics=statistics,
-        views=training_views(WORLD.frames[0], WORLD.rig, CPU),
+        views=views,
         frame_index=7,
         room=room,
-        config=PatchingConfig(),
         backend=BACKEND,
         generator=torch.Generator().manual_seed(0),
     )
-    return parameters, adam, keep, born
+    return population, population.patch(views[0])
 
 
 def test_the_faint_die_and_children_follow_those_that_stay() -> None:
-    parameters, adam, keep, born = patch(room=10)
+    population, keep = patch(room=10)
+    parameters = population.parameters
     assert keep.tolist() == [True, False, True]
-    assert born == 2
+    assert (population.spawned, population.pruned) == (2, 1)
     assert parameters.births.tolist() == [4, 6, 7 * BIRTHS_PER_FRAME, 7 * BIRTHS_PER_FRAME + 1]
     assert all(len(parameters.values[name]) == 4 for name in FREE_ROWS)
     assert torch.equal(parameters.values["free_logit_opacities"][:2], torch.tensor([2.0, 1.0]))
     torch.testing.assert_close(parameters.values["free_colors"][2:], torch.tensor([[0.2, 0.4, 0.6]] * 2))
     # Moments have gone the same way: another step takes them all.
-    adam.step(parameters, ones(parameters), dict.fromkeys(FREE_ROWS, 0.1))
+    population.adam.step(ones(parameters), dict.fromkeys(FREE_ROWS, 0.1))
 
 
 def test_who_dies_has_no_children() -> None:
-    parameters, _, keep, born = patch(room=10, dying_gradient=3.0)
+    population, keep = patch(room=10, dying_gradient=3.0)
     assert keep.tolist() == [True, False, True]
-    assert born == 2
-    assert len(parameters.births) == 4
+    assert population.spawned == 2
+    assert len(population) == 4
 
 
 def test_no_more_are_born_than_there_is_room_for_and_the_largest_gradient_comes_first() -> None:
-    whole, _, _, _ = patch(room=10)
-    parameters, _, keep, born = patch(room=3)
-    assert born == 1
-    assert len(parameters.births) == int(keep.sum()) + 1 == 3
-    assert patch(room=2)[3] == 0
-    assert len(whole.births) == 4
+    assert len(patch(room=10)[0]) == 4
+    population, keep = patch(room=3)
+    assert population.spawned == 1
+    assert len(population) == int(keep.sum()) + 1 == 3
+    assert patch(room=2)[0].spawned == 0

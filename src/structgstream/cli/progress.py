@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from structgstream.session import FrameReport
+    from structgstream.frame_report import FrameReport
     from structgstream.training.result import Step
 
 QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a frame

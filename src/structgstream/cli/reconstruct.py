@@ -43,7 +43,7 @@ class Reconstruct:
     """
 
     scene: tyro.conf.Positional[Folder]
-    """The capture: a folder of one of the known layouts."""
+    """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
@@ -127,21 +127,28 @@ def reconstructed(
         Interrupted: the user pressed Ctrl-C; whole frames are in the file.
         StructGStreamError: whatever goes wrong; whole frames are in the file.
     """
-    from structgstream.recorder import Recorder
+    from structgstream.recorder import record
+    from structgstream.struct_gstream import stream_pipeline
 
-    recorder = Recorder(output, resume=resume)
-    done = recorder.done
+    run = record(
+        output,
+        source,
+        stream_pipeline(config),
+        backend,
+        resume=resume,
+        metadata=metadata,
+        on_step=lambda step: progress.step(step),  # Made below: it begins with the frames that are there.
+    )
+    done = run.done
     peaks: dict[str, int] = {}
     try:
-        with display(len(source), done=done) as progress:
-            recording = recorder.record(source, config, backend, metadata=metadata, on_step=progress.step)
-            with closing(recording) as reports:
-                for report in reports:
-                    on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
-                    for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
-                        peaks[stage] = max(size, peaks.get(stage, 0))
-                    progress.frame(report)
-                    done = report.index + 1
+        with display(len(source), done=done) as progress, closing(run.reports) as reports:
+            for report in reports:
+                on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
+                for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
+                    peaks[stage] = max(size, peaks.get(stage, 0))
+                progress.frame(report)
+                done = report.index + 1
     except KeyboardInterrupt:
         kept = f"{output} has {done} of {len(source)} frames; go on with the same command and --resume."
         raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None

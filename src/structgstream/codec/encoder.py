@@ -10,6 +10,7 @@ trainer and viewers would drift apart.
 
 import math
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from structgstream.codec.container.blocks import coded_block, packed_block
 from structgstream.codec.container.payload import packet_with
@@ -20,13 +21,15 @@ from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
+SceneT = TypeVar("SceneT", covariant=True)
+
 
 @dataclass(frozen=True)
-class Encoded:
+class Encoded(Generic[SceneT]):
     """A packet and its reconstruction: the scene that a decoder gets."""
 
     packet: Packet
-    reconstruction: Scene
+    reconstruction: SceneT
 
 
 class SceneEncoder:
@@ -50,7 +53,7 @@ class SceneEncoder:
         self._last_pts_seconds = packet.pts_seconds
         return scene
 
-    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded:
+    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[Scene]:
         """The packet of one frame.
 
         Raises:

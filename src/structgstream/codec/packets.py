@@ -86,7 +86,7 @@ class Packet:
     index: int
     pts_seconds: float
     payload: bytes
-    field_bytes: Mapping[FieldName, int]
+    field_bytes: Mapping[str, int]
 
     def __repr__(self) -> str:
         return f"Packet({self.kind.name}, index={self.index}, {len(self.payload)} bytes)"

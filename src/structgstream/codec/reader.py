@@ -47,7 +47,6 @@ from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName
 
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
 
@@ -66,7 +65,7 @@ class PacketInfo:
     pts_seconds: float
     offset: int
     bytes: int
-    field_bytes: Mapping[FieldName, int]
+    field_bytes: Mapping[str, int]
 
 
 class Packets(Sequence[PacketInfo]):
@@ -118,7 +117,7 @@ class Packets(Sequence[PacketInfo]):
             if record_at(self._data, offset) is None:  # The record was damaged after opening.
                 raise self.damaged(index) from error
             raise
-        field_bytes: dict[FieldName, int] = {block.name: block.end - block.start for block in blocks}
+        field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
         size = RECORD.size + head[1] + CHECKSUM.size
         return PacketInfo(_KINDS[RecordType(head[0])], index, pts_seconds, offset, size, field_bytes)
 

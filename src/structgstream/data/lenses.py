@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 
 NEWTON_STEPS = 50
 CLOSE_ENOUGH = 1e-10
+FAR = 12.0  # normalised: 85 degrees from the axis
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,17 @@ class RadialTangential:
 
     @property
     def reach(self) -> float:
-        """The smallest radius at which the distorted radius stops increasing, or the factor has a pole."""
+        """The smallest radius at which the distorted picture folds, or the factor has a pole."""
         over, under = self._polynomials
         radius = Polynomial([0.0, 1.0])
         grows = (radius * over).deriv() * under - radius * over * under.deriv()
-        return min(_first_root(grows), _first_root(under))
+        radial = min(_first_root(grows), _first_root(under)) * (1 - 1e-9)
+        if not (self.p1 or self.p2):
+            return radial
+        radii, angles = np.linspace(0, min(radial, FAR), 256), np.linspace(0, 2 * math.pi, 64, endpoint=False)
+        rays = np.stack([np.cos(angles), np.sin(angles)], -1)
+        folded = np.linalg.det(_jacobian(self._anywhere, radii[:-1, None, None] * rays)).min(1) <= 0
+        return float(radii[:-1][folded][0]) if folded.any() else radial
 
     @property
     def _polynomials(self) -> tuple[Polynomial, Polynomial]:
@@ -83,21 +90,28 @@ class RadialTangential:
 
     def undistort(self, points: Floats) -> Floats:
         """Newton's method, started from the inverse of the radial part."""
-        radii = _radii(points)
+        wanted, points = points, np.nan_to_num(points)
+        radii, reach = _radii(points), self.reach
         over, under = self._polynomials
-        bounded = _inverse(lambda r: r * over(r) / under(r), radii, most=self.reach)
-        with np.errstate(invalid="ignore"):
-            found = points * np.where(radii > 0, bounded / np.where(radii > 0, radii, 1.0), 1.0)
-        if not (self.p1 or self.p2):
-            return found
+        bounded = _inverse(lambda r: r * over(r) / under(r), radii, most=reach)
+        tilted = bool(self.p1 or self.p2)
+        start = np.where(np.isfinite(bounded) | (not tilted), bounded, min(reach, FAR))
+        found = points * np.where(radii > 0, start / np.where(radii > 0, radii, 1.0), 1.0)
+        if not tilted:
+            return np.where(np.isnan(wanted), np.nan, found)
         for _ in range(NEWTON_STEPS):
-            error = self._anywhere(found) - points
-            step = np.linalg.solve(_jacobian(self._anywhere, np.nan_to_num(found)), error[..., None])[..., 0]
-            found = found - step
-            if not np.nanmax(np.abs(step), initial=0.0) > CLOSE_ENOUGH:
+            jacobian = _jacobian(self._anywhere, found)
+            flat = np.abs(np.linalg.det(jacobian)) < 1e-9
+            step = np.linalg.solve(np.where(flat[..., None, None], np.eye(2), jacobian), self._missed(found, points))
+            found = found - step[..., 0]
+            found = found * np.minimum(1, reach / np.maximum(_radii(found), 1e-12))
+            if np.abs(step).max(initial=0.0) < CLOSE_ENOUGH:
                 break
-        close = np.abs(self._anywhere(found) - points).max(-1, keepdims=True) < 1e-6
-        return np.where(close & (_radii(found) <= self.reach), found, np.nan)
+        close = np.abs(self._missed(found, points)[..., 0]).max(-1, keepdims=True) < 1e-6
+        return np.where(close & np.isfinite(wanted), found, np.nan)
+
+    def _missed(self, found: Floats, points: Floats) -> Floats:
+        return (self._anywhere(found) - points)[..., None]
 
 
 @dataclass(frozen=True)

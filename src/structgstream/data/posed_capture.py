@@ -67,6 +67,10 @@ def open_posed(
     for root in (path / name for name in ("images", *REDUCED, "")):
         if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
             poses = _poses(calibration, stills)
+            if poses and (unknown := sorted(stills.keys() - poses.keys(), key=natural)):
+                # Structure from motion often leaves out some photos; videos without a pose are a mistake.
+                log.warning("%s has no pose of %s of %s; left out", calibration.where, listed(unknown), root)
+                stills = {name: stills[name] for name in poses}
             return undistorted(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
@@ -143,8 +147,8 @@ def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pi
 def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, PosedCamera]:
     """The calibration of each camera that has one.
 
-    Names of cameras that differ in their form alone, such as ``cam_1`` and ``Camera01``, are matched by their numbers,
-    provided that all of them are.
+    Where no name is the same, a calibrated camera's may be one of the words of a file's (``take2_cam1``), or both may
+    have the same numbers (``cam_1`` and ``Camera01``), provided that every file finds its own.
 
     Raises:
         CalibrationError: pictures of one camera have different poses.
@@ -153,11 +157,20 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
     found = [next((part for part in path if part in cameras), None) for path in parts]
     if any(found) or any(_parts(posed.name) != (posed.name,) for posed in calibration.cameras):
         return _still(calibration, found)
-    numbered = {_number(name): name for name in cameras}
-    numbers = [_number(name) for (name,) in parts]
-    if None in numbered or len(numbered) != len(cameras) or set(numbers) != set(numbered):
-        return {}
-    return _still(calibration, [numbered[number] for number in numbers])
+    file_of = _by_word([posed.name for posed in calibration.cameras], cameras)
+    if not file_of:
+        numbered = {_number(name): name for name in cameras}
+        if None in numbered or len(numbered) != len(cameras) or {_number(name) for (name,) in parts} != set(numbered):
+            return {}
+        file_of = {name: numbered[_number(name)] for (name,) in parts}
+    return _still(calibration, [file_of.get(posed.name) for posed in calibration.cameras])
+
+
+def _by_word(names: Sequence[str], files: Collection[str]) -> dict[str, str]:
+    """The file of each camera whose name is a word of it; nothing when a file has none or several, or shares one."""
+    words = {file: [name for name in names if name in re.split(r"[^0-9A-Za-z]+", file)] for file in files}
+    found = {own[0]: file for file, own in words.items() if len(own) == 1}
+    return found if len(found) == len(files) else {}
 
 
 def _parts(name: str) -> tuple[str, ...]:

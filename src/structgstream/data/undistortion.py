@@ -26,7 +26,7 @@ from structgstream.frames import MultiViewFrame
 
 WIDEST_DEGREES = 110.0
 """Across the longer side. A rectilinear picture is stretched 3 times at the edge of 110 degrees, 15 times of 150."""
-MOST_OVERSAMPLING = 4
+WORTH_REDUCING = 1.25
 BORDER_SAMPLES = 129
 SCALE_SAMPLES = 33
 
@@ -111,11 +111,29 @@ def _inside(pixels: Floats, camera: Camera) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
+class Level:
+    """The part of the pinhole's picture that is sampled from one level of the lens picture's pyramid.
+
+    Args:
+        rows: of the pinhole's picture.
+        columns: of the pinhole's picture.
+        maps: source positions of its pixels, OpenCV's fixed-point numbers of 1/32 pixel.
+        weights: blending weight ``[h, w]`` float32 of this level over the finer ones; None for the first (weight 1).
+    """
+
+    rows: slice
+    columns: slice
+    maps: tuple[NDArray[np.generic], NDArray[np.generic]]
+    weights: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
 class Undistortion:
     """Resamples pictures of ``filmed`` for the pinhole ``target``, which has the same pose.
 
-    Against aliasing where pictures shrink, the picture is first reduced by area as far as no detail is lost, and every
-    pixel is the mean of a finer grid.
+    Against aliasing where pictures shrink, the picture is first reduced by area as far as no detail is lost; where a
+    pixel of the pinhole is still larger than one of the lens, it is sampled from a pyramid (Williams, Pyramidal
+    Parametrics, 1983).
     """
 
     filmed: LensCamera
@@ -124,12 +142,18 @@ class Undistortion:
     def __call__(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """``[H, W, 3]`` of the lens to ``[H, W, 3]`` of the pinhole; black where the lens shows nothing."""
         cv2 = opencv()
-        if (reduced := self._reduced) != (self.filmed.camera.width, self.filmed.camera.height):
-            picture = cv2.resize(picture, reduced, interpolation=cv2.INTER_AREA)
-        result = cv2.remap(picture, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        size = (self.target.width, self.target.height)
-        if result.shape[1::-1] != size:
-            result = cv2.resize(result, size, interpolation=cv2.INTER_AREA)
+        result = None
+        for number, level in enumerate(self._levels):
+            size = self._size(number)
+            if picture.shape[1::-1] != size:
+                picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            taken = cv2.remap(picture, *level.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            if result is None or level.weights is None:
+                result = taken
+            else:
+                finer = result[level.rows, level.columns]
+                result[level.rows, level.columns] = cv2.blendLinear(finer, taken, 1 - level.weights, level.weights)
+        assert result is not None
         if self.shown is not None:
             result[~self.shown] = 0
         return result
@@ -137,55 +161,69 @@ class Undistortion:
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
         """Mask ``[H, W]`` of the pinhole's pixels that the lens shows; None if all."""
-        shown = _inside(self.filmed.placed(_rays(self.target, 1)), self.filmed.camera)
+        shown = _inside(self.filmed.placed(_rays(self.target)), self.filmed.camera)
+        if not shown.any():
+            raise CalibrationError("The lens shows nothing of the requested field of view; give another.")
         return None if shown.all() else shown
 
     @cached_property
-    def _scales(self) -> tuple[float, float]:
-        """Least and most pixels of the lens, along any direction, in a pixel of the pinhole."""
-        K = self.target.K.numpy()
+    def _levels(self) -> tuple[Level, ...]:
+        """The first covers the whole picture; halved ones those parts where they are needed."""
+        pixels = self.filmed.placed(_rays(self.target))
+        halvings = _halvings(pixels, self.filmed.camera, self._size(0))
+        most = max(math.ceil(float(halvings.max()) - 0.5), 0)
+        shares = [np.ones_like(halvings), *(np.clip(halvings - number, 0, 1) for number in range(most))]
+        return tuple(self._level(number, pixels, share) for number, share in enumerate(shares))
+
+    def _level(self, number: int, pixels: Floats, share: Floats) -> Level:
+        cv2 = opencv()
+        rows, columns = np.flatnonzero(share.any(1)), np.flatnonzero(share.any(0))
+        part = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        width, height = self._size(number)
+        scale = width / self.filmed.camera.width, height / self.filmed.camera.height
+        found = pixels[part] * scale - 0.5  # OpenCV's pixel centres are integers
+        # Beyond the lens any place will do: those pixels become black.
+        found = np.clip(np.nan_to_num(found, nan=-1.0), -1, (width, height)).astype(np.float32)
+        maps = cv2.convertMaps(found[..., 0], found[..., 1], cv2.CV_16SC2)
+        return Level(*part, maps, share[part].astype(np.float32) if number else None)
+
+    def _size(self, number: int) -> tuple[int, int]:
+        """The size of the lens's picture after so many halvings; at first it is reduced as far as nothing is lost."""
+        factor = (self._least_scale if self._least_scale >= WORTH_REDUCING else 1.0) * 2**number
+        camera = self.filmed.camera
+        return max(round(camera.width / factor), 1), max(round(camera.height / factor), 1)
+
+    @cached_property
+    def _least_scale(self) -> float:
+        """Least pixels of the lens, along any direction, in a pixel of the pinhole."""
         across = np.linspace(1, self.target.width - 1, SCALE_SAMPLES)
         down = np.linspace(1, self.target.height - 1, SCALE_SAMPLES)
         pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
-
-        def at(pixels: Floats) -> Floats:
-            return self.filmed.placed((pixels - K[:2, 2]) / K[[0, 1], [0, 1]])
-
-        steps = [at(pixels + axis) - at(pixels - axis) for axis in np.eye(2) / 2]
+        straight = LensCamera(self.target, Pinhole())
+        steps = [
+            self.filmed.placed(straight.normalised(pixels + axis))
+            - self.filmed.placed(straight.normalised(pixels - axis))
+            for axis in np.eye(2) / 2
+        ]
         jacobians = np.stack(steps, -1)
         jacobians = jacobians[np.isfinite(jacobians).all((-1, -2))]
-        if not len(jacobians):
-            raise CalibrationError("The lens shows nothing of the requested field of view; give a wider one.")
-        singular = np.linalg.svd(jacobians, compute_uv=False)
-        return float(singular.min()), float(singular.max())
-
-    @property
-    def _reduced(self) -> tuple[int, int]:
-        """The size to which pictures of the lens are reduced first."""
-        width, height = self.filmed.camera.width, self.filmed.camera.height
-        factor = self._scales[0]
-        return (width, height) if factor < 1.25 else (round(width / factor), round(height / factor))
-
-    @cached_property
-    def _maps(self) -> tuple[NDArray[np.generic], NDArray[np.generic]]:
-        """Where each pixel comes from, in fixed-point numbers of 1/32 pixel, as OpenCV counts: centres are integers."""
-        cv2 = opencv()
-        camera, reduced = self.filmed.camera, self._reduced
-        left = self._scales[1] * reduced[0] / camera.width
-        grid = _rays(self.target, min(max(math.ceil(left - 0.5), 1), MOST_OVERSAMPLING))
-        pixels = self.filmed.placed(grid) * (reduced[0] / camera.width, reduced[1] / camera.height) - 0.5
-        # Beyond the lens any place will do: those pixels become black.
-        clipped = np.clip(np.nan_to_num(pixels, nan=-1.0), -1, np.array(reduced)).astype(np.float32)
-        return cv2.convertMaps(clipped[..., 0], clipped[..., 1], cv2.CV_16SC2)
+        return float(np.linalg.svd(jacobians, compute_uv=False).min()) if len(jacobians) else 1.0
 
 
-def _rays(camera: Camera, oversampling: int) -> Floats:
-    """Normalised points ``[H, W, 2]`` of a pinhole's pixel centres, or of a grid as many times as fine."""
-    K = camera.K.numpy()
-    columns = (np.arange(camera.width * oversampling) + 0.5) / oversampling
-    rows = (np.arange(camera.height * oversampling) + 0.5) / oversampling
-    pixels = np.stack(np.meshgrid(columns, rows), -1)
-    return (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+def _halvings(pixels: Floats, camera: Camera, size: tuple[int, int]) -> Floats:
+    """Pyramid level ``[H, W]`` (halvings of a picture of ``size``) with pixels as large as the pinhole's."""
+    if min(pixels.shape[:2]) < 2:
+        return np.zeros(pixels.shape[:2])
+    down, across = (np.asarray(np.gradient(pixels, axis=axis)) for axis in (0, 1))
+    area = np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    area = np.nan_to_num(area * (size[0] / camera.width) * (size[1] / camera.height), nan=1.0)
+    return np.maximum(np.log2(np.maximum(area, 1e-12)) / 2, 0)
+
+
+def _rays(camera: Camera) -> Floats:
+    """Normalised points ``[H, W, 2]`` of a pinhole's pixel centres."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
+    return LensCamera(camera, Pinhole()).normalised(pixels.astype(np.float64))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
-from structgstream.scene.state import FieldName
 
 REST = "the rest"
 """Bytes of no field: heads of records, checksums, and the header's JSON."""
@@ -53,7 +52,7 @@ def rows_of(reader: StreamReader) -> list[Row]:
     ]
 
 
-def with_rest(sizes: Mapping[FieldName, int], whole: int) -> dict[str, int]:
+def with_rest(sizes: Mapping[str, int], whole: int) -> dict[str, int]:
     """Bytes by field, with the remainder of ``whole`` as :data:`REST`."""
     return {**sizes, REST: whole - sum(sizes.values())}
 

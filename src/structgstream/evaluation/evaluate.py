@@ -30,8 +30,9 @@ from structgstream.evaluation.flow import Flow
 from structgstream.evaluation.instruments import Seen, Selection, instruments, measured
 from structgstream.evaluation.masks import changed_pixels
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors, ssim
-from structgstream.evaluation.recording import Drawable, Recording, counts, placed
+from structgstream.evaluation.recording import Drawable, Recording, placed
 from structgstream.evaluation.report import FrameScores, Report, Scores, course, drawing_facts, mean_scores
+from structgstream.frame_report import counts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
 from structgstream.scene.render import quantised, render
@@ -217,7 +218,7 @@ def _frame_scores(
         pts_seconds=info.pts_seconds,
         kind=PacketKind(info.kind).name.lower(),
         bytes=info.bytes,
-        field_bytes={name: size for name, size in info.field_bytes.items()},  # noqa: C416 -- widens the key type
+        field_bytes=dict(info.field_bytes),
         **counts(scene),
         decode_seconds=decode_seconds,
         cameras=scores,

@@ -2,7 +2,7 @@
 """The protocol of files that can be evaluated: a drawable per frame, of this method or another."""
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol, cast, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -45,13 +45,6 @@ class Recording(Protocol):
     def complete(self) -> bool: ...
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Drawable]]: ...
-
-
-def counts(drawable: Drawable) -> dict[str, int]:
-    """Numbers of ``anchors`` and ``free`` Gaussians; without anchors all Gaussians count as free."""
-    if isinstance(drawable, Scene):
-        return {"anchors": len(drawable.anchors), "free": len(drawable.free)}
-    return {"anchors": 0, "free": len(cast(Sequence, drawable))}
 
 
 def placed(drawable: Drawable, device: torch.device) -> Drawable:

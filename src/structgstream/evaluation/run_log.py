@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from structgstream.errors import StorageError
 
 if TYPE_CHECKING:
-    from structgstream.session import FrameReport
+    from structgstream.frame_report import FrameReport
 
 
 def log_path(stream: Path) -> Path:

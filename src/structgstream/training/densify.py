@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Applying growth to everything that has a row for each anchor: parameters, Adam state and statistics."""
+"""Applying growth to everything that has a row for each anchor: parameters with their moments, and statistics."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
 from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import ANCHOR_ROWS, Parameters, values_of_rows
+from structgstream.training.parameters import ANCHOR_ROWS, values_of_rows
 from structgstream.training.statistics import GradientStatistics
 
 
@@ -51,7 +51,7 @@ class Densifier:
         return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
 
     def apply(
-        self, scene: Scene, parameters: Parameters, adam: Adam, generator: torch.Generator, *, iteration: int
+        self, scene: Scene, adam: Adam[ParameterName], generator: torch.Generator, *, iteration: int
     ) -> tuple[int, int]:
         """Grow, then prune, after ``iteration``; returns how many anchors were added and removed."""
         k = self.offsets_per_anchor
@@ -76,33 +76,33 @@ class Densifier:
         anchors = AnchorCloud(
             new.positions, log_cells, log_cells, new.positions.new_zeros(len(new), k, 3), new.features
         )
-        self._replace(parameters, adam, keep=keep, added=values_of_rows(anchors, ANCHOR_ROWS), count=len(new))
-        parameters.values["base_scales"].detach().clamp_(max=0.05)
+        self._replace(adam, keep=keep, added=values_of_rows(anchors, ANCHOR_ROWS), count=len(new))
+        adam.values["base_scales"].detach().clamp_(max=0.05)
         return len(new), int(remove.sum())
 
     def judges(self, iteration: int) -> bool:
         """Whether contributions decide after this iteration who stays."""
         return self.config.least_contribution > 0.0 and iteration in self.config.contribution_at
 
-    def judge(self, contributions: Tensor, parameters: Parameters, adam: Adam) -> int:
+    def judge(self, contributions: Tensor, adam: Adam[ParameterName]) -> int:
         """Remove the anchors whose ``contributions`` ``[M]`` (shares of the mean) are too small; tells how many."""
         keep = contributions >= self.config.least_contribution
-        self._replace(parameters, adam, keep=keep, added={}, count=0)
+        self._replace(adam, keep=keep, added={}, count=0)
         return int((~keep).sum())
 
     def _replace(
-        self,
-        parameters: Parameters,
-        adam: Adam,
-        *,
-        keep: Tensor,
-        added: dict[ParameterName, Tensor],
-        count: int,
+        self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor], count: int
     ) -> None:
-        """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor."""
+        """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor.
+
+        What ``added`` has not is zero in the new rows.
+        """
         k = self.offsets_per_anchor
-        parameters.replace_rows(ANCHOR_ROWS, keep=keep, added=added, count=count)
-        adam.replace_rows(ANCHOR_ROWS, keep=keep, added=count)
+        new: dict[ParameterName, Tensor] = {}
+        for name, old in adam.values.items():
+            if name in ANCHOR_ROWS:
+                new[name] = added[name] if name in added else old.detach().new_zeros(count, *old.shape[1:])
+        adam.replace_rows(new, keep=keep)
         for statistics in (self.gradients, self.opacities):
             rows = keep.repeat_interleave(k) if statistics is self.gradients else keep
             more = count * k if statistics is self.gradients else count

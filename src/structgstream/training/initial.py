@@ -9,20 +9,23 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
 from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
 from structgstream.training.disturbance import DisturbanceConfig, disturbance_at, disturbed_center
 from structgstream.training.growth import GrowthConfig
+from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, Rate, constant
+from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
-from structgstream.training.result import FitResult, Step, StepListener
+from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import seeded_scene
-from structgstream.training.solidity import SolidityConfig
-from structgstream.training.step import LastPass, gradients_of, view_loss
+from structgstream.training.solidity import SolidityConfig, depth_spread
+from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import reduced, shuffled_views, training_views
+from structgstream.training.views import View, coarse_to_fine, training_views
 
 _JUDGED_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of them will do.
 
@@ -99,6 +102,75 @@ def rig_extent(rig: CameraRig) -> float:
     return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
 
 
+@dataclass
+class _FirstFrame(Hooks[View, SceneLoss]):
+    """What frame 0 does in an iteration: disturb what is drawn, grow and remove anchors."""
+
+    config: InitialConfig
+    backend: Backend
+    template: Scene
+    parameters: Parameters
+    adam: Adam[ParameterName]
+    densifier: Densifier
+    views: list[View]
+    extent: float
+    generator: torch.Generator
+    watch: Stopwatch
+    last_pass: LastPass
+
+    @property
+    def scene(self) -> Scene:
+        """As it is now; differentiable."""
+        return self.parameters.scene(self.template)
+
+    def loss(self, iteration: int, sample: View) -> SceneLoss:
+        config, generator = self.config, self.generator
+        scene = self.scene
+        # The order of what is drawn from the generator is part of the result.
+        loss = view_loss(
+            scene,
+            sample,
+            backend=self.backend,
+            weights=config.losses,
+            voxel_size=config.voxel_size,
+            track_screen=self.densifier.collects(iteration),
+            watch=self.watch,
+            disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
+            background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
+            seen_from=disturbed_center(
+                sample.camera.viewport(scene.anchors.positions).center,
+                self.extent / 1.1,
+                iteration,
+                config.iterations,
+                config.disturbance,
+                generator,
+            ),
+        )
+        if weight := config.solidity.weight_at(iteration, config.iterations):
+            with self.watch.stage("rasterise"):
+                spread = depth_spread(loss.calm, sample.camera, scale=config.solidity.scale, backend=self.backend)
+                loss = with_term(loss, "depth_spread", spread, weight=weight)
+        self.last_pass.add(iteration, loss, sample)
+        return loss
+
+    def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
+        densifier = self.densifier
+        if screen_gradient is not None:
+            with self.watch.stage("densify"), torch.no_grad():
+                densifier.gradients.add(loss.rendering, screen_gradient)
+                densifier.opacities.add(loss.structured)
+                if densifier.due(iteration):
+                    densifier.apply(self.scene, self.adam, self.generator, iteration=iteration)
+        if densifier.judges(iteration):
+            with self.watch.stage("densify"), torch.no_grad():
+                cameras = [view.camera for view in self.views]
+                shares = contributions(self.scene, cameras, scale=_JUDGED_SCALE, backend=self.backend)
+                densifier.judge(shares, self.adam)
+
+    def counts(self) -> tuple[int, int]:
+        return len(self.adam.values["anchor_positions"]), 0
+
+
 def fit_first_frame(
     frame: MultiViewFrame,
     rig: CameraRig,
@@ -108,7 +180,7 @@ def fit_first_frame(
     backend: Backend,
     seed: int,
     on_step: StepListener | None = None,
-) -> FitResult:
+) -> FitResult[Scene]:
     """Reconstruct frame 0 from its training views.
 
     Args:
@@ -120,83 +192,54 @@ def fit_first_frame(
         seed: all randomness comes from it.
         on_step: called after every iteration.
     """
-    generator = torch.Generator().manual_seed(seed)
-    watch = Stopwatch(backend.device)
-    views = training_views(frame, rig, backend.device)
-    template = seeded_scene(
-        points,
-        cameras=len(views),
-        voxel_size=config.voxel_size * config.seed_voxels,
-        offsets_per_anchor=config.offsets_per_anchor,
-        feature_width=config.feature_width,
-        hidden_width=config.hidden_width,
-        distance_input=config.distance_input,
-        device=backend.device,
-        generator=generator,
-        all_drawn=config.all_drawn,
-    )
-    trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
-    if not config.camera_color:
-        trained.difference_update(CAMERA_ROWS)
-    parameters = Parameters.of(template, trained=frozenset(trained))
-    adam = Adam(backend)
+    generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
+    views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
+    template = _seeded(points, cameras=len(views), config=config, device=backend.device, generator=generator)
+    parameters = Parameters.of(template, trained=_trained(config))
+    adam = Adam(backend, parameters.values)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
-    extent = rig_extent(rig)
-    coarse = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
-    order = shuffled_views(coarse, generator)
-    last_pass = LastPass()
-    for iteration in range(1, config.iterations + 1):
-        if iteration == config.coarse_iterations + 1:
-            order = shuffled_views(views, generator)
-        view = next(order)
-        scene = parameters.scene(template)
-        collects = densifier.collects(iteration)
-        loss = view_loss(
-            scene,
-            view,
-            backend=backend,
-            weights=config.losses,
-            voxel_size=config.voxel_size,
-            track_screen=collects,
-            watch=watch,
-            disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
-            background=torch.rand(3, generator=generator).to(backend.device) if config.random_background else None,
-            seen_from=disturbed_center(
-                view.camera.viewport(scene.anchors.positions).center,
-                extent / 1.1,
-                iteration,
-                config.iterations,
-                config.disturbance,
-                generator,
-            ),
-            spread_weight=config.solidity.weight_at(iteration, config.iterations),
-            spread_scale=config.solidity.scale,
-        )
-        gradients, screen_gradient = gradients_of(loss, parameters, watch)
-        if iteration > config.iterations - len(views):
-            last_pass.add(loss, view)
-        with watch.stage("optimise"):
-            adam.step(parameters, gradients, rates_at(iteration, config, extent=extent))
-        if screen_gradient is not None:
-            with watch.stage("densify"), torch.no_grad():
-                densifier.gradients.add(loss.rendering, screen_gradient)
-                densifier.opacities.add(loss.structured)
-                if densifier.due(iteration):
-                    densifier.apply(scene, parameters, adam, generator, iteration=iteration)
-        if densifier.judges(iteration):
-            with watch.stage("densify"), torch.no_grad():
-                cameras = [other.camera for other in views]
-                shares = contributions(parameters.scene(template), cameras, scale=_JUDGED_SCALE, backend=backend)
-                densifier.judge(shares, parameters, adam)
-        if on_step is not None:
-            anchors = parameters.values["anchor_positions"].shape[0]
-            on_step(Step(iteration, config.iterations, float(loss.total.detach()), anchors, 0))
+    last_pass = LastPass(config.iterations - len(views))
+    hooks = _FirstFrame(
+        config, backend, template, parameters, adam, densifier, views, extent, generator, watch, last_pass
+    )
+    samples = coarse_to_fine(
+        views,
+        coarse_iterations=config.coarse_iterations,
+        coarse_scale=config.coarse_scale,
+        generator=generator,
+    )
+    schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
+    iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     return FitResult(
-        scene=detached(parameters.scene(template)),
-        iterations=config.iterations,
+        scene=detached(hooks.scene),
+        iterations=iterations,
         train_psnr=last_pass.psnr,
         grown=densifier.grown,
         removed=densifier.pruned,
         seconds=watch.seconds,
         losses=last_pass.terms,
     )
+
+
+def _seeded(
+    points: Tensor, *, cameras: int, config: InitialConfig, device: torch.device, generator: torch.Generator
+) -> Scene:
+    """Where frame 0 starts."""
+    return seeded_scene(
+        points,
+        cameras=cameras,
+        voxel_size=config.voxel_size * config.seed_voxels,
+        offsets_per_anchor=config.offsets_per_anchor,
+        feature_width=config.feature_width,
+        hidden_width=config.hidden_width,
+        distance_input=config.distance_input,
+        device=device,
+        generator=generator,
+        all_drawn=config.all_drawn,
+    )
+
+
+def _trained(config: InitialConfig) -> frozenset[ParameterName]:
+    """What has a rate, without the camera colour where it is off."""
+    trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
+    return frozenset(trained if config.camera_color else trained.difference(CAMERA_ROWS))

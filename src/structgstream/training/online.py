@@ -19,35 +19,30 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import with_enough_room
-from structgstream.scene.focus import Focus
-from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.births import BirthConfig
+from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
 from structgstream.training.motion_start import MotionStartConfig, displaced, started
+from structgstream.training.next_frame import NextFrame, Start
 from structgstream.training.observation import slots_of
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import (
-    FREE_ROWS,
-    Parameters,
-    detached,
-    parameters_of_fields,
-    values_of_rows,
-)
+from structgstream.training.optimize import Schedule, optimize
+from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields, values_of_rows
 from structgstream.training.partition import Partition
 from structgstream.training.patching import PatchingConfig
+from structgstream.training.picture_change import PictureChange
 from structgstream.training.pictures import FramePictures, pictures_of
-from structgstream.training.population import patched
+from structgstream.training.population import Population
 from structgstream.training.price import Rate
 from structgstream.training.renewal import renewal
 from structgstream.training.residuals import ResidualFloor
-from structgstream.training.result import FitResult, Step, StepListener
+from structgstream.training.result import FitResult, StepListener
 from structgstream.training.rounding import RoundingConfig
 from structgstream.training.settling import Settling
 from structgstream.training.statistics import GradientStatistics
-from structgstream.training.step import LastPass, gradients_of, view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, shuffled_views
 
@@ -125,7 +120,7 @@ def fit_next_frame(
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
     on_step: StepListener | None = None,
-) -> FitResult:
+) -> FitResult[Scene]:
     """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
 
     Args:
@@ -145,57 +140,15 @@ def fit_next_frame(
     """
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
-    motion = config.motion
     if pictures is None:
-        pictures = pictures_of(frame, rig, before=before, motion=motion, start=config.start, backend=backend)
-    views, changes = pictures.views, pictures.changes
+        pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
 
-    def fitted(stepping: Backend) -> FitResult:
+    def fitted(stepping: Backend) -> FitResult[Scene]:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
         fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
-        ahead = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
-        if older is not None and config.motion_prior:
-            ahead[: len(scene.anchors)] = config.motion_prior * (scene.anchors.positions - older.anchors.positions)
-        if changes is None:
-            return fit.run(scene, views, ahead=ahead)
-        with watch.stage("find motion"):
-            which = moving_parts(scene, views, changes, config=motion, backend=backend, older=older, floor=floor)
-            partition, ahead = Partition.of(scene, which), ahead[which.movers]
-            trusted = [views[number] for number in which.trusted]
-        with watch.stage("start motion"):
-            start = started(partition, trusted, ahead, config=config.start, motion=motion, backend=backend)
-        with watch.stage("renew"):
-            new = renewal(
-                replace(partition, moving=displaced(partition.moving, start.displacements)),
-                trusted,
-                start.places,
-                frame_index=frame.index,
-                floor=floor,
-                room=config.patching.max_free - len(partition.still.free),
-                least_pixels=motion.least_pixels,
-                config=config.births,
-                backend=backend,
-            )
-            alive = torch.cat([torch.ones(len(partition.moving.anchors), dtype=torch.bool).to(new.kept), new.kept])
-            moving = replace(partition.moving, free=partition.moving.free.select(new.kept))
-        ahead = start.displacements[alive]
-        result = fit.run(moving, trusted, partition=partition, places=start.places, ahead=ahead, born=new.born)
-        died = int((~new.kept).sum())
-        return replace(
-            result,
-            scene=partition.together(result.scene),
-            pruned=result.pruned + int(which.unseen.sum()) + died,
-            spawned=result.spawned + len(new.born),
-            counts={
-                "lifted": start.lifted,
-                "corrected": start.corrected,
-                "born": len(new.born),
-                "blamed": died,
-                "births refused": int(new.refused),
-                "views left out": len(views) - len(trusted),
-                "jumps": int(which.jumped),
-            },
-        )
+        if pictures.changes is None:
+            return fit.optimized(Start(scene, pictures.views, _ahead(scene, older, config.motion_prior)))
+        return _moved(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
 
     if backend.device.type != "cuda":
         return fitted(backend)
@@ -212,7 +165,7 @@ def remembers(config: OnlineConfig) -> bool:
     return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Fit:
     """The optimisation of one frame; ``stepping`` is what the iterations run on."""
 
@@ -225,103 +178,143 @@ class _Fit:
     steps: Mapping[str, float]
     on_step: StepListener | None
 
-    def run(
-        self,
-        scene: Scene,
-        views: list[View],
-        *,
-        ahead: Tensor,
-        partition: Partition | None = None,
-        places: Mapping[int, Focus] | None = None,
-        born: FreeGaussians | None = None,
-    ) -> FitResult:
-        """Fit ``scene`` to the pictures, its movers (Note [Movers]) starting ``ahead`` ``[M + F, 3]`` of their places.
-
-        With a partition it is its moving part, which shows in ``places`` by view index. What is ``born`` joins it.
-        """
-        config, watch, patching = self.config, self.watch, self.config.patching
-        still_free = 0 if partition is None else len(partition.still.free)
-        seen = views if places is None else [view for view in views if view.index in places]
-        iterations = math.ceil(config.iterations * len(seen) / len(views))  # Each view as often as in a full frame.
-        patch_at = math.ceil(patching.iteration * len(seen) / len(views))
-        order = shuffled_views(seen, self.generator)
-        dynamic = config.dynamic if partition is None else config.dynamic.difference(SHARED_FIELDS)
-        trained = parameters_of_fields(dynamic)
-        steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
-        parameters = Parameters.of(scene, trained=trained, steps=steps)
-        rounding = config.rounding.resolved()
-        rate = Rate.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
-        anchors = len(scene.anchors)  # What a step costs is counted from the last frame.
-        if "anchor_positions" in trained:
-            parameters.values["anchor_positions"].data += ahead[:anchors]
-        if "free_means" in trained:
-            parameters.values["free_means"].data += ahead[anchors:]
-        if born is not None and "free_means" in trained:
-            keep = torch.ones(len(scene.free), dtype=torch.bool, device=born.means.device)
-            parameters.births = torch.cat([parameters.births, born.births])
-            parameters.replace_rows(FREE_ROWS, keep=keep, added=values_of_rows(born, FREE_ROWS), count=len(born))
-        adam = Adam(self.backend)
-        statistics = GradientStatistics(slots_of(scene) + (0 if born is None else len(born)), self.backend.device)
-        last_pass = LastPass()
-        settling = Settling(config.least_gain * len(views) / max(1, config.iterations), len(seen))
-        tells_every = 1 if self.backend.device.type == "cpu" else 10  # Asking a GPU for the loss waits for it.
-        spawned = pruned = iteration = 0
-        while iteration < iterations and not (iteration > patch_at and settling.settled):
-            iteration += 1
-            view = next(order)
-            loss = view_loss(
-                parameters.scene(scene),
-                view,
-                backend=self.stepping,
-                weights=config.losses,
-                voxel_size=0.0,
-                track_screen=patching.spawn != "off" and patching.collect_from < iteration <= patch_at,
-                watch=watch,
-                focus=None if places is None else places[view.index],
-            )
-            settling.add(view.index, loss.total)
-            if iteration < patch_at and settling.settled:
-                patch_at = iteration
-            if rate is not None:
-                loss = replace(loss, total=loss.total + rate.price(parameters.values))
-            gradients, screen_gradient = gradients_of(loss, parameters, watch)
-            if config.least_gain or iteration > iterations - len(seen):
-                last_pass.add(loss, view)
-            with watch.stage("optimise"):
-                adam.step(parameters, gradients, online_rates(config, (iteration - 1) / iterations))
-            if screen_gradient is not None:
-                statistics.add(loss.rendering, screen_gradient)
-            if iteration == patch_at and "free" in config.dynamic:
-                with watch.stage("patch"), torch.no_grad():
-                    others = [other for other in seen if other.index != view.index]
-                    survivors, spawned = patched(
-                        parameters,
-                        adam,
-                        scene=scene,
-                        statistics=statistics,
-                        views=[view, *others],
-                        frame_index=self.frame_index,
-                        room=patching.max_free - still_free,
-                        config=patching,
-                        backend=self.backend,
-                        generator=self.generator,
-                    )
-                    pruned = int((~survivors).sum())
-                    rate = None if rate is None else rate.kept(survivors)
-                settling.begin_again()
-            if self.on_step is not None and iteration % tells_every == 0:
-                free = parameters.values["free_means"].shape[0] + still_free
-                self.on_step(Step(iteration, iterations, float(loss.total.detach()), len(scene.anchors), free))
+    def optimized(self, start: Start) -> FitResult[Scene]:
+        """Fit the scene of ``start`` to the pictures."""
+        config, seen = self.config, start.seen
+        # Each view is looked at as often as in a full frame.
+        iterations = math.ceil(config.iterations * len(seen) / len(start.views))
+        samples = shuffled_views(seen, self.generator)
+        hooks = self._hooks(start, iterations)
+        schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
+        population, last_pass = hooks.population, hooks.last_pass
+        done = optimize(population.adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step)
         return FitResult(
-            scene=detached(parameters.scene(scene)),
-            iterations=iteration,
+            scene=detached(hooks.parameters.scene(start.scene)),
+            iterations=done,
             train_psnr=last_pass.psnr,
-            moving=len(scene.anchors),
-            spawned=spawned,
-            pruned=pruned,
-            seconds=watch.seconds,
+            moving=len(start.scene.anchors),
+            spawned=population.spawned,
+            pruned=population.pruned,
+            seconds=self.watch.seconds,
             losses=last_pass.terms,
         )
+
+    def _hooks(self, start: Start, iterations: int) -> NextFrame:
+        config, patching, scene, seen = self.config, self.config.patching, start.scene, start.seen
+        parameters, rate = self._parameters(start)
+        adam = Adam(self.backend, parameters.values)
+        _move(parameters, adam, start)
+        still_free = 0 if start.partition is None else len(start.partition.still.free)
+        population = Population(
+            config=patching,
+            template=scene,
+            parameters=parameters,
+            adam=adam,
+            statistics=GradientStatistics(
+                slots_of(scene) + (0 if start.born is None else len(start.born)), self.backend.device
+            ),
+            views=seen,
+            frame_index=self.frame_index,
+            room=patching.max_free - still_free,
+            backend=self.backend,
+            generator=self.generator,
+        )
+        return NextFrame(
+            start=start,
+            parameters=parameters,
+            losses=config.losses,
+            rate=rate,
+            population=population,
+            settling=Settling(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
+            patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),
+            patches="free" in config.dynamic,
+            last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
+            backend=self.stepping,
+            watch=self.watch,
+        )
+
+    def _parameters(self, start: Start) -> tuple[Parameters, Rate | None]:
+        """The leaves of the scene where it was in the last frame, and the price of leaving that."""
+        config = self.config
+        dynamic = config.dynamic if start.partition is None else config.dynamic.difference(SHARED_FIELDS)
+        trained = parameters_of_fields(dynamic)
+        steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
+        parameters = Parameters.of(start.scene, trained=trained, steps=steps)
+        rounding = config.rounding.resolved()
+        return parameters, Rate.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
+
+
+def _move(parameters: Parameters, adam: Adam[ParameterName], start: Start) -> None:
+    """Put what is trained where the frame starts, with what is born."""
+    values, anchors = parameters.values, len(start.scene.anchors)
+    if values["anchor_positions"].requires_grad:
+        values["anchor_positions"].data += start.ahead[:anchors]
+    if not values["free_means"].requires_grad:
+        return
+    values["free_means"].data += start.ahead[anchors:]
+    if start.born is not None:
+        keep = torch.ones(len(start.scene.free), dtype=torch.bool, device=start.born.means.device)
+        parameters.births = torch.cat([parameters.births, start.born.births])
+        adam.replace_rows(values_of_rows(start.born, FREE_ROWS), keep=keep)
+
+
+def _ahead(scene: Scene, older: Scene | None, motion_prior: float) -> Tensor:
+    """How far from their places the movers start ``[M + F, 3]``: a share of the anchors' last step."""
+    ahead = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
+    if older is not None and motion_prior:
+        ahead[: len(scene.anchors)] = motion_prior * (scene.anchors.positions - older.anchors.positions)
+    return ahead
+
+
+def _moved(
+    fit: _Fit,
+    scene: Scene,
+    views: list[View],
+    changes: list[PictureChange],
+    *,
+    older: Scene | None,
+    floor: ResidualFloor | None,
+) -> FitResult[Scene]:
+    """Fit what moves in ``scene``, from where the pictures show it, and leave the rest as it is."""
+    config, backend, watch = fit.config, fit.backend, fit.watch
+    ahead = _ahead(scene, older, config.motion_prior)
+    with watch.stage("find motion"):
+        which = moving_parts(scene, views, changes, config=config.motion, backend=backend, older=older, floor=floor)
+        partition, ahead = Partition.of(scene, which), ahead[which.movers]
+        trusted = [views[number] for number in which.trusted]
+    with watch.stage("start motion"):
+        start = started(partition, trusted, ahead, config=config.start, motion=config.motion, backend=backend)
+    with watch.stage("renew"):
+        new = renewal(
+            replace(partition, moving=displaced(partition.moving, start.displacements)),
+            trusted,
+            start.places,
+            frame_index=fit.frame_index,
+            floor=floor,
+            room=config.patching.max_free - len(partition.still.free),
+            least_pixels=config.motion.least_pixels,
+            config=config.births,
+            backend=backend,
+        )
+        alive = torch.cat([torch.ones(len(partition.moving.anchors), dtype=torch.bool).to(new.kept), new.kept])
+        moving = replace(partition.moving, free=partition.moving.free.select(new.kept))
+    result = fit.optimized(Start(moving, trusted, start.displacements[alive], partition, start.places, new.born))
+    died = int((~new.kept).sum())
+    return replace(
+        result,
+        scene=partition.together(result.scene),
+        pruned=result.pruned + int(which.unseen.sum()) + died,
+        spawned=result.spawned + len(new.born),
+        counts={
+            "lifted": start.lifted,
+            "corrected": start.corrected,
+            "born": len(new.born),
+            "blamed": died,
+            "births refused": int(new.refused),
+            "views left out": len(views) - len(trusted),
+            "jumps": int(which.jumped),
+        },
+    )
 
 
 def without_patching(config: OnlineConfig) -> OnlineConfig:

@@ -2,15 +2,14 @@
 """Adam over named parameters whose rows come and go."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.scene.state import ParameterName
-from structgstream.training.parameters import Parameters
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.
@@ -36,27 +35,38 @@ def constant(rate: float) -> Rate:
     return Rate(rate, rate)
 
 
+Name = TypeVar("Name", bound=str)
+
+
+def leaves(values: Mapping[Name, Tensor]) -> dict[Name, Tensor]:
+    """Copies of ``values`` that collect gradients."""
+    return {name: value.detach().clone().contiguous().requires_grad_() for name, value in values.items()}
+
+
 @dataclass
-class Adam:
-    """Adam state by parameter name; a fresh one is made for each frame, so no state crosses frames."""
+class Adam(Generic[Name]):
+    """Named leaf tensors and Adam's state of each; a fresh one is made for each fit, so no state crosses frames.
+
+    Args:
+        backend: what steps.
+        values: the leaves; the mapping is shared with whoever made them, and changed when rows come and go.
+        eps: Adam's.
+    """
 
     backend: Backend
-    first: dict[ParameterName, Tensor] = field(default_factory=dict)
-    second: dict[ParameterName, Tensor] = field(default_factory=dict)
-    steps: dict[ParameterName, int] = field(default_factory=dict)
+    values: dict[Name, Tensor]
+    eps: float = EPS
+    first: dict[Name, Tensor] = field(default_factory=dict)
+    second: dict[Name, Tensor] = field(default_factory=dict)
+    steps: dict[Name, int] = field(default_factory=dict)
 
-    def step(
-        self,
-        parameters: Parameters,
-        gradients: Mapping[ParameterName, Tensor],
-        rates: Mapping[ParameterName, float],
-    ) -> None:
-        """Move every parameter that has a gradient and a positive rate."""
+    def step(self, gradients: Mapping[Name, Tensor], rates: Mapping[Name, float]) -> None:
+        """Move every leaf that has a gradient and a positive rate."""
         for name, gradient in gradients.items():
             rate = rates[name]
             if rate <= 0.0:
                 continue
-            value = parameters.values[name]
+            value = self.values[name]
             if name not in self.first:
                 self.first[name] = torch.zeros_like(value, requires_grad=False)
                 self.second[name] = torch.zeros_like(value, requires_grad=False)
@@ -70,13 +80,23 @@ class Adam:
                 lr=rate,
                 step=self.steps[name],
                 betas=BETAS,
-                eps=EPS,
+                eps=self.eps,
             )
 
-    def replace_rows(self, names: Iterable[ParameterName], *, keep: Tensor, added: int) -> None:
-        """Drop the state of rows not in the mask ``keep`` and append ``added`` rows of zeros."""
-        for name in names:
+    def replace_rows(self, added: Mapping[Name, Tensor], *, keep: Tensor) -> None:
+        """In every leaf of ``added`` keep the rows of the mask ``keep`` and append its own, whose state is zero."""
+        for name, rows in added.items():
+            old = self.values[name]
+            together = torch.cat([old.detach()[keep], rows.detach()])
+            self.values[name] = together.contiguous().requires_grad_(old.requires_grad)
             for state in (self.first, self.second):
                 if name in state:
-                    old = state[name]
-                    state[name] = torch.cat([old[keep], old.new_zeros(added, *old.shape[1:])])
+                    kept = state[name][keep]
+                    state[name] = torch.cat([kept, kept.new_zeros(rows.shape)])
+
+    def replace_values(self, name: Name, value: Tensor) -> None:
+        """Put ``value`` in place of a leaf and forget its moments; its steps are counted on."""
+        self.values[name] = value.detach().clone().contiguous().requires_grad_()
+        for state in (self.first, self.second):
+            if name in state:
+                state[name] = torch.zeros_like(value)

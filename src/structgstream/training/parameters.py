@@ -4,7 +4,6 @@
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-import torch
 from torch import Tensor
 
 from structgstream.scene.anchors import AnchorCloud
@@ -70,21 +69,6 @@ class Parameters:
         }
         known: dict[ParameterName, float] = {name: step for name, step in (steps or {}).items() if name in copies}
         return cls(copies, scene.free.births.clone(), known)
-
-    @property
-    def trained(self) -> list[ParameterName]:
-        """Names that collect gradients, in a fixed order, without those that are empty."""
-        return [name for name, value in self.values.items() if value.requires_grad and value.numel()]
-
-    def replace_rows(
-        self, names: Iterable[ParameterName], *, keep: Tensor, added: Mapping[ParameterName, Tensor], count: int
-    ) -> None:
-        """Keep the rows ``keep`` (mask) of each name that there is and append ``added``, ``count`` zeros by default."""
-        for name in names:
-            if (old := self.values.get(name)) is not None:
-                more = added[name] if name in added else old.new_zeros(count, *old.shape[1:])
-                rows = torch.cat([old.detach()[keep], more])
-                self.values[name] = rows.contiguous().requires_grad_(old.requires_grad)
 
     def scene(self, template: Scene) -> Scene:
         """The scene these parameters stand for; differentiable. ``template`` has what is not trained."""

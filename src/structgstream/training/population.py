@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """In the middle of a frame: free Gaussians die and are born, in the tensors that are being fitted."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
+from structgstream.scene.state import ParameterName
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, values_of_rows
 from structgstream.training.patching import (
@@ -20,53 +23,70 @@ from structgstream.training.statistics import GradientStatistics
 from structgstream.training.views import View
 
 
-def patched(
-    parameters: Parameters,
-    adam: Adam,
-    *,
-    scene: Scene,
-    statistics: GradientStatistics,
-    views: list[View],
-    frame_index: int,
-    room: int,
-    config: PatchingConfig,
-    backend: Backend,
-    generator: torch.Generator,
-) -> tuple[Tensor, int]:
-    """Prunes and spawns free Gaussians, in ``parameters`` and their moments.
+@dataclass
+class Population:
+    """The free Gaussians of one frame's fit: who dies and who is born.
 
     Args:
+        config: the rule.
+        template: of ``parameters``.
         parameters: of the frame.
-        adam: holds their moments.
-        scene: the template of ``parameters``.
+        adam: of their values.
         statistics: view-space gradients by id.
-        views: which pictures children may take their looks from, the first that shows a parent.
+        views: which pictures children may take their looks from.
         frame_index: of the frame, for births.
         room: how many free Gaussians there may be.
-        config: the rule.
         backend: what computes.
         generator: of what is random.
-
-    Returns:
-        Mask of those that survive, and how many were born.
+        spawned: how many were born so far.
+        pruned: how many died so far.
     """
-    current = parameters.scene(scene)
-    keep = surviving(current.free, config)
-    drawn = statistics.count.clone()
-    drawn[len(drawn) - len(keep) :][~keep] = 0.0  # Those that die have no children.
-    ids = parents_of(
-        statistics.mean(),
-        drawn,
-        room=room - int(keep.sum()),
-        config=config,
-        generator=generator,
-    )
-    parents = gaussians_by_id(current, views, ids, backend)
-    first_birth = frame_index * BIRTHS_PER_FRAME
-    if len(parameters.births):  # Some may have been born in this frame already.
-        first_birth = max(first_birth, int(parameters.births.max()) + 1)
-    children = children_of(parents, first_birth=first_birth, config=config, generator=generator)
-    parameters.births = torch.cat([parameters.births[keep], children.births])
-    parameters.replace_rows(FREE_ROWS, keep=keep, added=values_of_rows(children, FREE_ROWS), count=len(children))
-    adam.replace_rows(FREE_ROWS, keep=keep, added=len(children))
-    return keep, len(children)
+
+    config: PatchingConfig
+    template: Scene
+    parameters: Parameters
+    adam: Adam[ParameterName]
+    statistics: GradientStatistics
+    views: list[View]
+    frame_index: int
+    room: int
+    backend: Backend
+    generator: torch.Generator
+    spawned: int = 0
+    pruned: int = 0
+
+    def __len__(self) -> int:
+        return len(self.parameters.births)
+
+    def patch(self, view: View) -> Tensor:
+        """Prunes and spawns; returns the mask of those that survive.
+
+        A child looks as its parent does in ``view``, if that shows it, else in the first of the others that does.
+        """
+        current = self.parameters.scene(self.template)
+        keep = surviving(current.free, self.config)
+        others = [other for other in self.views if other.index != view.index]
+        parents = gaussians_by_id(current, [view, *others], self._parents(keep), self.backend)
+        children = children_of(parents, first_birth=self._next_birth(), config=self.config, generator=self.generator)
+        self.parameters.births = torch.cat([self.parameters.births[keep], children.births])
+        self.adam.replace_rows(values_of_rows(children, FREE_ROWS), keep=keep)
+        self.spawned, self.pruned = self.spawned + len(children), self.pruned + int((~keep).sum())
+        return keep
+
+    def _parents(self, keep: Tensor) -> Tensor:
+        """Ids ``[P]`` that get a child when those without the mask ``keep`` die."""
+        drawn = self.statistics.count.clone()
+        drawn[len(drawn) - len(keep) :][~keep] = 0.0  # Those that die have no children.
+        return parents_of(
+            self.statistics.mean(),
+            drawn,
+            room=self.room - int(keep.sum()),
+            config=self.config,
+            generator=self.generator,
+        )
+
+    def _next_birth(self) -> int:
+        first = self.frame_index * BIRTHS_PER_FRAME
+        births = self.parameters.births
+        # Some may have been born in this frame already.
+        return max(first, int(births.max()) + 1) if len(births) else first

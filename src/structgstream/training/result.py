@@ -3,8 +3,10 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
-from structgstream.scene.scene import Scene
+SceneT = TypeVar("SceneT", covariant=True)
+OtherT = TypeVar("OtherT")
 
 
 @dataclass(frozen=True)
@@ -22,11 +24,12 @@ StepListener = Callable[[Step], None]
 
 
 @dataclass(frozen=True)
-class FitResult:
+class FitResult(Generic[SceneT]):
     """A fitted frame.
 
     Args:
-        scene: the scene after optimisation, detached, in normalised units.
+        scene: what was fitted, detached, in normalised units, before it was coded: a ``Scene``, or what another method
+            draws.
         iterations: optimisation steps done.
         train_psnr: mean over training cameras of the PSNR of the last rendering of each during optimisation, dB, over
             the pixels that were drawn; NaN when there was nothing to do.
@@ -40,7 +43,7 @@ class FitResult:
         losses: mean of each loss term over the last pass through the cameras.
     """
 
-    scene: Scene
+    scene: SceneT
     iterations: int
     train_psnr: float
     moving: int = 0
@@ -51,3 +54,7 @@ class FitResult:
     counts: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     losses: Mapping[str, float] = field(default_factory=dict)
+
+    def with_scene(self, scene: OtherT) -> "FitResult[OtherT]":
+        """The same fit, seen as of ``scene``."""
+        return FitResult(**{**vars(self), "scene": scene})

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain, islice
 
 import torch
 from torch import Tensor
@@ -67,3 +68,11 @@ def shuffled_views(views: list[View], generator: torch.Generator) -> Iterator[Vi
     while True:
         for i in torch.randperm(len(views), generator=generator).tolist():
             yield views[i]
+
+
+def coarse_to_fine(
+    views: list[View], *, coarse_iterations: int, coarse_scale: float, generator: torch.Generator
+) -> Iterator[View]:
+    """Shuffled views without end, the first ``coarse_iterations`` of them shrunk by ``coarse_scale``."""
+    coarse = [reduced(view, coarse_scale) for view in views] if coarse_iterations else views
+    return chain(islice(shuffled_views(coarse, generator), coarse_iterations), shuffled_views(views, generator))

@@ -22,6 +22,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
 from structgstream.session import Session
+from structgstream.struct_gstream import stream_pipeline
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.results import Result, read_result
 from structgstream_studies.experiments.tasks import FirstFrame, Variation
@@ -69,7 +70,7 @@ def same_scene(one: Scene, other: Scene) -> bool:
 def test_a_shared_first_frame_gives_bit_for_bit_the_stream_without_it(runs: Runs, tmp_path: Path) -> None:
     path = tmp_path / "alone.sgs"
     metadata = {"start": CLIP.start, "scale": CLIP.scale}
-    session = Session(CLIP.open(), FileSink(path), runs.full.config, runs.backend, metadata=metadata)
+    session = Session(CLIP.open(), FileSink(path), stream_pipeline(runs.full.config), runs.backend, metadata=metadata)
     assert len([*session.run()]) == 3
     assert packets(path) == packets(runs.full.stream)
     assert path.read_bytes() == runs.full.stream.read_bytes()
@@ -249,7 +250,7 @@ def test_a_first_frame_that_is_there_is_not_fitted_again(runs: Runs, monkeypatch
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr("structgstream.session.fit_first_frame", never)
+    monkeypatch.setattr("structgstream.struct_gstream.fit_first_frame", never)
     before = runs.first.stream.stat().st_mtime_ns
     runs.first.run(runs.backend)
     assert runs.first.stream.stat().st_mtime_ns == before
@@ -261,7 +262,7 @@ def test_scoring_alone_is_done_again_when_only_the_result_is_missing(
     shutil.copytree(runs.folder / "streams", tmp_path / "streams")
     run = replace(runs.full, folder=tmp_path)
     before = run.stream.stat().st_mtime_ns
-    monkeypatch.setattr("structgstream.session.fit_next_frame", lambda *_, **__: pytest.fail("fitted again"))
+    monkeypatch.setattr("structgstream.struct_gstream.fit_next_frame", lambda *_, **__: pytest.fail("fitted again"))
     run.run(runs.backend)
     assert run.done()
     assert run.stream.stat().st_mtime_ns == before

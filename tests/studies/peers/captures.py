@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from memory_captures import MemoryCapture
-from structgstream_studies.peers.method import PeerFit
+from structgstream.training.result import FitResult
 from structgstream_studies.peers.methods import AnyMethod
 from worlds import moving_world
 
@@ -22,15 +22,15 @@ class Watched:
     """A method that remembers what it fitted."""
 
     method: AnyMethod
-    fits: list[PeerFit[Any]] = field(default_factory=list)
+    fits: list[FitResult[Any]] = field(default_factory=list)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.method, name)
 
-    def first(self, *args: Any, **kwargs: Any) -> PeerFit[Any]:
+    def first(self, *args: Any, **kwargs: Any) -> FitResult[Any]:
         self.fits.append(self.method.first(*args, **kwargs))
         return self.fits[-1]
 
-    def next(self, *args: Any, **kwargs: Any) -> PeerFit[Any]:
+    def next(self, *args: Any, **kwargs: Any) -> FitResult[Any]:
         self.fits.append(self.method.next(*args, **kwargs))
         return self.fits[-1]

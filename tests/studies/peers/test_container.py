@@ -11,11 +11,18 @@ import pytest
 
 from rigs import arc_rig
 from structgstream.codec.container.records import PREFIX, scanned
-from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
 from structgstream.scene.state import STATE_TABLE
 from structgstream.similarity import Similarity
-from structgstream_studies.peers.container import PeerReader, PeerWriter, is_peer_file, packed_array, unpacked_arrays
+from structgstream_studies.peers.container import (
+    PeerReader,
+    PeerSink,
+    is_peer_file,
+    packed_array,
+    packet_of,
+    unpacked_arrays,
+)
 from structgstream_studies.peers.method import Arrays
 
 HEADER = StreamHeader(
@@ -52,12 +59,27 @@ def frame(i: int) -> Arrays:
     }
 
 
+def packet(i: int) -> Packet:
+    return packet_of(frame(i), index=i, pts_seconds=i / 25, kind=PacketKind.DELTA if i else PacketKind.KEY)
+
+
+def broken_off(path: Path, *packets: Packet) -> bytes:
+    """A file whose last frame is missing."""
+    sink = PeerSink(path, frames=len(packets) + 1)
+    sink.open(HEADER)
+    for one in packets:
+        sink.write(one)
+    sink.close()
+    return path.read_bytes()
+
+
 def written(path: Path, frames: int = 3) -> bytes:
-    writer = PeerWriter(path, HEADER)
+    sink = PeerSink(path, frames=frames)
+    sink.open(HEADER)
     for i in range(frames):
-        writer.write(PacketKind.KEY if i == 0 else PacketKind.DELTA, i, i / 25, frame(i))
-    writer.close(complete=True)
-    writer.close(complete=True)
+        sink.write(packet(i))
+    sink.close()
+    sink.close()
     return path.read_bytes()
 
 
@@ -128,17 +150,12 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_frames_out_of_order_are_refused(tmp_path: Path) -> None:
     for index, pts, kind in ((1, 0.0, PacketKind.KEY), (0, 0.0, PacketKind.DELTA)):
-        writer = PeerWriter(tmp_path / "b.sgp", HEADER)
-        writer.write(kind, index, pts, frame(0))
-        writer.close(complete=False)
+        one = packet_of(frame(0), index=index, pts_seconds=pts, kind=kind)
         with pytest.raises(StreamError):
-            read((tmp_path / "b.sgp").read_bytes())
-    writer = PeerWriter(tmp_path / "b.sgp", HEADER)
-    for index in range(2):
-        writer.write(PacketKind.KEY, index, 0.0, frame(0))
-    writer.close(complete=False)
+            read(broken_off(tmp_path / "b.sgp", one))
+    same_time = [packet_of(frame(0), index=i, pts_seconds=0.0, kind=PacketKind.KEY) for i in range(2)]
     with pytest.raises(StreamError, match="not presented after"):
-        read((tmp_path / "b.sgp").read_bytes())
+        read(broken_off(tmp_path / "b.sgp", *same_time))
 
 
 def test_writing_goes_on_where_it_stopped(tmp_path: Path) -> None:
@@ -146,15 +163,21 @@ def test_writing_goes_on_where_it_stopped(tmp_path: Path) -> None:
     data = written(path)
     third = list(scanned(data))[3]
     path.write_bytes(data[: third.offset + 9])
-    writer = PeerWriter(path, HEADER, resumed=read(path.read_bytes()))
-    writer.write(PacketKind.DELTA, 2, 2 / 25, frame(2))
-    writer.close(complete=True)
+    sink = PeerSink(path, frames=3, resumed=read(path.read_bytes()))
+    sink.open(HEADER)
+    sink.write(packet(2))
+    sink.close()
     assert path.read_bytes() == data
+
+
+def test_only_a_whole_file_is_complete(tmp_path: Path) -> None:
+    assert not read(broken_off(tmp_path / "a.sgp", packet(0), packet(1))).complete
+    assert read(written(tmp_path / "a.sgp", 2)).complete
 
 
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="Cannot open"):
-        PeerWriter(tmp_path, HEADER)
+        PeerSink(tmp_path, frames=1).open(HEADER)
 
 
 @pytest.mark.parametrize("at", range(1, 20))

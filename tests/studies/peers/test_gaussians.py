@@ -41,19 +41,19 @@ def test_a_fit_is_better_than_its_start_and_repeats() -> None:
         for _ in range(2)
     ]
     start = initial_gaussians(POINTS, training_views(CAPTURE.pictures[0], CAPTURE.rig, BACKEND.device), CONFIG)
-    assert mean_psnr(fits[0].gaussians) > mean_psnr(start) + 2.0
-    for name, value in fits[0].gaussians.tensors().items():
-        assert torch.equal(value, getattr(fits[1].gaussians, name)), name
+    assert mean_psnr(fits[0].scene.gaussians) > mean_psnr(start) + 2.0
+    for name, value in fits[0].scene.gaussians.tensors().items():
+        assert torch.equal(value, getattr(fits[1].scene.gaussians, name)), name
     assert [step.iteration for step in steps] == 2 * list(range(1, CONFIG.iterations + 1))
     assert fits[0].spawned > 0
-    assert abs(float(fits[0].camera_color.gains.mean()) - 1.0) < 1e-5
-    assert not torch.equal(fits[0].camera_color.gains, torch.ones_like(fits[0].camera_color.gains))
+    assert abs(float(fits[0].scene.camera_color.gains.mean()) - 1.0) < 1e-5
+    assert not torch.equal(fits[0].scene.camera_color.gains, torch.ones_like(fits[0].scene.camera_color.gains))
 
 
 def test_without_camera_colour_the_correction_is_the_identity() -> None:
     config = replace(CONFIG, camera_color=False, iterations=3, coarse_iterations=0)
     fit = fit_gaussians(CAPTURE.pictures[0], CAPTURE.rig, POINTS, config=config, backend=BACKEND, seed=3)
-    assert torch.equal(fit.camera_color.gains, torch.ones(4, 3))
+    assert torch.equal(fit.scene.camera_color.gains, torch.ones(4, 3))
 
 
 def test_a_point_starts_with_the_colour_that_the_views_show_there() -> None:

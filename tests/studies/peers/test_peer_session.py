@@ -14,16 +14,21 @@ from memory_captures import MemoryCapture
 from peers.captures import Watched, moving_capture
 from structgstream.codec.container.records import scanned
 from structgstream.codec.packets import PacketKind
-from structgstream.errors import ConfigError, StorageError, StreamError
+from structgstream.errors import ConfigError, StreamError
+from structgstream.recorder import record
 from structgstream.scene.render import render
 from structgstream.session import FrameReport
+from structgstream_studies.peers.codec import peer_pipeline
 from structgstream_studies.peers.container import is_peer_file
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
-from structgstream_studies.peers.session import PeerSession
 from structgstream_studies.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig
 
 BACKEND = quickest_backend()
 NAMES = list(TINY_METHODS)
+
+
+def recorded(capture: MemoryCapture, path: Path, method: AnyMethod, *, seed: int = 5, resume: bool = False):
+    return record(path, capture, peer_pipeline(method, seed=seed), BACKEND, resume=resume).reports
 
 
 class Run:
@@ -34,7 +39,7 @@ class Run:
         self.watched = Watched(TINY_METHODS[name])
         self.path = folder / f"{name}.sgp"
         method: AnyMethod = cast("AnyMethod", self.watched)
-        self.reports = list(PeerSession(self.capture, self.path, method, BACKEND, seed=5).run())
+        self.reports = list(recorded(self.capture, self.path, method))
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +72,7 @@ def test_the_file_gives_back_what_was_fitted_exactly(runs: dict[str, Run], name:
     frames = list(reader.scenes())
     assert len(frames) == len(run.watched.fits) == 3
     for (info, state), fit in zip(frames, run.watched.fits, strict=True):
-        drawn, expected = (render(value, camera, BACKEND).image for value in (state, fit.state))
+        drawn, expected = (render(value, camera, BACKEND).image for value in (state, fit.scene))
         assert torch.equal(drawn, expected), info
 
 
@@ -108,8 +113,8 @@ def test_going_on_after_a_cut_gives_the_same_bytes(runs: dict[str, Run], name: s
     second = open_peer(runs[name].path).packets[1]
     path.write_bytes(whole[: second.offset + second.bytes + 7])
     assert not open_peer(path).complete
-    session = PeerSession(runs[name].capture, path, TINY_METHODS[name], BACKEND, seed=5, resume=True)
-    assert [report.index for report in session.run()] == [2]
+    reports = recorded(runs[name].capture, path, TINY_METHODS[name], resume=True)
+    assert [report.index for report in reports] == [2]
     assert path.read_bytes() == whole
 
 
@@ -117,35 +122,33 @@ def test_going_on_with_a_whole_file_changes_nothing(runs: dict[str, Run], tmp_pa
     whole = runs["3dgs"].path.read_bytes()
     path = tmp_path / "whole.sgp"
     path.write_bytes(whole)
-    session = PeerSession(runs["3dgs"].capture, path, TINY_METHODS["3dgs"], BACKEND, seed=5, resume=True)
-    assert list(session.run()) == []
+    reports = recorded(runs["3dgs"].capture, path, TINY_METHODS["3dgs"], resume=True)
+    assert list(reports) == []
     assert path.read_bytes() == whole
     last = list(scanned(whole))[-1]
     path.write_bytes(whole[: last.offset])
-    session = PeerSession(runs["3dgs"].capture, path, TINY_METHODS["3dgs"], BACKEND, seed=5, resume=True)
-    assert list(session.run()) == []
+    reports = recorded(runs["3dgs"].capture, path, TINY_METHODS["3dgs"], resume=True)
+    assert list(reports) == []
     assert path.read_bytes() == whole
 
 
 def test_another_seed_method_or_capture_is_refused(runs: dict[str, Run]) -> None:
     run = runs["3dgs"]
     with pytest.raises(ConfigError, match="seed"):
-        PeerSession(run.capture, run.path, TINY_METHODS["3dgs"], BACKEND, seed=6, resume=True)
+        recorded(run.capture, run.path, TINY_METHODS["3dgs"], seed=6, resume=True)
     with pytest.raises(ConfigError, match="configuration"):
-        PeerSession(run.capture, run.path, METHODS["3dgs"], BACKEND, seed=5, resume=True)
+        recorded(run.capture, run.path, METHODS["3dgs"], resume=True)
     with pytest.raises(ConfigError, match="method"):
-        PeerSession(run.capture, run.path, TINY_METHODS["scaffold-gs"], BACKEND, seed=5, resume=True)
+        recorded(run.capture, run.path, TINY_METHODS["scaffold-gs"], resume=True)
     held = replace(run.capture, rig=run.capture.rig.with_held_out(frozenset({"cam01"})))
     with pytest.raises(ConfigError, match="cameras"):
-        PeerSession(held, run.path, TINY_METHODS["3dgs"], BACKEND, seed=5, resume=True)
-    with pytest.raises(StorageError, match="exists"):
-        PeerSession(run.capture, run.path, TINY_METHODS["3dgs"], BACKEND, seed=5)
+        recorded(held, run.path, TINY_METHODS["3dgs"], resume=True)
 
 
 def test_following_is_better_than_holding_frame_zero(tmp_path: Path) -> None:
     method, capture = ThreeDGStream(longer(TINY_METHODS["3dgstream"].config)), moving_capture(3, speed=0.06)
     path = tmp_path / "followed.sgp"
-    for _ in PeerSession(capture, path, method, BACKEND).run():
+    for _ in recorded(capture, path, method, seed=0):
         pass
     states = [state for _, state in open_peer(path).scenes()]
     assert psnr_held_out(states[2], capture, 2, path) > psnr_held_out(states[0], capture, 2, path) + 1.5
@@ -162,7 +165,7 @@ def test_every_frame_is_better_than_grey(runs: dict[str, Run], name: str) -> Non
 
 def test_additions_live_for_one_frame(runs: dict[str, Run]) -> None:
     run = runs["3dgstream"]
-    first, second, third = (fit.state for fit in run.watched.fits)
+    first, second, third = (fit.scene for fit in run.watched.fits)
     assert len(first.added) == 0
     assert len(second.added) > 0
     assert len(second.base) == len(third.base) == len(first.base)
@@ -177,7 +180,7 @@ def test_sizes_are_those_of_the_cache(runs: dict[str, Run]) -> None:
     sizes: dict[str, int] = {**run.reports[1].field_bytes}
     assert sizes["grid"] == 2 * grid.total_rows * grid.features + 4 + 4 + 8
     assert sizes["network"] == 2 * grid.weights + 4 + 7 + 4
-    added = len(run.watched.fits[1].state.added)
+    added = len(run.watched.fits[1].scene.added)
     assert sizes["added_sh"] == 4 * 9 * added + 4 + 8 + 12
 
 

@@ -10,7 +10,6 @@ from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content
 
 from structgstream.codec.container.blocks import blocks_in
 from structgstream.errors import StreamError
-from structgstream.scene.state import FieldName
 
 MAX_JSON_BYTES = 2**20
 LENGTH = struct.Struct("<I")
@@ -64,7 +63,7 @@ def description_of(payload: bytes) -> dict[str, Any]:
         raise ValueError(str(error)) from error
 
 
-def field_bytes_of(payload: bytes) -> dict[FieldName, int]:
+def field_bytes_of(payload: bytes) -> dict[str, int]:
     """Bytes of each field in the payload.
 
     Raises:

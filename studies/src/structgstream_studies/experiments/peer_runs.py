@@ -13,8 +13,8 @@ from structgstream_studies.experiments.tasks import answers, scored
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
+    from structgstream.frame_report import FrameReport
     from structgstream.kernels.backend import Backend
-    from structgstream.session import FrameReport
 
 PEER_TITLES: Mapping[str, str] = {
     "3dgstream": "3DGStream's method",
@@ -74,22 +74,19 @@ class PeerRun:
         write_result(self.result, scored(self.recording(), self.stream, self.capture, backend, asked=self._asked()))
 
     def _reconstruct(self, backend: "Backend") -> None:
-        from structgstream.data.prefetch import Prefetch
         from structgstream.evaluation.environment import environment
-        from structgstream.recorder import logged
+        from structgstream.recorder import record
+        from structgstream_studies.peers.codec import peer_pipeline
         from structgstream_studies.peers.methods import METHODS
-        from structgstream_studies.peers.session import PeerSession
 
         self.stream.parent.mkdir(parents=True, exist_ok=True)
-        source = Prefetch(self.capture.open())
+        pipeline = peer_pipeline(METHODS[self.key], seed=self.seed)
         part = {"start": self.capture.start, "scale": self.capture.scale, "every": self.capture.every}
-        session = PeerSession(
-            source, self.stream, METHODS[self.key], backend, seed=self.seed, resume=True, metadata=part
-        )
         machine = environment() | {"backend": backend.name}
 
         def remarks(report: "FrameReport") -> Mapping[str, Any]:
             return {} if report.index else {"trained_by": machine}
 
-        for _ in logged(session.run(), self.stream, done=session.done, remarks=remarks):
+        run = record(self.stream, self.capture.open(), pipeline, backend, resume=True, metadata=part, remarks=remarks)
+        for _ in run.reports:
             pass

@@ -19,8 +19,9 @@ from structgstream_studies.experiments.results import Result, read_result, resul
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
+    from structgstream.frame_report import FrameReport
     from structgstream.kernels.backend import Backend
-    from structgstream.session import FrameReport
+    from structgstream.scene.scene import Scene
     from structgstream.training.result import FitResult
 
 
@@ -81,8 +82,8 @@ class FirstFrame:
             return
         _reconstruct(replace(self.capture, frames=1), self._alone, self.stream, backend, first=None)
 
-    def fitted(self) -> "FitResult":
-        """The frame as ``Session`` takes it, read from the file."""
+    def fitted(self) -> "FitResult[Scene]":
+        """The frame as ``StructGStream`` takes it, read from the file."""
         from structgstream.codec.reader import open_stream
         from structgstream.training.result import FitResult
 
@@ -195,11 +196,11 @@ def _reconstruct(
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
     from structgstream.evaluation.environment import environment
-    from structgstream.recorder import Recorder
+    from structgstream.recorder import record
+    from structgstream.struct_gstream import stream_pipeline
 
     source = capture.open()
     stream.parent.mkdir(parents=True, exist_ok=True)
-    recorder = Recorder(stream, resume=True)
     machine = environment() | {"backend": backend.name}
 
     def remarks(report: "FrameReport") -> Mapping[str, Any]:
@@ -207,17 +208,16 @@ def _reconstruct(
         shared = first.log() if first is not None and report.index == 0 else {}
         return {**shared, "trained_by": machine} if report.index == 0 else {}
 
-    fitted = first.fitted() if first is not None and recorder.done == 0 else None
+    pipeline = stream_pipeline(config, fitted=None if first is None else first.fitted)
     metadata = {"start": capture.start, "scale": capture.scale}
     try:
-        reports = recorder.record(source, config, backend, metadata=metadata, first=fitted, remarks=remarks)
+        run = record(stream, source, pipeline, backend, resume=True, metadata=metadata, remarks=remarks)
     except ConfigError as error:
         raise ExperimentError(f"{stream} answers another question, so choose another folder. {error}") from None
-    if recorder.done > len(source):
+    if run.done > len(source):
         raise ExperimentError(
-            f"{stream} has {recorder.done} frames already and {len(source)} are asked for; choose another folder for "
-            "fewer."
+            f"{stream} has {run.done} frames already and {len(source)} are asked for; choose another folder for fewer."
         )
-    if recorder.done < len(source):
-        for _ in reports:
+    if run.done < len(source):
+        for _ in run.reports:
             pass

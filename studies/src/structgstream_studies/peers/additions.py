@@ -3,18 +3,22 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
+from torch import Tensor
 
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
-from structgstream.training.optim import EPS
-from structgstream.training.result import Step, StepListener
+from structgstream.training.last_pass import LastPass
+from structgstream.training.optim import Adam, leaves
+from structgstream.training.optimize import Hooks, Schedule, optimize
+from structgstream.training.result import StepListener
+from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View
-from structgstream_studies.peers.fitting import LastPsnr, Leaves, gradients_of, picture_loss
+from structgstream_studies.peers.gaussians import LOSSES
 from structgstream_studies.peers.plain import PlainGaussians, rotated
 
 
@@ -66,6 +70,49 @@ def spawned_at(parents: PlainGaussians, config: AdditionsConfig, generator: torc
     )
 
 
+@dataclass
+class _Added(Hooks[View, ViewLoss]):
+    """What the second stage does in an iteration: draw the additions among the others, and drop the useless."""
+
+    config: AdditionsConfig
+    adam: Adam[str]
+    base: PlainGaussians
+    color: CameraColor
+    extent: float
+    watch: Stopwatch
+    last_pass: LastPass
+    _still: dict[int, Gaussians] = field(default_factory=dict)
+
+    @property
+    def added(self) -> PlainGaussians:
+        """As they are now."""
+        return PlainGaussians(**self.adam.values)
+
+    def loss(self, iteration: int, sample: View) -> ViewLoss:
+        backend = self.adam.backend
+        with self.watch.stage("generate"):
+            if sample.index not in self._still:
+                self._still[sample.index] = self.base.gaussians(sample.camera, backend)
+            drawn = concatenate(self.added.gaussians(sample.camera, backend), self._still[sample.index])
+        loss = picture_loss(
+            drawn, sample, self.color, backend=backend, weights=LOSSES, track_screen=False, watch=self.watch
+        )
+        self.last_pass.add(iteration, loss, sample)
+        return loss
+
+    def after_step(self, iteration: int, sample: View, loss: ViewLoss, screen_gradient: Tensor | None) -> None:
+        if iteration % self.config.interval:
+            return
+        with self.watch.stage("densify"), torch.no_grad():
+            current = self.added
+            keep = current.logit_opacities.sigmoid() >= self.config.min_opacity
+            keep &= current.log_scales.exp().amax(1) <= self.config.max_extent * self.extent
+            self.adam.replace_rows(PlainGaussians.empty(current.degree, current.means).tensors(), keep=keep)
+
+    def counts(self) -> tuple[int, int]:
+        return 0, len(self.base) + len(self.adam.values["means"])
+
+
 def fit_additions(
     start: PlainGaussians,
     base: PlainGaussians,
@@ -77,6 +124,7 @@ def fit_additions(
     views: int,
     backend: Backend,
     watch: Stopwatch,
+    before: int,
     on_step: StepListener | None,
 ) -> Additions:
     """Fit ``start`` among ``base``, which stays as it is.
@@ -91,11 +139,12 @@ def fit_additions(
         views: number of training views, over the last of which the PSNR is taken.
         backend: what computes.
         watch: seconds by stage.
+        before: iterations of the first stage, for progress.
         on_step: called after every iteration.
     """
     if not len(start):
         return Additions(start, None)
-    leaves = Leaves.of(start.tensors(), backend=backend, eps=EPS)
+    adam = Adam(backend, leaves(start.tensors()))
     rates = {
         "means": config.means * extent,
         "log_scales": config.log_scales,
@@ -104,27 +153,8 @@ def fit_additions(
         "base_colors": config.base_colors,
         "sh": config.sh,
     }
-    still: dict[int, Gaussians] = {}
-    last = LastPsnr(config.iterations, views)
-    for iteration in range(1, config.iterations + 1):
-        view = next(order)
-        with watch.stage("generate"):
-            if view.index not in still:
-                still[view.index] = base.gaussians(view.camera, backend)
-            added = PlainGaussians(**leaves.values)
-            drawn = concatenate(added.gaussians(view.camera, backend), still[view.index])
-        loss = picture_loss(drawn, view, color, backend=backend, track_screen=False, watch=watch)
-        last.add(iteration, loss, view)
-        if len(added):
-            gradients, _ = gradients_of(loss, leaves.values, watch)
-            with watch.stage("optimise"):
-                leaves.step(gradients, rates)
-        if iteration % config.interval == 0:
-            with watch.stage("densify"), torch.no_grad():
-                current = PlainGaussians(**leaves.values)
-                keep = current.logit_opacities.sigmoid() >= config.min_opacity
-                keep &= current.log_scales.exp().amax(1) <= config.max_extent * extent
-                leaves.replace_rows(PlainGaussians.empty(current.degree, current.means).tensors(), keep=keep)
-        if on_step is not None:
-            on_step(Step(iteration, config.iterations, float(loss.total.detach()), 0, len(added)))
-    return Additions(PlainGaussians(**leaves.values).detached(), last.mean)
+    last_pass = LastPass(config.iterations - views)
+    hooks = _Added(config, adam, base, color, extent, watch, last_pass)
+    schedule = Schedule(config.iterations, lambda _: rates, before=before)
+    optimize(adam, order, schedule, hooks, watch=watch, on_step=on_step)
+    return Additions(hooks.added.detached(), last_pass.psnr)

@@ -12,25 +12,25 @@
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
-from typing import Any, Generic, cast
+from typing import Any, Generic
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.codec.container.payload import FRAME
 from structgstream.codec.container.records import PREFIX, RecordType, packed, record_at, scanned, why_stopped
 from structgstream.codec.container.stored import Stored, StoredFile
+from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import packed_header, unpacked_header
-from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import PacketInfo
 from structgstream.errors import StorageError, StreamError
-from structgstream.scene.state import FieldName
-from structgstream_studies.peers.method import Arrays, PeerMethod, State
+from structgstream.pipeline import State
+from structgstream_studies.peers.method import Arrays, PeerMethod
 
 MAGIC = b"\x89SGP\r\n\x1a\n"
 MAJOR, MINOR = 1, 0
@@ -158,22 +158,40 @@ class PeerReader(Generic[State]):
         packet_kind = _KINDS[RecordType(kind)]
         if index == 0 and packet_kind is not PacketKind.KEY:
             raise StreamError(f"{self._name} begins with a delta frame; the first must be a key frame.")
-        # Other methods have other fields; who reports them only passes the names on.
-        return PacketInfo(packet_kind, index, pts_seconds, offset, end - offset, cast("Mapping[FieldName, int]", sizes))
+        return PacketInfo(packet_kind, index, pts_seconds, offset, end - offset, sizes)
 
     def __len__(self) -> int:
         return len(self.packets)
 
-    def arrays(self, index: int) -> Arrays:
+    def packet(self, index: int) -> Packet:
         """What frame ``index`` carries.
 
         Raises:
             StreamError: it was damaged after the file was opened.
         """
-        record = record_at(self._data, self.packets[index].offset)
+        info = self.packets[index]
+        record = record_at(self._data, info.offset)
         if record is None:
             raise StreamError(f"Frame {index} of {self._name} is damaged.")
-        return unpacked_arrays(record.payload, FRAME.size, where=f"Frame {index} of {self._name}")[0]
+        return Packet(info.kind, index, info.pts_seconds, record.payload, info.field_bytes)
+
+    def arrays(self, index: int) -> Arrays:
+        """The arrays of frame ``index``.
+
+        Raises:
+            StreamError: it was damaged after the file was opened.
+        """
+        return arrays_of(self.packet(index), where=f"Frame {index} of {self._name}")
+
+    def group(self, index: int) -> Iterator[Packet]:
+        """The packets that frame ``index`` needs, from a key packet to its own."""
+        keys = [info.index for info in self.packets[: index + 1] if info.kind is PacketKind.KEY]
+        for number in range(keys[-1], index + 1):
+            yield self.packet(number)
+
+    def scene(self, index: int) -> State:
+        """Frame ``index`` as the method's state, on the CPU, in normalised units."""
+        return next(self.scenes(index))[1]
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, State]]:
         """Every frame from ``start`` on as the method's state, on the CPU, in normalised units."""
@@ -187,51 +205,79 @@ class PeerReader(Generic[State]):
                 yield info, state
 
 
-class PeerWriter:
-    """Appends frames to a file; each is on the disk when :meth:`write` returns.
-
-    Args:
-        path: the file; it is created, unless ``resumed`` holds what is there already.
-        header: of a new file.
-        resumed: the reader of the file to go on with, after its last whole frame.
+def packet_of(arrays: Arrays, *, index: int, pts_seconds: float, kind: PacketKind) -> Packet:
+    """One frame's arrays as a packet.
 
     Raises:
-        StorageError: it cannot be written.
+        StreamError: the format has no place for one of them.
+    """
+    blocks = {name: packed_array(name, value) for name, value in arrays.items()}
+    payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())
+    return Packet(kind, index, pts_seconds, payload, {name: len(block) for name, block in blocks.items()})
+
+
+def arrays_of(packet: Packet, *, where: str) -> Arrays:
+    """The arrays in a packet.
+
+    Raises:
+        StreamError: the payload contradicts the format.
+    """
+    return unpacked_arrays(packet.payload, FRAME.size, where=where)[0]
+
+
+class PeerSink:
+    """A peer's file. Every frame is on the disk when :meth:`write` returns.
+
+    Args:
+        path: the file; what is there is replaced, unless it is resumed.
+        frames: how many it holds in the end: only then it is marked as complete.
+        resumed: the reader of the file to go on with, after its last whole frame.
     """
 
-    def __init__(self, path: Path | str, header: StreamHeader, *, resumed: "PeerReader[Any] | None" = None) -> None:
-        self._path = Path(path)
-        self._count = 0 if resumed is None else len(resumed)
-        try:
-            self._file = FileIO(self._path, "w" if resumed is None else "r+")
-        except OSError as error:
-            raise StorageError(f"Cannot open {path} for writing ({error.strerror}); choose another place.") from error
-        self._end = 0 if resumed is None else resumed.end
-        if resumed is None:
-            self._append(PREFIX.pack(MAGIC, MAJOR, MINOR) + packed(RecordType.INIT, packed_header(header)))
-        else:
-            self._file.truncate(self._end)
+    def __init__(self, path: Path | str, *, frames: int, resumed: "PeerReader[Any] | None" = None) -> None:
+        self._path, self._frames, self._resumed = Path(path), frames, resumed
+        self._file: FileIO | None = None
+        self._count = self._end = 0
 
-    def write(self, kind: PacketKind, index: int, pts_seconds: float, arrays: Arrays) -> tuple[int, dict[str, int]]:
-        """Append one frame; returns the bytes that it and each of its arrays take.
+    def open(self, header: StreamHeader) -> int:
+        """Create the file and write the init record, or go on with a resumed one, which holds its header already.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        try:
+            self._file = FileIO(self._path, "w" if self._resumed is None else "r+")
+        except OSError as error:
+            raise StorageError(
+                f"Cannot open {self._path} for writing ({error.strerror}); choose another place."
+            ) from error
+        if self._resumed is None:
+            return self._append(PREFIX.pack(MAGIC, MAJOR, MINOR) + packed(RecordType.INIT, packed_header(header)))
+        self._count, self._end = len(self._resumed), self._resumed.end
+        self._file.truncate(self._end)
+        return 0
+
+    def write(self, packet: Packet) -> int:
+        """Append one frame; returns the bytes that it takes.
 
         Raises:
             StorageError: the disk is full or gone; what was written before stays.
         """
-        blocks = {name: packed_array(name, value) for name, value in arrays.items()}
-        size = self._append(packed(_TYPES[kind], FRAME.pack(index, pts_seconds) + b"".join(blocks.values())))
+        size = self._append(packed(_TYPES[packet.kind], packet.payload))
         self._count += 1
-        return size, {name: len(block) for name, block in blocks.items()}
+        return size
 
-    def close(self, *, complete: bool) -> None:
-        """Close the file, marked as complete or to be continued. A second call does nothing."""
-        if self._file.closed:
+    def close(self) -> None:
+        """Close the file, marked as complete if no frame is missing. A second call does nothing."""
+        if self._file is None:
             return
         with self._file:
-            if complete:
+            if self._count == self._frames:
                 self._append(packed(RecordType.INDEX, COUNT.pack(self._count)))
+        self._file = None
 
     def _append(self, data: bytes) -> int:
+        assert self._file is not None, "open() comes before write()"
         try:
             self._file.seek(self._end)
             rest = memoryview(data)

@@ -13,18 +13,22 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.state import fields_of, parameters_of
 from structgstream.training.initial import rig_extent
-from structgstream.training.optim import EPS, Rate, constant
-from structgstream.training.result import Step, StepListener
+from structgstream.training.last_pass import LastPass
+from structgstream.training.losses import LossWeights
+from structgstream.training.optim import Adam, Rate, constant, leaves
+from structgstream.training.optimize import Hooks, Schedule, optimize
+from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import neighbour_distances, voxel_centers
 from structgstream.training.statistics import GradientStatistics
+from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import View, reduced, shuffled_views, training_views
+from structgstream.training.views import View, coarse_to_fine, training_views
 from structgstream_studies.peers.densify import DensifyConfig, densified, reset_opacities
-from structgstream_studies.peers.fitting import LastPsnr, Leaves, gradients_of, picture_loss
 from structgstream_studies.peers.plain import Y0, PlainGaussians
 
-COLORS = ("base_colors", "sh")
 CAMERA = parameters_of(fields_of("camera"))
+LOSSES = LossWeights(l1=0.8, ssim=0.2)
+"""3DGS's."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +72,11 @@ class GaussiansConfig:
 
 
 @dataclass(frozen=True)
-class GaussiansFit:
-    """A fitted frame: see ``peers.method.PeerFit``."""
+class RecordedGaussians:
+    """Gaussians, and how the training cameras record them."""
 
     gaussians: PlainGaussians
     camera_color: CameraColor
-    train_psnr: float
-    seconds: dict[str, float]
-    spawned: int
-    pruned: int
 
 
 def point_colors(points: Tensor, views: list[View]) -> Tensor:
@@ -149,7 +149,7 @@ def fit_gaussians(
     backend: Backend,
     seed: int,
     on_step: StepListener | None = None,
-) -> GaussiansFit:
+) -> FitResult[RecordedGaussians]:
     """Reconstruct one frame from its training views.
 
     Args:
@@ -170,54 +170,88 @@ def fit_gaussians(
         start = initial_gaussians(points, views, config)
         identity = CameraColor.identity(len(views), start.means)
         camera = {p.name: getattr(identity, p.attribute) for p in CAMERA} if config.camera_color else {}
-        small = [reduced(view, config.coarse_scale) for view in views] if config.coarse_iterations else views
-    leaves = Leaves.of(start.tensors() | camera, backend=backend, eps=EPS)
-    statistics = GradientStatistics(len(start), backend.device)
-    last = LastPsnr(config.iterations, len(views))
-    order = shuffled_views(small, generator)
-    spawned = pruned = 0
-    for iteration in range(1, config.iterations + 1):
-        if iteration == config.coarse_iterations + 1:
-            order = shuffled_views(views, generator)
-        view = next(order)
-        gaussians, color = parts(leaves, identity)
-        with watch.stage("generate"):
-            drawn = gaussians.gaussians(view.camera, backend, degree=None if iteration > config.sh_from else 0)
+        samples = coarse_to_fine(
+            views,
+            coarse_iterations=config.coarse_iterations,
+            coarse_scale=config.coarse_scale,
+            generator=generator,
+        )
+    adam = Adam(backend, leaves(start.tensors() | camera))
+    statistics, last_pass = GradientStatistics(len(start), backend.device), LastPass(config.iterations - len(views))
+    hooks = _FromScratch(config, adam, identity, statistics, extent, generator, watch, last_pass)
+    schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
+    iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
+    gaussians, color = hooks.parts()
+    return FitResult(
+        scene=RecordedGaussians(gaussians.detached(), CameraColor(color.gains.detach(), color.biases.detach())),
+        iterations=iterations,
+        train_psnr=last_pass.psnr,
+        spawned=hooks.spawned,
+        pruned=hooks.pruned,
+        seconds=watch.seconds,
+        losses=last_pass.terms,
+    )
+
+
+@dataclass
+class _FromScratch(Hooks[View, ViewLoss]):
+    """What 3DGS does in an iteration; ``identity`` is the colour correction where none is learned."""
+
+    config: GaussiansConfig
+    adam: Adam[str]
+    identity: CameraColor
+    statistics: GradientStatistics
+    extent: float
+    generator: torch.Generator
+    watch: Stopwatch
+    last_pass: LastPass
+    spawned: int = 0
+    pruned: int = 0
+
+    def parts(self) -> tuple[PlainGaussians, CameraColor]:
+        """What the leaves stand for."""
+        values = self.adam.values
+        color = {p.attribute: values[p.name] for p in CAMERA if p.name in values}
+        names = {parameter.name for parameter in CAMERA}
+        gaussians = PlainGaussians(**{name: value for name, value in values.items() if name not in names})
+        return gaussians, CameraColor(**color).gauged() if color else self.identity
+
+    def loss(self, iteration: int, sample: View) -> ViewLoss:
+        config, backend = self.config, self.adam.backend
+        gaussians, color = self.parts()
+        with self.watch.stage("generate"):
+            drawn = gaussians.gaussians(sample.camera, backend, degree=None if iteration > config.sh_from else 0)
         collects = iteration <= config.densify.stop
-        loss = picture_loss(drawn, view, color, backend=backend, track_screen=collects, watch=watch)
-        gradients, screen = gradients_of(loss, leaves.values, watch)
-        last.add(iteration, loss, view)
-        with watch.stage("optimise"):
-            leaves.step(gradients, rates_at(iteration, config, extent=extent))
-        if screen is not None:
-            with watch.stage("densify"), torch.no_grad():
-                statistics.add(loss.rendering, screen)
-                if config.densify.due(iteration):
-                    gaussians, _ = parts(leaves, identity)
-                    change = densified(
-                        gaussians,
-                        statistics.mean(),
-                        config=config.densify,
-                        extent=extent,
-                        prune_large=config.densify.has_reset(iteration),
-                        generator=generator,
-                    )
-                    leaves.replace_rows(change.added.tensors(), keep=change.keep)
-                    spawned, pruned = spawned + len(change.added), pruned + change.removed
-                    statistics = GradientStatistics(len(parts(leaves, identity)[0]), backend.device)
-                if iteration == config.densify.reset_at:
-                    leaves.replace_values("logit_opacities", reset_opacities(leaves.values["logit_opacities"]))
-        if on_step is not None:
-            on_step(Step(iteration, config.iterations, float(loss.total.detach()), 0, len(drawn)))
-    gaussians, color = parts(leaves, identity)
-    color = CameraColor(color.gains.detach(), color.biases.detach())
-    return GaussiansFit(gaussians.detached(), color, last.mean, watch.seconds, spawned, pruned)
+        loss = picture_loss(
+            drawn, sample, color, backend=backend, weights=LOSSES, track_screen=collects, watch=self.watch
+        )
+        self.last_pass.add(iteration, loss, sample)
+        return loss
 
+    def after_step(self, iteration: int, sample: View, loss: ViewLoss, screen_gradient: Tensor | None) -> None:
+        if screen_gradient is None:
+            return
+        config = self.config.densify
+        with self.watch.stage("densify"), torch.no_grad():
+            self.statistics.add(loss.rendering, screen_gradient)
+            if config.due(iteration):
+                self._densify(prune_large=config.has_reset(iteration))
+            if iteration == config.reset_at:
+                logits = reset_opacities(self.adam.values["logit_opacities"])
+                self.adam.replace_values("logit_opacities", logits)
 
-def parts(leaves: Leaves, identity: CameraColor) -> tuple[PlainGaussians, CameraColor]:
-    """What the leaves stand for; ``identity`` where no camera colour is learned."""
-    values = leaves.values
-    color = {p.attribute: values[p.name] for p in CAMERA if p.name in values}
-    names = {parameter.name for parameter in CAMERA}
-    gaussians = PlainGaussians(**{name: value for name, value in values.items() if name not in names})
-    return gaussians, CameraColor(**color).gauged() if color else identity
+    def _densify(self, *, prune_large: bool) -> None:
+        change = densified(
+            self.parts()[0],
+            self.statistics.mean(),
+            config=self.config.densify,
+            extent=self.extent,
+            prune_large=prune_large,
+            generator=self.generator,
+        )
+        self.adam.replace_rows(change.added.tensors(), keep=change.keep)
+        self.spawned, self.pruned = self.spawned + len(change.added), self.pruned + change.removed
+        self.statistics = GradientStatistics(len(self.adam.values["means"]), self.adam.backend.device)
+
+    def counts(self) -> tuple[int, int]:
+        return 0, len(self.adam.values["means"])

@@ -9,62 +9,39 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
 from structgstream.codec.scene.shapes import check_shapes
 from structgstream.errors import StreamError
-from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import Backend
+from structgstream.pipeline import FrameTask
 from structgstream.presets import RIG
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_of, state_of
 from structgstream.training.initial import InitialConfig, fit_first_frame
 from structgstream.training.losses import LossWeights
-from structgstream.training.result import StepListener
-from structgstream_studies.peers.method import Arrays, PeerFit, PointsMaker, stored
+from structgstream.training.result import FitResult
+from structgstream_studies.peers.method import Arrays, EveryFrameAlone, stored
 
 SCAFFOLD = replace(RIG.initial, distance_input=False, losses=LossWeights(l1=0.8, ssim=0.2, volume=0.01))
 """The preset ``rig`` with Scaffold-GS's inputs and loss: no distance, no term that keeps offsets short."""
 
 
 @dataclass(frozen=True)
-class ScaffoldGS:
+class ScaffoldGS(EveryFrameAlone[Scene]):
     """The method behind the loop. No frame knows of another, and nothing is remembered."""
 
     config: InitialConfig = field(default_factory=lambda: SCAFFOLD)
     name: str = "scaffold-gs"
-    stands_alone: bool = True
 
-    def first(
-        self,
-        frame: MultiViewFrame,
-        rig: CameraRig,
-        points: PointsMaker,
-        *,
-        backend: Backend,
-        seed: int,
-        on_step: StepListener | None = None,
-    ) -> PeerFit[Scene]:
+    def first(self, task: FrameTask) -> FitResult[Scene]:
         """Any frame: see ``training.initial.fit_first_frame``."""
-        fit = fit_first_frame(frame, rig, points(), config=self.config, backend=backend, seed=seed, on_step=on_step)
-        return PeerFit(fit.scene, fit.train_psnr, fit.seconds, fit.spawned, fit.pruned)
-
-    def prepared(self, state: Scene, *, backend: Backend, seed: int) -> None:
-        """Nothing."""
-
-    def next(
-        self,
-        state: Scene,
-        memory: None,
-        frame: MultiViewFrame,
-        rig: CameraRig,
-        points: PointsMaker,
-        *,
-        backend: Backend,
-        seed: int,
-        on_step: StepListener | None = None,
-    ) -> PeerFit[Scene]:
-        """As :meth:`first`."""
-        return self.first(frame, rig, points, backend=backend, seed=seed, on_step=on_step)
+        return fit_first_frame(
+            task.frame,
+            task.rig,
+            task.points(),
+            config=self.config,
+            backend=task.backend,
+            seed=task.seed,
+            on_step=task.on_step,
+        )
 
     def arrays(self, state: Scene) -> Arrays:
         """Every tensor of the scene."""

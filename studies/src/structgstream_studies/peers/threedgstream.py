@@ -9,7 +9,7 @@
     base(t+1) starts here <-----------------------------------------'      dropped with the frame
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,22 +17,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera
 from structgstream.errors import StreamError
-from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from structgstream.pipeline import FrameTask, Past
 from structgstream.scene.color import CameraColor
 from structgstream.training.initial import rig_extent
-from structgstream.training.result import Step, StepListener
+from structgstream.training.last_pass import LastPass
+from structgstream.training.optim import Adam, leaves
+from structgstream.training.optimize import Hooks, Schedule, optimize
+from structgstream.training.result import FitResult
 from structgstream.training.statistics import GradientStatistics
+from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import shuffled_views, training_views
+from structgstream.training.views import View, shuffled_views
 from structgstream_studies.peers.additions import AdditionsConfig, fit_additions, spawned_at
-from structgstream_studies.peers.fitting import LastPsnr, Leaves, gradients_of, picture_loss
-from structgstream_studies.peers.gaussians import GaussiansConfig, fit_gaussians
+from structgstream_studies.peers.gaussians import LOSSES, GaussiansConfig, fit_gaussians
 from structgstream_studies.peers.hash_grid import Cache, GridConfig, GridQuery, transformation
-from structgstream_studies.peers.method import Arrays, PeerFit, PointsMaker, stored
+from structgstream_studies.peers.method import Arrays, LooksAtPicturesOnly, stored
 from structgstream_studies.peers.plain import PlainGaussians, moved
 from structgstream_studies.peers.plain_arrays import color_of, gaussians_of, tensor_of, with_prefix
 from structgstream_studies.peers.warm_up import WarmUpConfig, warmed_up
@@ -112,101 +115,112 @@ def transformed(base: PlainGaussians, rows: Tensor, outputs: Tensor, shift_scale
     return moved(base, shifts, stays.index_copy(0, rows, outputs[:, 3:7]))
 
 
+@dataclass
+class _Transformed(Hooks[View, ViewLoss]):
+    """What the first stage does in an iteration: move ``rows`` of the base by the cache, as ``query`` asks it."""
+
+    config: ThreeDGStreamConfig
+    adam: Adam[str]
+    state: StreamedGaussians
+    rows: Tensor
+    query: GridQuery
+    statistics: GradientStatistics
+    watch: Stopwatch
+    last_pass: LastPass
+
+    def loss(self, iteration: int, sample: View) -> ViewLoss:
+        config, state, backend, watch = self.config, self.state, self.adam.backend, self.watch
+        with watch.stage("transform"):
+            outputs = transformation(Cache.of(self.adam.values), self.query, config.grid)
+            gaussians = transformed(state.base, self.rows, outputs, config.shift_scale)
+        with watch.stage("generate"):
+            drawn = gaussians.gaussians(sample.camera, backend)
+        collects = iteration > config.collect_from
+        loss = picture_loss(
+            drawn, sample, state.camera_color, backend=backend, weights=LOSSES, track_screen=collects, watch=watch
+        )
+        self.last_pass.add(iteration, loss, sample)
+        return loss
+
+    def after_step(self, iteration: int, sample: View, loss: ViewLoss, screen_gradient: Tensor | None) -> None:
+        if screen_gradient is not None:
+            self.statistics.add(loss.rendering, screen_gradient)
+
+    def counts(self) -> tuple[int, int]:
+        return 0, len(self.state.base)
+
+    def parents(self) -> Tensor:
+        """Mask of the Gaussians of the base that have a child: those inside the box that pull hard."""
+        inside = torch.zeros(len(self.state.base), dtype=torch.bool, device=self.rows.device)
+        return (self.statistics.mean() >= self.config.additions.gradient) & inside.index_fill(0, self.rows, True)
+
+
 @dataclass(frozen=True)
-class ThreeDGStream:
+class ThreeDGStream(LooksAtPicturesOnly):
     """The method behind the loop; its memory is the warmed-up cache."""
 
     config: ThreeDGStreamConfig = field(default_factory=ThreeDGStreamConfig)
     name: str = "3dgstream"
     stands_alone: bool = False
 
-    def first(
-        self,
-        frame: MultiViewFrame,
-        rig: CameraRig,
-        points: PointsMaker,
-        *,
-        backend: Backend,
-        seed: int,
-        on_step: StepListener | None = None,
-    ) -> PeerFit[StreamedGaussians]:
+    def first(self, task: FrameTask) -> FitResult[StreamedGaussians]:
         """Frame 0: plain Gaussians from scratch."""
         fit = fit_gaussians(
-            frame, rig, points(), config=self.config.initial, backend=backend, seed=seed, on_step=on_step
+            task.frame,
+            task.rig,
+            task.points(),
+            config=self.config.initial,
+            backend=task.backend,
+            seed=task.seed,
+            on_step=task.on_step,
         )
-        base = fit.gaussians
+        base, color = fit.scene.gaussians, fit.scene.camera_color
         none = PlainGaussians.empty(base.degree, base.means)
-        state = StreamedGaussians(base, none, fit.camera_color, box_of(base.means, self.config.box_share), None)
-        return PeerFit(state, fit.train_psnr, fit.seconds, fit.spawned, fit.pruned)
+        return fit.with_scene(StreamedGaussians(base, none, color, box_of(base.means, self.config.box_share), None))
 
-    def prepared(self, state: StreamedGaussians, *, backend: Backend, seed: int) -> Cache:
+    def prepare(self, state: StreamedGaussians, task: Callable[[], FrameTask]) -> Cache:
         """The cache that every frame starts from."""
+        first, config = task(), self.config
         _, positions = in_box(state.base.means, state.box)
-        config = self.config
-        return warmed_up(positions, config=config.warm_up, grid=config.grid, backend=backend, seed=seed)[0]
+        return warmed_up(positions, config=config.warm_up, grid=config.grid, backend=first.backend, seed=first.seed)[0]
 
-    def next(
-        self,
-        state: StreamedGaussians,
-        memory: Cache,
-        frame: MultiViewFrame,
-        rig: CameraRig,
-        points: PointsMaker,
-        *,
-        backend: Backend,
-        seed: int,
-        on_step: StepListener | None = None,
-    ) -> PeerFit[StreamedGaussians]:
-        """Both stages of a later frame; ``points`` are not asked for."""
-        config, base = self.config, state.base
-        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
-        views = training_views(frame, rig, backend.device)
+    def next(self, past: Past[StreamedGaussians, Cache], task: FrameTask) -> FitResult[StreamedGaussians]:
+        """Both stages of a later frame."""
+        config, state, base, backend = self.config, past.state, past.state.base, task.backend
+        generator, watch = torch.Generator().manual_seed(task.seed), Stopwatch(backend.device)
+        views = task.pictures.views
+        order = shuffled_views(views, generator)
         with watch.stage("look up"):
             rows, positions = in_box(base.means, state.box)
             query = GridQuery.of(positions, config.grid)
-        leaves = Leaves.of(memory.tensors(), backend=backend, eps=config.eps)
-        statistics = GradientStatistics(len(base), backend.device)
-        order = shuffled_views(views, generator)
-        steps = config.iterations + config.additions.iterations
-        last = LastPsnr(config.iterations, len(views))
-        rates = dict.fromkeys(leaves.values, config.rate)
-        for iteration in range(1, config.iterations + 1):
-            view = next(order)
-            with watch.stage("transform"):
-                outputs = transformation(Cache.of(leaves.values), query, config.grid)
-                gaussians = transformed(base, rows, outputs, config.shift_scale)
-            with watch.stage("generate"):
-                drawn = gaussians.gaussians(view.camera, backend)
-            collects = iteration > config.collect_from
-            loss = picture_loss(drawn, view, state.camera_color, backend=backend, track_screen=collects, watch=watch)
-            gradients, screen = gradients_of(loss, leaves.values, watch)
-            last.add(iteration, loss, view)
-            if screen is not None:
-                statistics.add(loss.rendering, screen)
-            with watch.stage("optimise"):
-                leaves.step(gradients, rates)
-            if on_step is not None:
-                on_step(Step(iteration, steps, float(loss.total.detach()), 0, len(base)))
-        fitted = replace(state, cache=Cache.of(leaves.values).as_stored())
+        adam = Adam(backend, leaves(past.memory.tensors()), config.eps)
+        last_pass = LastPass(config.iterations - len(views))
+        hooks = _Transformed(
+            config, adam, state, rows, query, GradientStatistics(len(base), backend.device), watch, last_pass
+        )
+        rates = dict.fromkeys(adam.values, config.rate)
+        schedule = Schedule(config.iterations, lambda _: rates, after=config.additions.iterations)
+        optimize(adam, order, schedule, hooks, watch=watch, on_step=task.on_step)
+        fitted = replace(state, cache=Cache.of(adam.values).as_stored())
         decoded = self._moved(fitted, rows, query)
-        inside = torch.zeros(len(base), dtype=torch.bool, device=base.means.device).index_fill(0, rows, True)
-        additions = config.additions
-        parents = decoded.select((statistics.mean() >= additions.gradient) & inside)
+        parents = decoded.select(hooks.parents())
         result = fit_additions(
-            spawned_at(parents, additions, generator),
+            spawned_at(parents, config.additions, generator),
             decoded,
             state.camera_color,
             order,
-            config=additions,
-            extent=rig_extent(rig),
+            config=config.additions,
+            extent=rig_extent(task.rig),
             views=len(views),
             backend=backend,
             watch=watch,
-            on_step=None if on_step is None else _later(on_step, config.iterations, steps, len(base)),
+            before=config.iterations,
+            on_step=task.on_step,
         )
-        return PeerFit(
-            state=replace(fitted, base=decoded, added=result.added),
-            train_psnr=last.mean if result.train_psnr is None else result.train_psnr,
+        return FitResult(
+            scene=replace(fitted, base=decoded, added=result.added),
+            iterations=config.iterations + config.additions.iterations,
+            train_psnr=last_pass.psnr if result.train_psnr is None else result.train_psnr,
             seconds=watch.seconds,
             spawned=len(parents),
             pruned=len(parents) - len(result.added),
@@ -251,12 +265,3 @@ class ThreeDGStream:
         rows, positions = in_box(previous.base.means, previous.box)
         state = replace(previous, added=added, cache=cache)
         return replace(state, base=self._moved(state, rows, GridQuery.of(positions, grid, gradients=False)))
-
-
-def _later(on_step: StepListener, before: int, steps: int, base: int) -> StepListener:
-    """Steps of the second stage, counted on from the first."""
-
-    def listener(step: Step) -> None:
-        on_step(replace(step, iteration=before + step.iteration, iterations=steps, free=base + step.free))
-
-    return listener

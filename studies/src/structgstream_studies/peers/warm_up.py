@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """3DGStream's warm-up: a cache that leaves every position where it is, from which each frame starts."""
 
+import math
 from dataclasses import dataclass
+from itertools import cycle
 
 import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream_studies.peers.fitting import Leaves
+from structgstream.training.optim import Adam, leaves
+from structgstream.training.optimize import Hooks, Schedule, optimize
+from structgstream.training.step import Loss
+from structgstream.training.stopwatch import Stopwatch
 from structgstream_studies.peers.hash_grid import Cache, GridConfig, GridQuery, transformation
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -49,21 +54,30 @@ def warmed_up(
     """
     generator, device = torch.Generator().manual_seed(seed), backend.device
     start = Cache.random(grid, generator)
-    leaves = Leaves.of(
-        {name: value.to(device) for name, value in start.tensors().items()}, backend=backend, eps=config.eps
-    )
+    adam = Adam(backend, leaves({name: value.to(device) for name, value in start.tensors().items()}), config.eps)
     pool = [
         GridQuery.of(_batch(positions.cpu(), config, generator).to(device), grid)
         for _ in range(min(config.batches, config.iterations))
     ]
-    value = float("nan")
-    for iteration in range(config.iterations):
-        loss = identity_loss(transformation(Cache.of(leaves.values), pool[iteration % len(pool)], grid))
-        found = torch.autograd.grad(loss, list(leaves.values.values()))
-        leaves.step(dict(zip(leaves.values, found, strict=True)), dict.fromkeys(leaves.values, config.rate))
-        if iteration == config.iterations - 1:
-            value = float(loss.detach())
-    return Cache.of({name: leaf.detach() for name, leaf in leaves.values.items()}), value
+    hooks = _Identity(adam, grid)
+    rates = dict.fromkeys(adam.values, config.rate)
+    optimize(adam, cycle(pool), Schedule(config.iterations, lambda _: rates), hooks, watch=Stopwatch(device))
+    value = math.nan if hooks.last is None else float(hooks.last.total.detach())
+    return Cache.of({name: leaf.detach() for name, leaf in adam.values.items()}), value
+
+
+@dataclass
+class _Identity(Hooks[GridQuery, Loss]):
+    """Batches of positions as samples; ``last`` is the last one's loss."""
+
+    adam: Adam[str]
+    grid: GridConfig
+    last: Loss | None = None
+
+    def loss(self, iteration: int, sample: GridQuery) -> Loss:
+        total = identity_loss(transformation(Cache.of(self.adam.values), sample, self.grid))
+        self.last = Loss(total, {"identity": total})
+        return self.last
 
 
 def _batch(positions: Tensor, config: WarmUpConfig, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What happened to one frame: its numbers, and the clock and the memory meter that they are read from."""
+
+import time
+from collections.abc import Iterator, Mapping, Sized
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import TypeVar
+
+import torch
+
+from structgstream.codec.encoder import Encoded
+from structgstream.codec.packets import PacketKind
+from structgstream.memory import PeakKind, PeakMeter
+from structgstream.scene.render import Drawable
+from structgstream.scene.scene import Scene
+from structgstream.training.result import FitResult
+
+T = TypeVar("T")
+StateT = TypeVar("StateT", bound=Drawable)
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What happened to one frame.
+
+    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors. ``field_bytes`` are those of
+    each field of the packet.
+
+    Peaks of memory are by stage: ``read``, ``fit``, ``store`` for encoding and writing, and ``prepare`` for what frame
+    0 leaves to later frames. ``peak_memory_kind`` says whether they are each stage's own (Note [Peaks]);
+    ``peak_device_bytes`` has the GPU's, when there is one. ``cpu_seconds`` is the time of all the process's threads
+    together, which other processes do not lengthen.
+    """
+
+    index: int
+    pts_seconds: float
+    kind: PacketKind
+    bytes: int
+    field_bytes: Mapping[str, int]
+    train_psnr: float
+    anchors: int
+    moving: int
+    free: int
+    spawned: int
+    pruned: int
+    grown: int = 0
+    removed: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    peak_memory_bytes: Mapping[str, int] = field(default_factory=dict)
+    peak_device_bytes: Mapping[str, int] = field(default_factory=dict)
+    peak_memory_kind: PeakKind = PeakKind.NONE
+    cpu_seconds: float = 0.0
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+class FrameMeter:
+    """Seconds and memory of one frame's stages, which follow one another; the first begins on creation."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._peaks = PeakMeter(device)
+        self._started = self._last = time.perf_counter()
+        self._cpu_started = time.process_time()
+        self._seconds: dict[str, float] = {}
+
+    def end(self, stage: str, *, peak: str | None = None) -> None:
+        """A stage is over; so is the stage ``peak`` of memory, if that is named."""
+        if peak is not None:
+            self._peaks.end(peak)
+        now = time.perf_counter()
+        self._seconds[stage], self._last = now - self._last, now
+
+    def report(self, fit: FitResult[StateT], encoded: Encoded[StateT], size: int) -> FrameReport:
+        """The report of the frame whose packet takes ``size`` bytes."""
+        packet, state = encoded.packet, encoded.reconstruction
+        read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
+        return FrameReport(
+            index=packet.index,
+            pts_seconds=packet.pts_seconds,
+            kind=packet.kind,
+            bytes=size,
+            field_bytes=packet.field_bytes,
+            train_psnr=fit.train_psnr,
+            **counts(state),
+            moving=fit.moving,
+            spawned=fit.spawned,
+            pruned=fit.pruned,
+            grown=fit.grown,
+            removed=fit.removed,
+            counts=dict(fit.counts),
+            seconds={**read, **fit.seconds, **self._seconds, "total": self._last - self._started},
+            peak_memory_bytes=self._peaks.process_bytes,
+            peak_device_bytes=self._peaks.device_bytes,
+            peak_memory_kind=self._peaks.kind,
+            cpu_seconds=time.process_time() - self._cpu_started,
+        )
+
+
+def metered(items: Iterator[T], device: torch.device) -> Iterator[tuple[FrameMeter, T]]:
+    """Each item with the meter of its frame, whose stage ``read`` was getting it."""
+    while True:
+        meter = FrameMeter(device)
+        found = [*islice(items, 1)]
+        if not found:
+            return
+        meter.end("read", peak="read")
+        yield meter, found[0]
+
+
+def counts(state: Drawable) -> dict[str, int]:
+    """``anchors`` and ``free`` Gaussians; all Gaussians of what has no anchors are free."""
+    if isinstance(state, Scene):
+        return {"anchors": len(state.anchors), "free": len(state.free)}
+    return {"anchors": 0, "free": len(state) if isinstance(state, Sized) else 0}

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two codecs of scenes: ``raw`` and ``compact``, with the header that each begins a stream with."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.packets import StreamHeader
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.scene.bins import on_bins
+from structgstream.codec.sinks import FileSink
+from structgstream.pipeline import FrameTask, StreamFacts
+from structgstream.presets import StreamConfig
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.order import in_space_order
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
+from structgstream.training.first_bins import first_bins, float32, regauged, sensitivity_of
+from structgstream.training.rounding import pixel_size
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What numbers of a stream are multiples of, as the header states it; nothing with codec ``raw``.
+
+    Args:
+        steps: of what packets carry, by name.
+        init_steps: of what the header carries, by field.
+    """
+
+    steps: Mapping[str, float] = field(default_factory=dict)
+    init_steps: Mapping[FieldName, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SceneCodec(ABC):
+    """What both codecs share: the file, the coder and the header."""
+
+    config: StreamConfig
+
+    @property
+    def name(self) -> str:
+        """What the header's ``codec`` says."""
+        return self.config.codec
+
+    def key_interval(self, fps: float) -> int:
+        """Frames from one key packet to the next."""
+        return max(1, round(fps * self.config.key_interval_seconds))
+
+    def file(self, path: Path, *, frames: int, resume: bool) -> tuple[FileSink, StreamReader | None]:
+        """The file, which is replaced unless it is resumed; ``frames`` are not counted.
+
+        Raises:
+            StreamError: what is to be resumed is no stream, or damaged where nothing can be saved.
+        """
+        return FileSink.resume(path) if resume else (FileSink(path, overwrite=True), None)
+
+    def coder(self, header: StreamHeader, device: torch.device) -> SceneEncoder:
+        """What encodes and decodes, on the CPU."""
+        return SceneEncoder(header)
+
+    def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
+        """Frame 0 as the frames after it start from it, and the header of the stream."""
+        scene, grid = self._begun(fitted, task)
+        state, dynamic = state_of(scene), self.config.online.dynamic
+        reference = dynamic.difference(fields_of("free")) if grid.steps else ()
+        header = StreamHeader(
+            rig=facts.rig,
+            similarity=facts.similarity,
+            fps=facts.fps,
+            codec=facts.codec,
+            dynamic=dynamic,
+            static={name: value.cpu() for name, value in state.items() if name not in dynamic},
+            distance_input=scene.distance_input,
+            config=facts.config,
+            metadata=facts.metadata,
+            steps=grid.steps,
+            reference={name: state[name].cpu() for name in reference},
+            init_steps=grid.init_steps,
+        )
+        return scene, header
+
+    @abstractmethod
+    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+        """Frame 0 with the numbers that a receiver will have."""
+
+    def _with_dynamic_fields(self, scene: Scene) -> Scene:
+        """``scene`` with every field that may change; appearance has the directions in which features may."""
+        online = self.config.online
+        if "appearance" in online.dynamic:
+            scene = with_appearance(scene, online.appearance_rank)
+        return with_dynamic_fields(scene, online.dynamic)
+
+
+@dataclass(frozen=True)
+class RawCodec(SceneCodec):
+    """Every number as float32."""
+
+    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+        return self._with_dynamic_fields(scene), Grid()
+
+
+@dataclass(frozen=True)
+class CompactCodec(SceneCodec):
+    """Every number is a bin (``training/rounding.py``, Note [Bins]): frame 0 is rounded, and in space order."""
+
+    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+        dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
+        scene, worth = regauged(scene, sensitivity_of(scene, task.rig, backend=task.backend, seed=task.seed))
+        scene = self._with_dynamic_fields(scene)
+        known = rounding.steps(pixel_size(scene.anchors.positions, task.rig))
+        used = {parameter.name for parameter in parameters_of(dynamic)}
+        steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
+        voxel_size = self.config.initial.voxel_size
+        scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
+        if scene.environment is not None:
+            init_steps["environment"] = float32(self.config.environment.step)
+        rounded = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
+        return scene_of(rounded, distance_input=scene.distance_input), Grid(steps, init_steps)
+
+
+def scene_codec(config: StreamConfig) -> SceneCodec:
+    """The codec that the configuration names."""
+    return RawCodec(config) if config.codec == "raw" else CompactCodec(config)

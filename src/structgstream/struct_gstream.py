@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Struct-GStream: frame 0 from scratch, every later frame from the decoded one before it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from structgstream.cameras import CameraRig
+from structgstream.errors import ConfigError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.pipeline import FrameTask, Past, Pipeline
+from structgstream.presets import StreamConfig, to_json
+from structgstream.rate_control import pressed
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+from structgstream.scene_codecs import scene_codec
+from structgstream.training.environment import fitted_environment
+from structgstream.training.initial import fit_first_frame
+from structgstream.training.online import fit_next_frame, remembers
+from structgstream.training.pictures import FramePictures, pictures_of
+from structgstream.training.residuals import ResidualFloor, residual_floor
+from structgstream.training.result import FitResult
+
+
+@dataclass(frozen=True)
+class StructGStream:
+    """The method. Its memory is what frame 0 missed, where later frames ask for that.
+
+    Args:
+        config: everything that decides the result.
+        fitted: gives frame 0 as it was fitted before, with the same capture, seed and ``config.initial``; variants that
+            differ in later frames alone can share it. None: it is fitted.
+    """
+
+    config: StreamConfig
+    fitted: Callable[[], FitResult[Scene]] | None = None
+
+    @property
+    def needs_before(self) -> bool:
+        """Whether what moves is looked for in the pictures."""
+        return self.config.online.motion.enabled
+
+    @property
+    def needs_older(self) -> bool:
+        """See ``training.online.remembers``."""
+        return remembers(self.config.online)
+
+    def observe(
+        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+    ) -> FramePictures:
+        """The training pictures, and what has changed in them."""
+        online = self.config.online
+        return pictures_of(frame, rig, before=before, motion=online.motion, start=online.start, backend=backend)
+
+    def first(self, task: FrameTask) -> FitResult[Scene]:
+        """Frame 0, before its environment if it has one."""
+        config, backend = self.config, task.backend
+        if self.fitted is not None:
+            fit = self.fitted()
+        else:
+            fit = fit_first_frame(
+                task.frame,
+                task.rig,
+                task.points(),
+                config=config.initial,
+                backend=backend,
+                seed=task.seed,
+                on_step=task.on_step,
+            )
+        if not config.environment.enabled:
+            return fit
+        views = task.pictures.views
+        found = fitted_environment(fit.scene, views, config=config.environment, backend=backend)
+        return replace(fit, scene=replace(fit.scene, environment=found))
+
+    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> ResidualFloor | None:
+        """What frame 0 missed, if residuals tell what moves."""
+        motion = self.config.online.motion
+        if motion.residual_threshold <= 0.0:
+            return None
+        first = task()
+        scene, backend = on_device(state, first.backend.device), first.backend
+        return residual_floor(scene, first.pictures.views, scale=motion.picture_scale, backend=backend)
+
+    def next(self, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
+        """A later frame."""
+        device = task.backend.device
+        return fit_next_frame(
+            on_device(past.state, device),
+            task.frame,
+            task.rig,
+            config=pressed(self.config.online, task.pressure),
+            backend=task.backend,
+            seed=task.seed,
+            pictures=task.pictures,
+            steps=task.steps,
+            floor=past.memory,
+            older=None if past.older is None else on_device(past.older, device),
+            on_step=task.on_step,
+        )
+
+
+def stream_pipeline(
+    config: StreamConfig, *, fitted: Callable[[], FitResult[Scene]] | None = None
+) -> Pipeline[Scene, ResidualFloor | None]:
+    """The pipeline of a configuration; see :class:`StructGStream`.
+
+    Raises:
+        ConfigError: a rate to keep to for a stream whose packets are as large as they are.
+    """
+    if config.rate.target_mbits is not None and config.codec != "compact":
+        raise ConfigError(
+            f"A target of {config.rate.target_mbits:g} Mbit/s was given for a stream with codec {config.codec!r}, "
+            "whose packets are as large as they are; take --preset compact, or leave the target out."
+        )
+    return Pipeline(
+        StructGStream(config, fitted),
+        scene_codec(config),
+        config=to_json(config),
+        seed=config.seed,
+        normalised_radius=config.normalised_radius,
+        points=config.points,
+        rate=config.rate,
+    )

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a fit does at its end, from the last rendering of each view."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from structgstream.training.step import ViewLoss
+from structgstream.training.views import View
+
+
+class LastPass:
+    """Mean loss terms and PSNR over the last pass through the cameras. Numbers are read when they are asked for.
+
+    Args:
+        after: iterations that are not looked at; the pass follows them.
+    """
+
+    def __init__(self, after: int = 0) -> None:
+        self._after = after
+        self._terms: dict[int, dict[str, Tensor]] = {}
+        self._squared_errors: dict[int, Tensor] = {}
+
+    def add(self, iteration: int, loss: ViewLoss, view: View) -> None:
+        """Note one view's result, in place of what was noted of it before."""
+        if iteration > self._after:
+            self._squared_errors[view.index] = loss.squared_error(view)
+            self._terms[view.index] = {name: value.detach() for name, value in loss.terms.items()}
+
+    @property
+    def psnr(self) -> float:
+        """Mean over views of the PSNR in dB, NaN before any view."""
+        values = [-10.0 * math.log10(max(float(error), 1e-10)) for error in self._squared_errors.values()]
+        return sum(values) / len(values) if values else math.nan
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Mean of each loss term."""
+        names = dict.fromkeys(
+            name for terms in self._terms.values() for name in terms
+        )  # Not every view has every term.
+        by_name = {name: [terms[name] for terms in self._terms.values() if name in terms] for name in names}
+        return {name: float(torch.stack(values).mean()) for name, values in by_name.items()}

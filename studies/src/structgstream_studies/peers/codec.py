@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Peers behind the loop: their frames as packets of named arrays, and a method as a pipeline."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic
+
+import torch
+
+from structgstream.codec.container.records import PREFIX, record_at
+from structgstream.codec.container.stored import StoredFile
+from structgstream.codec.encoder import Encoded
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.pipeline import FrameTask, Memory, Pipeline, State, StreamFacts
+from structgstream.presets import RIG, to_json
+from structgstream.scene.state import STATE_TABLE
+from structgstream_studies.peers.container import PeerReader, PeerSink, arrays_of, check_prefix, packet_of
+from structgstream_studies.peers.method import PeerMethod
+
+
+class PeerCoder(Generic[State]):
+    """Encodes and decodes the frames of one file, in order.
+
+    Args:
+        method: gives arrays for states and states for arrays.
+        device: where states are decoded to.
+    """
+
+    def __init__(self, method: PeerMethod[State, Memory], device: torch.device) -> None:
+        self._arrays, self._restored = method.arrays, method.restored
+        self._device = device
+        self._state: State | None = None
+
+    def encode(self, state: State, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[State]:
+        """The packet of a frame, and what the decoder makes of it."""
+        packet = packet_of(self._arrays(state), index=index, pts_seconds=pts_seconds, kind=kind)
+        return Encoded(packet, self.follow(packet))
+
+    def follow(self, packet: Packet) -> State:
+        """Decode a packet, and go on after it."""
+        previous = None if packet.kind is PacketKind.KEY else self._state
+        arrays = arrays_of(packet, where=f"Frame {packet.index}")
+        self._state = self._restored(arrays, previous, device=self._device)
+        return self._state
+
+
+@dataclass(frozen=True)
+class PeerCodec(Generic[State, Memory]):
+    """A peer's file: its frames as named arrays."""
+
+    method: PeerMethod[State, Memory]
+
+    @property
+    def name(self) -> str:
+        """The method's."""
+        return self.method.name
+
+    def key_interval(self, fps: float) -> int:
+        """Every frame is a key frame, or the first alone."""
+        return 1 if self.method.stands_alone else sys.maxsize
+
+    def file(self, path: Path, *, frames: int, resume: bool) -> tuple[PeerSink, PeerReader[State] | None]:
+        """The file, which is replaced unless it is resumed and holds a whole frame.
+
+        Raises:
+            StreamError: what is to be resumed is no file of a peer.
+        """
+        reader = self._existing(path) if resume and path.exists() else None
+        return PeerSink(path, frames=frames, resumed=reader), reader
+
+    def _existing(self, path: Path) -> PeerReader[State] | None:
+        data = StoredFile(path)
+        if len(data) < PREFIX.size:
+            return None
+        check_prefix(data, str(path))
+        if record_at(data, PREFIX.size) is None:
+            return None
+        reader = PeerReader(data, lambda _: self.method, name=str(path))
+        return reader if len(reader) else None
+
+    def prepare(self, fitted: State, task: FrameTask, facts: StreamFacts) -> tuple[State, StreamHeader]:
+        """Frame 0 as it is, and the header, which carries nothing of it."""
+        return fitted, StreamHeader(
+            rig=facts.rig,
+            similarity=facts.similarity,
+            fps=facts.fps,
+            codec=facts.codec,
+            dynamic=frozenset(field.name for field in STATE_TABLE),
+            static={},
+            distance_input=False,
+            config=facts.config,
+            metadata=facts.metadata,
+        )
+
+    def coder(self, header: StreamHeader, device: torch.device) -> PeerCoder[State]:
+        """What encodes and decodes, on ``device``."""
+        return PeerCoder(self.method, device)
+
+
+def peer_pipeline(method: PeerMethod[State, Memory], *, seed: int = 0) -> Pipeline[State, Memory]:
+    """A peer with the initial points, the normalisation and the seeds that the preset ``rig`` has."""
+    return Pipeline(
+        method,
+        PeerCodec(method),
+        config=to_json(method.config),
+        seed=seed,
+        normalised_radius=RIG.normalised_radius,
+        points=RIG.points,
+        metadata={"seed": seed},
+    )
