@@ -78,7 +78,7 @@ def test_a_bug_says_that_it_is_one(command, capsys: pytest.CaptureFixture[str]) 
     command(raising(IndexError("7")))
     assert main(["inspect"]) == 1
     text = capsys.readouterr().err
-    assert "should not happen" in text
+    assert "unexpected error" in text
     assert "IndexError: 7" in text
     assert "--debug" in text
     assert "Traceback" not in text

@@ -67,7 +67,7 @@ def remarks(counts: Mapping[str, int]) -> str:
     if counts.get("jumps"):
         found.append("the pictures changed everywhere: motion segmentation skipped")
     if counts.get("births refused"):
-        found.append("births refused: too much is missing at once")
+        found.append("no births: too many pixels are missing at once")
     return "".join(f"  [{remark}]" for remark in found)
 
 
