@@ -165,8 +165,8 @@ def departures(preset: str, rig: CameraRig) -> list[str]:
     sizes = sorted({(rig[name].width, rig[name].height) for name in rig})
     if sizes != [(data.width, data.height)]:
         theirs = ", ".join(f"{width}x{height}" for width, height in sizes)
-        scaled = "" if data.scale == 1.0 else f" (--scale {data.scale:g} of those stored)"
-        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}{scaled}")
+        reduced = "" if data.scale == 1 else f" (--scale {data.scale:g} of the stored)"
+        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}{reduced}")
     if len(rig.cameras) != data.cameras:
         found.append(f"{len(rig.cameras)} cameras instead of {data.cameras}")
     if data.held_out is not None and len(rig.testing) != data.held_out:

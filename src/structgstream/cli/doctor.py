@@ -17,6 +17,7 @@ OPTIONAL = (
     ("av", "av", "capture", "read and write video"),
     ("cv2", "opencv-python-headless", "capture", "read pictures, initial points"),
     ("scipy", "scipy", "capture", "initial points"),
+    ("yaml", "pyyaml", "capture", "read calibrations of Kalibr"),
     ("matplotlib", "matplotlib", "report", "plots, contact sheets"),
     ("starlette", "starlette", "serve", "command play"),
     ("uvicorn", "uvicorn", "serve", "command play"),
