@@ -14,16 +14,16 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Read once, when torch loads OpenMP.
 
 from structgstream.codec.reader import open_stream
-from structgstream.data.wrappers import of_cameras
+from structgstream.data.wrappers import select_cameras
 from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import Picture, rendered
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
-from structgstream.exporters.bake import Baking, baked
+from structgstream.exporters.bake import BakingConfig, bake
 from structgstream.kernels.backend import select_backend
 from structgstream.scene.state import on_device
 
 
-def choices(center: Baking) -> list[Baking]:
+def choices(center: BakingConfig) -> list[BakingConfig]:
     """The values around ``center``, one choice changed at a time."""
     found = [replace(center, degree=degree) for degree in (0, 1, 2)]
     found += [replace(center, ridge=ridge) for ridge in (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1) if ridge != center.ridge]
@@ -52,7 +52,7 @@ def main() -> None:
     scene = on_device(reader.scene(options.frame), backend.device)
     rig = reader.header.rig
     views = {name: reader.header.camera(name) for name in rig}
-    frames = of_cameras(capture_of(reader.header, options.capture, frames=None), tuple(rig)).frames()
+    frames = select_cameras(capture_of(reader.header, options.capture, frames=None), tuple(rig)).frames()
     truths = next(frame for number, frame in enumerate(frames) if number == options.frame).images
     own = {name: rendered(scene, views[name], backend)[0] for name in rig}
     sides = {"training": rig.training, "held out": rig.testing}
@@ -66,14 +66,14 @@ def main() -> None:
             cells += [f"{sum(values) / len(values):.2f}" for values in (to_own, to_truth)]
         print(f"| {text} | {' | '.join(cells)} |", flush=True)
 
-    def pictures(names: tuple[str, ...], choice: Baking, of: tuple[str, ...]) -> tuple[dict[str, Picture], int]:
-        plain = baked(scene, [views[name] for name in names], backend, baking=choice)
+    def pictures(names: tuple[str, ...], choice: BakingConfig, of: tuple[str, ...]) -> tuple[dict[str, Picture], int]:
+        plain = bake(scene, [views[name] for name in names], backend, baking=choice)
         return {name: rendered(plain, views[name], backend)[0] for name in of}, len(plain)
 
     print("| choice | left out | training, to the scene | to the truth | held out, to the scene | to the truth |")
     print("|---|---|---|---|---|---|")
     row("the scene", own, own)
-    for number, choice in enumerate(choices(Baking())):
+    for number, choice in enumerate(choices(BakingConfig())):
         if options.only is None or number in options.only:
             others, _ = pictures(tuple(name for name in rig.training if name not in left_out), choice, left_out)
             found, count = pictures(rig.training, choice, tuple(rig))

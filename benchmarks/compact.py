@@ -10,11 +10,11 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.container.blocks import packed_block, unpacked_blocks
+from structgstream.codec.container.blocks import pack_raw_block, unpack_raw_blocks
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import binned, valued
+from structgstream.codec.scene.bins import dequantize_state, quantize_state
 from structgstream.codec.scene.compact import CompactDecoder, CompactEncoder, CompactState
-from structgstream.scene.order import space_order
+from structgstream.scene.order import morton_order
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity
 
@@ -47,7 +47,7 @@ def workload(anchors: int) -> Work:
     """Frame 2 of a stream: 5 % of the anchors move, in 40 balls; there are 5 % as many free Gaussians."""
     g = torch.Generator().manual_seed(3)
     positions = torch.randn(anchors, 3, generator=g)
-    positions = positions[space_order(positions)]
+    positions = positions[morton_order(positions)]
     centers = positions[torch.randint(anchors, (40,), generator=g)]
     nearest = torch.cdist(positions, centers).min(1).values
     active = nearest <= nearest.kthvalue(max(anchors // 20, 1)).values
@@ -81,7 +81,7 @@ def workload(anchors: int) -> Work:
     state = _moved(state, active, 2, g)
     coded = encoder.encode(state, kind=PacketKind.DELTA, index=2)
     seen = _rounded(state, DYNAMIC)
-    raw = b"".join(packed_block(name, seen[name]) for name in sorted(DYNAMIC))
+    raw = b"".join(pack_raw_block(name, seen[name]) for name in sorted(DYNAMIC))
     return Work(header, before, state, raw, coded)
 
 
@@ -106,7 +106,7 @@ def _moved(state: State, active: Tensor, frame: int, g: torch.Generator) -> Stat
 
 def _rounded(state: State, names: frozenset[FieldName]) -> State:
     """The fields ``names`` as a decoder has them."""
-    return valued(binned(state, names, STEPS), names, STEPS)
+    return dequantize_state(quantize_state(state, names, STEPS), names, STEPS)
 
 
 def _told(state: State) -> Results:
@@ -124,7 +124,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
         return _told(decoder.decode(work.coded, kind=PacketKind.DELTA, index=2))
 
     def encode() -> Results:
-        encoder.follow(work.before)
+        encoder.replay(work.before)
         encoder.encode(work.frame, kind=PacketKind.DELTA, index=2)
         return _told(_rounded(work.frame, DYNAMIC))
 
@@ -134,7 +134,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
     return [
         Contestant(
             "raw, decode, 1 thread",
-            lambda: _told(unpacked_blocks(work.raw, 0, where="The frame")),
+            lambda: _told(unpack_raw_blocks(work.raw, 0, where="The frame")),
             1,
             facts=facts("raw"),
         ),

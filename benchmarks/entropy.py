@@ -12,9 +12,9 @@ import zstandard
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.codec.entropy import rans
-from structgstream.codec.entropy.residual_symbols import ALPHABET, symbols_of
-from structgstream.codec.entropy.table_choice import chosen_tables
-from structgstream.codec.entropy.table_sets import decoded_tables
+from structgstream.codec.entropy.residual_symbols import ALPHABET, residuals_to_symbols
+from structgstream.codec.entropy.table_choice import choose_tables
+from structgstream.codec.entropy.table_sets import decode_tables
 from structgstream.codec.entropy.tables import FrequencyTables, geometric
 
 CONTEXTS = 50
@@ -25,7 +25,7 @@ def workload(symbols: int) -> Symbols:
     """Symbols u8 ``[n]``, contexts u16 ``[n]``, counts ``[50, 16]``: Laplace residuals of scales 0.2 to 1, rounded."""
     g = np.random.default_rng(5)
     contexts = g.integers(0, CONTEXTS, symbols).astype(np.uint16)
-    values, _ = symbols_of(np.rint(g.laplace(0, np.linspace(0.2, 1.0, CONTEXTS)[contexts])).astype(np.int64))
+    values, _ = residuals_to_symbols(np.rint(g.laplace(0, np.linspace(0.2, 1.0, CONTEXTS)[contexts])).astype(np.int64))
     counts = np.zeros((CONTEXTS, ALPHABET), np.int64)
     np.add.at(counts, (contexts, values), 1)
     return values, contexts, counts
@@ -42,11 +42,11 @@ def _told(symbols: np.ndarray) -> Results:
 
 def _ours(work: Symbols, *, native: bool, lanes: int | None = None) -> Contestant:
     values, contexts, counts = work
-    tables, bits = chosen_tables(counts, defaults())
+    tables, bits = choose_tables(counts, defaults())
     section = rans.encode(values, contexts, tables, lanes=lanes)
 
     def decode() -> Results:
-        return _told(rans.decode(section, contexts, decoded_tables(bits, defaults()), native=native))
+        return _told(rans.decode(section, contexts, decode_tables(bits, defaults()), native=native))
 
     name = ("cpu" if native else "NumPy reference") + (f", lanes: {lanes}" if lanes else "") + ", 1 thread"
     return _contestant(name, decode, len(bits) + len(section), work)

@@ -14,7 +14,7 @@ from structgstream.data.points import initial_points
 from structgstream.data.wrappers import resized
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import FAST, TINY
-from structgstream.similarity import normalising_similarity
+from structgstream.similarity import normalizing_similarity
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.result import FitResult
 
@@ -23,7 +23,7 @@ def contestants(*, iterations: int, scale: float, points: int) -> list[Contestan
     """Torch for all but the raster first, then the C++ with one and with two threads; ``points`` are made before."""
     source = resized(bundled_clip(), scale)
     frame = next(iter(source.frames()))
-    similarity = normalising_similarity(source.rig, radius=TINY.normalised_radius)
+    similarity = normalizing_similarity(source.rig, radius=TINY.normalised_radius)
     made = initial_points(frame, source.rig, config=replace(FAST.points, max_points=points), seed=0).positions
     # The tiny schedule stretched: a fixed share of the iterations on small pictures and before each growth.
     stretch = iterations / TINY.initial.iterations

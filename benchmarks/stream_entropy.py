@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from structgstream.codec.arrays import Contexts
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
-from structgstream.codec.entropy.coder import Decoder
+from structgstream.codec.entropy.section_coder import SectionDecoder
 from structgstream.codec.reader import open_stream
 
 
@@ -34,9 +34,11 @@ class Counted:
 def counted_init(path: str) -> Counted:
     """The sections of the init record."""
     current = Counted()
-    section = Decoder._section
+    section = SectionDecoder._section
 
-    def listening(self: Decoder, name: str, contexts: Contexts, *, count: int, alphabet: int) -> NDArray[np.uint8]:
+    def listening(
+        self: SectionDecoder, name: str, contexts: Contexts, *, count: int, alphabet: int
+    ) -> NDArray[np.uint8]:
         field = name.partition(".")[0]
         before = len(self._left[field])
         symbols = section(self, name, contexts, count=count, alphabet=alphabet)
@@ -45,11 +47,11 @@ def counted_init(path: str) -> Counted:
         current.section(counts, before - len(self._left[field]))
         return symbols
 
-    Decoder._section = listening
+    SectionDecoder._section = listening
     try:
         open_stream(path)
     finally:
-        Decoder._section = section
+        SectionDecoder._section = section
     return current
 
 
@@ -57,7 +59,7 @@ def packet_bytes(path: str) -> Counter[str]:
     """The bytes of all packets by name; a byte counts where it is taken."""
     found: Counter[str] = Counter()
     before: Counter[str] = Counter()  # of a field, in this packet
-    looked_at = AdaptiveDecoder._looked_at
+    looked_at = AdaptiveDecoder._check_coded
 
     def listening(self: AdaptiveDecoder, name: str, sound: bool) -> None:
         looked_at(self, name, sound)
@@ -66,14 +68,14 @@ def packet_bytes(path: str) -> Counter[str]:
         found[name] += taken - before[field]
         before[field] = taken
 
-    AdaptiveDecoder._looked_at = listening
+    AdaptiveDecoder._check_coded = listening
     try:
         reader = open_stream(path)
         for info in reader.packets:
             before.clear()
             reader.scene(info.index)
     finally:
-        AdaptiveDecoder._looked_at = looked_at
+        AdaptiveDecoder._check_coded = looked_at
     return found
 
 

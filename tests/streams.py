@@ -9,7 +9,7 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
-from structgstream.codec.scene.bins import binned, on_bins, valued
+from structgstream.codec.scene.bins import dequantize_state, quantize_state, round_to_bins
 from structgstream.codec.scene.compact import FREE_FIELDS
 from structgstream.codec.scene.static_fields import UNCODED_FIELDS
 from structgstream.codec.sinks import MemorySink
@@ -44,12 +44,12 @@ def compact_header(
     rows = dynamic - FREE_FIELDS
     used = {p.name: steps[p.name] for p in parameters_of(dynamic) if p.name in steps}
     state = state_of(scene)
-    reference = valued(binned(state, rows, used), rows, used)
+    reference = dequantize_state(quantize_state(state, rows, used), rows, used)
     init_steps: dict[FieldName, float] = {
         name: used.get(name, STATIC_STEP) for name in state if name not in UNCODED_FIELDS
     }
     header = header_for(scene, dynamic=dynamic)
-    static = on_bins(header.static, init_steps)
+    static = round_to_bins(header.static, init_steps)
     return replace(header, codec="compact", static=static, steps=used, reference=reference, init_steps=init_steps)
 
 

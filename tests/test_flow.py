@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.flow import agreeing, inside, sampled
+from structgstream.flow import consistency_mask, inside, sampled
 
 
 def constant(dx: float, dy: float, height: int = 6, width: int = 8) -> np.ndarray:
@@ -14,7 +14,7 @@ def constant(dx: float, dy: float, height: int = 6, width: int = 8) -> np.ndarra
 def test_the_rule_of_occlusion_at_its_threshold() -> None:
     def holds(rest: float, length: float) -> bool:
         backward, forward = constant(-length, 0, width=40), constant(length + rest, 0, width=40)
-        return bool(agreeing(backward, forward)[3, 20])
+        return bool(consistency_mask(backward, forward)[3, 20])
 
     # At rest r and lengths a, a + r: r^2 <= 0.01 (a^2 + (a + r)^2) + 0.5.
     assert holds(0.70, 0.0)

@@ -4,7 +4,7 @@ from dataclasses import fields, is_dataclass
 
 import pytest
 
-from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_MODE, PRESETS, to_json
+from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_METHOD_PRESET, PRESETS, to_json
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -16,7 +16,7 @@ def test_every_preset_is_plain_json(name: str) -> None:
 def test_the_named_defaults_exist() -> None:
     assert DEFAULT_PRESET in PRESETS
     assert DEMO_PRESET in PRESETS
-    assert PRESETS[PAPER_MODE].codec == "raw" != PRESETS[DEFAULT_PRESET].codec
+    assert PRESETS[PAPER_METHOD_PRESET].codec == "raw" != PRESETS[DEFAULT_PRESET].codec
 
 
 def frozen(value: object) -> bool:

@@ -7,7 +7,7 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.rate_control import LEAST, MOST, RateConfig, RateController, pressed
+from structgstream.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
 from structgstream.training.online import OnlineConfig
 
 FPS, KEY_EVERY = 30.0, 30
@@ -76,7 +76,7 @@ def test_without_a_target_nothing_is_pressed() -> None:
     controller.add(10**9, PacketKind.DELTA)
     assert (controller.pressure, controller.rate_mbits, controller.missed) == (1.0, None, False)
     config = OnlineConfig()
-    assert pressed(config, 1.0) is config
+    assert with_rate_control(config, 1.0) is config
 
 
 def test_pressure_has_bounds_and_changes_step_by_step() -> None:
@@ -116,7 +116,7 @@ def test_a_target_that_is_missed_again_is_said_again(caplog: pytest.LogCaptureFi
 
 
 def test_what_is_pressed() -> None:
-    before, after = OnlineConfig(), pressed(OnlineConfig(), 4.0)
+    before, after = OnlineConfig(), with_rate_control(OnlineConfig(), 4.0)
     assert after.rounding.rate_weight == 4.0 * before.rounding.rate_weight
     assert after.patching.grad_threshold == 2.0 * before.patching.grad_threshold
 

@@ -10,7 +10,7 @@ from reports import frame_report
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, log_path, read_log
 from structgstream.frame_report import FrameReport
-from structgstream.recorder import check_output, logged
+from structgstream.recorder import check_output, log_reports
 
 
 def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]:
@@ -23,7 +23,7 @@ def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]
 
 def test_a_line_is_there_when_its_frame_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "x.sgs"
-    reports = logged(run([]), path, done=0, remarks=lambda one: {"first": True} if one.index == 0 else {})
+    reports = log_reports(run([]), path, done=0, remarks=lambda one: {"first": True} if one.index == 0 else {})
     for count, one in enumerate(reports, start=1):
         assert [*read_log(path)] == [*range(count)]
         assert one.index == count - 1
@@ -34,13 +34,13 @@ def test_a_resumed_log_keeps_what_is_stored_and_drops_the_rest(tmp_path: Path) -
     path = tmp_path / "x.sgs"
     for index in range(3):
         append_log(path, {"index": index, "run": 1})
-    assert [one.index for one in logged(run([], start=2), path, done=2)] == [2]
+    assert [one.index for one in log_reports(run([], start=2), path, done=2)] == [2]
     assert [entry.get("run") for entry in read_log(path).values()] == [1, 1, None]
 
 
 def test_closing_it_closes_the_session(tmp_path: Path) -> None:
     closed: list[str] = []
-    reports = logged(run(closed), tmp_path / "x.sgs", done=0)
+    reports = log_reports(run(closed), tmp_path / "x.sgs", done=0)
     next(reports)
     assert not closed
     reports.close()
@@ -49,7 +49,7 @@ def test_closing_it_closes_the_session(tmp_path: Path) -> None:
 
 def test_a_log_that_cannot_be_written_ends_the_session(tmp_path: Path) -> None:
     closed: list[str] = []
-    reports = logged(run(closed), tmp_path / "x.sgs", done=0)
+    reports = log_reports(run(closed), tmp_path / "x.sgs", done=0)
     next(reports)
     log_path(tmp_path / "x.sgs").unlink()
     log_path(tmp_path / "x.sgs").mkdir()

@@ -9,8 +9,8 @@ import torch
 from rigs import random_scene
 from small_presets import TINY_RIG
 from streams import same
-from structgstream.beginning import frame_seed
 from structgstream.codec.packets import StreamHeader
+from structgstream.initialization import frame_seed
 from structgstream.kernels.backend import reference_backend
 from structgstream.pipeline import FrameTask, StreamFacts
 from structgstream.presets import TINY, StreamConfig, to_json

@@ -12,9 +12,8 @@ from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
 from streams import moved, same, small_scene
 from structgstream import struct_gstream as method
-from structgstream.beginning import frame_seed
 from structgstream.cameras import CameraRig
-from structgstream.codec.container.records import scanned
+from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
@@ -22,6 +21,7 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry
 from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
+from structgstream.initialization import frame_seed
 from structgstream.kernels.backend import reference_backend
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -126,7 +126,7 @@ def test_two_runs_and_both_sinks_give_the_same_bytes(quick_fits: list[int], tmp_
 def test_resuming_gives_the_bytes_of_an_uninterrupted_run(quick_fits: list[int], tmp_path: Path) -> None:
     whole = uninterrupted()
     path = tmp_path / "a.sgs"
-    ends = [record.end for record in scanned(whole)]
+    ends = [record.end for record in scan_records(whole)]
     for cut in sorted({0, 3, len(whole), *ends, *(end - 1 for end in ends), *range(1, len(whole), 397)}):
         path.write_bytes(whole[:cut])
         quick_fits.clear()

@@ -14,13 +14,13 @@ from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
 from streams import same
 from structgstream import struct_gstream as method
-from structgstream.codec.container.records import scanned
+from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
 from structgstream.presets import COMPACT, PRESETS, StreamConfig
 from structgstream.rate_control import RateConfig
-from structgstream.scene.order import space_order
+from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
 from structgstream.session import FrameReport, Session
@@ -113,7 +113,7 @@ def test_anchors_stand_on_their_grid_in_space_order() -> None:
     header = StreamReader(whole()[0]).header
     positions, step = header.reference["anchor_positions"], header.init_steps["anchor_positions"]
     assert step == float(np.float32(CONFIG.initial.voxel_size))
-    assert torch.equal(space_order(positions, step=step), torch.arange(len(positions)))
+    assert torch.equal(morton_order(positions, step=step), torch.arange(len(positions)))
     assert torch.equal((positions.double() / step).round().float() * step, positions)
 
 
@@ -121,7 +121,7 @@ def test_the_header_is_a_fraction_of_its_numbers() -> None:
     data = whole()[0]
     header = StreamReader(data).header
     numbers = sum(value.numel() for part in (header.static, header.reference) for value in part.values())
-    assert next(scanned(data)).end < 0.5 * 4 * numbers, "most are the MLPs' here, which get ten bits each"
+    assert next(scan_records(data)).end < 0.5 * 4 * numbers, "most are the MLPs' here, which get ten bits each"
 
 
 def test_an_environment_is_in_the_header_and_in_every_scene() -> None:
@@ -148,7 +148,7 @@ def test_what_stands_still_keeps_its_bins() -> None:
 
 def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Path) -> None:
     data, path = whole()[0], tmp_path / "a.sgs"
-    init, *packets = [*scanned(data)][:-1]
+    init, *packets = [*scan_records(data)][:-1]
     for cut in (init.end, *(record.end for record in packets), packets[2].end - 1):
         path.write_bytes(data[:cut])
         sink, resumed = FileSink.resume(path)
@@ -166,7 +166,7 @@ def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
     assert [r.bytes for r in reports[:2]] == [r.bytes for r in free[:2]]
     assert reports[3].bytes < free[3].bytes
     path = tmp_path / "a.sgs"
-    path.write_bytes(sink.data[: [*scanned(sink.data)][-3].end])
+    path.write_bytes(sink.data[: [*scan_records(sink.data)][-3].end])
     file, resumed = FileSink.resume(path)
     run(file, resumed=resumed, config=config)
     assert path.read_bytes() == sink.data

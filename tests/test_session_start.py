@@ -11,7 +11,7 @@ import pytest
 from backends import quickest_backend
 from memory_captures import MemoryCapture
 from small_presets import TINY_RIG
-from structgstream.codec.container.records import scanned
+from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
@@ -62,7 +62,7 @@ def test_the_same_again_is_the_same_file() -> None:
 def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Path) -> None:
     """What frame 0 missed, what moved last and the last pictures are all found again."""
     data, path = whole()[0], tmp_path / "a.sgs"
-    for record in [*scanned(data)][:-1]:
+    for record in [*scan_records(data)][:-1]:
         path.write_bytes(data[: record.end])
         sink, resumed = FileSink.resume(path)
         run(sink, resumed=resumed)

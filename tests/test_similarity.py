@@ -2,7 +2,7 @@
 import torch
 
 from rigs import arc_rig
-from structgstream.similarity import Similarity, normalising_similarity, rig_radius
+from structgstream.similarity import Similarity, normalizing_similarity, rig_radius
 
 
 def pixel(camera, point):
@@ -27,7 +27,7 @@ def test_inverse_gives_the_captures_units_back() -> None:
 def test_every_rig_comes_to_the_same_radius() -> None:
     for radius in (0.4, 50.0):
         rig = arc_rig(radius=radius)
-        normalised = normalising_similarity(rig, radius=1.0).rig(rig)
+        normalised = normalizing_similarity(rig, radius=1.0).rig(rig)
         assert abs(rig_radius(normalised) - 1.0) < 1e-9
         assert normalised["cam01"].near == rig["cam01"].near / rig_radius(rig)
 
@@ -35,4 +35,4 @@ def test_every_rig_comes_to_the_same_radius() -> None:
 def test_held_out_cameras_do_not_move_the_scene() -> None:
     rig = arc_rig(5)
     with_other_held_out = rig.mapped({**rig.cameras, "cam00": rig["cam03"]})
-    assert normalising_similarity(rig, radius=1.0) == normalising_similarity(with_other_held_out, radius=1.0)
+    assert normalizing_similarity(rig, radius=1.0) == normalizing_similarity(with_other_held_out, radius=1.0)

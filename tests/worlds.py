@@ -14,7 +14,7 @@ from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, Moving, changes_between, moving_parts
+from structgstream.training.motion import MotionConfig, MotionSegmentation, detect_changes, segment_motion
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View
 
@@ -92,7 +92,7 @@ def moved_since(
     flow_from: Collection[int] = (),
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
-) -> Moving:
+) -> MotionSegmentation:
     """What may move in ``scene`` between the pictures ``before`` and those of ``views``."""
-    changes = changes_between(views, before, config=config, backend=backend, flow_from=flow_from)
-    return moving_parts(scene, views, changes, config=config, backend=backend, older=older, floor=floor)
+    changes = detect_changes(views, before, config=config, backend=backend, flow_from=flow_from)
+    return segment_motion(scene, views, changes, config=config, backend=backend, older=older, floor=floor)

@@ -16,12 +16,12 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError
 from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
-from structgstream.evaluation.instruments import Selection
+from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, PageFormat
 from structgstream.exporters.frames import write_frames
-from structgstream.exporters.request import check_page, checked_degree, chosen_frames, destination
+from structgstream.exporters.request import check_degree, check_page, choose_frames, destination
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.player.stream_file import StreamFile
@@ -118,7 +118,7 @@ def evaluate(
     capture: FrameSource | Path | str,
     *,
     cameras: tuple[str, ...] | None = None,
-    metrics: Selection = "all",
+    metrics: MetricSelection = "all",
     lpips_weights: Path | None = None,
     backend: Backend | BackendName = "auto",
 ) -> Report:
@@ -196,9 +196,9 @@ def export(
         write = write_page if chosen == "html" else write_site
         write(target, StreamFile(path))
         return target
-    degree = checked_degree(sh_degree, chosen)
+    degree = check_degree(sh_degree, chosen)
     with open_stream(path, by_index=frame is not None) as reader:
-        numbers = chosen_frames(reader.runs, target, frame=frame, frames=frames)
+        numbers = choose_frames(reader.runs, target, frame=frame, frames=frames)
         for _ in write_frames(reader, numbers, target, format=chosen, backend=select_backend(backend), degree=degree):
             pass
     return target

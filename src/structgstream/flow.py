@@ -24,7 +24,8 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
     Args:
         extra: the extra of this package that a user should install when OpenCV is missing.
         refined: OpenCV's preset "medium". False: preset "fast", stopped at half resolution and without variational
-            refinement; it takes two fifths of the time and is as accurate at consistent pixels (:func:`agreeing`).
+            refinement; it takes two fifths of the time and is as accurate at consistent
+            pixels (:func:`consistency_mask`).
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -47,7 +48,7 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
     return flow
 
 
-def agreeing(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
+def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mask ``[H, W]`` of the pixels whose flow is forward-backward consistent, hence not occluded (Sundaram et al.,
     2010).
 

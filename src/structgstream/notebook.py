@@ -9,7 +9,7 @@ from pathlib import Path
 
 from structgstream.errors import MissingExtraError
 from structgstream.player.bundle import bundle
-from structgstream.player.stream_file import StreamFile, check_begun
+from structgstream.player.stream_file import StreamFile, check_has_header
 
 try:
     import anywidget
@@ -75,8 +75,8 @@ class Player(anywidget.AnyWidget):
 
 def _stream_bytes(stream: Path | str | bytes) -> bytes:
     if isinstance(stream, bytes):
-        check_begun(stream, "The stream")
+        check_has_header(stream, "The stream")
         return stream
     with StreamFile(Path(stream)).opened() as data:
-        check_begun(data, str(stream))
+        check_has_header(data, str(stream))
         return data[:]

@@ -151,14 +151,14 @@ class StoredStream(Protocol[State_co]):
         ...
 
 
-class Coder(Protocol[State]):
+class FrameCoder(Protocol[State]):
     """Encodes and decodes the frames of one stream in order, such as a ``SceneEncoder``."""
 
     def encode(self, state: State, /, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[State]:
         """The packet of a frame, and its reconstruction."""
         ...
 
-    def follow(self, packet: Packet) -> State:
+    def replay(self, packet: Packet) -> State:
         """Decode an existing packet, and continue after it."""
         ...
 
@@ -183,7 +183,7 @@ class StreamCodec(Protocol[State]):
         """Frame 0 as later frames and receivers get it, and the header of the stream."""
         ...
 
-    def coder(self, header: StreamHeader, device: torch.device) -> Coder[State]:
+    def coder(self, header: StreamHeader, device: torch.device) -> FrameCoder[State]:
         """The coder of the stream of this header; decoded states may be on ``device``."""
         ...
 

@@ -11,7 +11,6 @@ from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
 from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig
-from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
@@ -19,8 +18,9 @@ from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
 from structgstream.training.motion_start import MotionStartConfig
 from structgstream.training.online import OnlineConfig
-from structgstream.training.optim import Rate
+from structgstream.training.optim import LearningRate
 from structgstream.training.patching import PatchingConfig
+from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.rounding import RoundingConfig
 from structgstream.training.solidity import SolidityConfig
 
@@ -112,9 +112,11 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
     return config
 
 
-def decayed(rates: InitialRates, share: float) -> InitialRates:
+def with_decay(rates: InitialRates, share: float) -> InitialRates:
     """The same initial learning rates, each decaying to ``share`` of itself over the schedule."""
-    return InitialRates(**{name: Rate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()})
+    return InitialRates(
+        **{name: LearningRate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
+    )
 
 
 PAPER = StreamConfig()
@@ -183,7 +185,7 @@ RIG = StreamConfig(
         schedule_iterations=4000,
         camera_color=True,
         coarse_iterations=2500,
-        rates=decayed(InitialRates(), 0.05),
+        rates=with_decay(InitialRates(), 0.05),
         growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=120_000),
         losses=LossWeights(offset_distance=0.005),
     ),
@@ -217,7 +219,7 @@ COMPACT = replace(
             least_growth=0.25,
             room_until=2400,
         ),
-        disturbance=DisturbanceConfig(dropped_share=0.2, noise_scales=0.5),
+        disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
         solidity=SolidityConfig(weight=0.05, every=4),
         random_background=True,
     ),
@@ -286,6 +288,6 @@ PRESETS: dict[str, StreamConfig] = {
     "tiny": TINY,
 }
 DEFAULT_PRESET = "compact"
-PAPER_MODE = "rig"
+PAPER_METHOD_PRESET = "rig"
 """The preset that the paper's ablations edit, and that is compared with other methods."""
 DEMO_PRESET = "fast"

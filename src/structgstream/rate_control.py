@@ -147,7 +147,7 @@ class RateController:
         )
 
 
-def pressed(config: OnlineConfig, pressure: float) -> OnlineConfig:
+def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
     """``config`` with the price of a bit times ``pressure``, and the spawning threshold times its square root."""
     if pressure == 1.0:
         return config

@@ -18,7 +18,7 @@ from structgstream.pipeline import Memory, Pipeline, State
 from structgstream.session import Session
 from structgstream.training.result import StepListener
 
-Remarks = Callable[[FrameReport], Mapping[str, Any]]
+LogExtras = Callable[[FrameReport], Mapping[str, Any]]
 """Further entries of a frame's line in the log."""
 
 
@@ -44,7 +44,7 @@ def record(
     resume: bool = False,
     metadata: Mapping[str, object] | None = None,
     on_step: StepListener | None = None,
-    remarks: Remarks | None = None,
+    remarks: LogExtras | None = None,
 ) -> Run:
     """Reconstructs a capture into a file, with a log beside it.
 
@@ -58,7 +58,7 @@ def record(
         resume: continue after the last whole frame of an existing file.
         metadata: plain JSON values for the header, equal in all runs of a stream.
         on_step: called after every optimisation step.
-        remarks: see :data:`Remarks`.
+        remarks: see :data:`LogExtras`.
 
     Raises:
         ConfigError: the file to resume was made with another configuration or from another capture.
@@ -68,11 +68,11 @@ def record(
     sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
     session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
-    return Run(done, logged(session.run(), path, done=done, remarks=remarks))
+    return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
 
 
-def logged(
-    reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: Remarks | None = None
+def log_reports(
+    reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
     """The reports of a session, each written to the log beside ``path`` before it is yielded.
 
@@ -80,17 +80,17 @@ def logged(
         reports: closed with the result.
         path: the file that the session writes.
         done: number of existing frames, whose lines of the log are kept.
-        remarks: see :data:`Remarks`.
+        remarks: see :data:`LogExtras`.
 
     Raises:
         StorageError: the log cannot be written.
     """
     begin_log(path, frames=done)
-    return _noted(reports, path, remarks)
+    return _append_reports(reports, path, remarks)
 
 
-def _noted(
-    reports: Generator[FrameReport, None, None], path: Path, remarks: Remarks | None
+def _append_reports(
+    reports: Generator[FrameReport, None, None], path: Path, remarks: LogExtras | None
 ) -> Generator[FrameReport, None, None]:
     with closing(reports):
         for report in reports:

@@ -12,20 +12,20 @@ import torch
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.scene.bins import on_bins
+from structgstream.codec.scene.bins import round_to_bins
 from structgstream.codec.sinks import FileSink
 from structgstream.pipeline import FrameTask, StreamFacts
 from structgstream.presets import StreamConfig
 from structgstream.scene.appearance import with_appearance
-from structgstream.scene.order import in_space_order
+from structgstream.scene.order import in_morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
-from structgstream.training.first_bins import first_bins, float32, regauged, sensitivity_of
+from structgstream.training.first_quantization import estimate_sensitivity, float32, quantize_first_frame, regauge
 from structgstream.training.rounding import pixel_size
 
 
 @dataclass(frozen=True)
-class Grid:
+class QuantizationSteps:
     """Quantization steps of a stream, as stored in the header; empty with codec ``raw``.
 
     Args:
@@ -66,9 +66,9 @@ class SceneCodec(ABC):
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
         """Frame 0 as later frames and receivers get it, and the header of the stream."""
-        scene, grid = self._begun(fitted, task)
+        scene, step_sizes = self._initialize_stream(fitted, task)
         state, dynamic = state_of(scene), self.config.online.dynamic
-        reference = dynamic.difference(fields_of("free")) if grid.steps else ()
+        reference = dynamic.difference(fields_of("free")) if step_sizes.steps else ()
         header = StreamHeader(
             rig=facts.rig,
             similarity=facts.similarity,
@@ -79,14 +79,14 @@ class SceneCodec(ABC):
             distance_input=scene.distance_input,
             config=facts.config,
             metadata=facts.metadata,
-            steps=grid.steps,
+            steps=step_sizes.steps,
             reference={name: state[name].cpu() for name in reference},
-            init_steps=grid.init_steps,
+            init_steps=step_sizes.init_steps,
         )
         return scene, header
 
     @abstractmethod
-    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         """The reconstruction of frame 0, as a receiver gets it, and its steps."""
 
     def _with_dynamic_fields(self, scene: Scene) -> Scene:
@@ -101,27 +101,29 @@ class SceneCodec(ABC):
 class RawCodec(SceneCodec):
     """Every number as float32."""
 
-    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
-        return self._with_dynamic_fields(scene), Grid()
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
+        return self._with_dynamic_fields(scene), QuantizationSteps()
 
 
 @dataclass(frozen=True)
 class CompactCodec(SceneCodec):
     """All values are quantized (``training/rounding.py``, Note [Bins]); anchors are in Z-order."""
 
-    def _begun(self, scene: Scene, task: FrameTask) -> tuple[Scene, Grid]:
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
-        scene, worth = regauged(scene, sensitivity_of(scene, task.rig, backend=task.backend, seed=task.seed))
+        scene, sensitivity = regauge(scene, estimate_sensitivity(scene, task.rig, backend=task.backend, seed=task.seed))
         scene = self._with_dynamic_fields(scene)
         known = rounding.steps(pixel_size(scene.anchors.positions, task.rig))
         used = {parameter.name for parameter in parameters_of(dynamic)}
         steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
         voxel_size = self.config.initial.voxel_size
-        scene, init_steps = first_bins(scene, worth, config=rounding, voxel_size=voxel_size, steps=steps)
+        scene, init_steps = quantize_first_frame(
+            scene, sensitivity, config=rounding, voxel_size=voxel_size, steps=steps
+        )
         if scene.environment is not None:
             init_steps["environment"] = float32(self.config.environment.step)
-        rounded = on_bins(state_of(in_space_order(scene, step=init_steps["anchor_positions"])), init_steps)
-        return scene_of(rounded, distance_input=scene.distance_input), Grid(steps, init_steps)
+        rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
+        return scene_of(rounded, distance_input=scene.distance_input), QuantizationSteps(steps, init_steps)
 
 
 def scene_codec(config: StreamConfig) -> SceneCodec:

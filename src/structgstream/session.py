@@ -10,19 +10,19 @@ from contextlib import suppress
 from functools import partial
 from typing import Generic
 
-from structgstream.beginning import frame_seed, initial_points_of
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.source import FrameSource
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
+from structgstream.initialization import frame_seed, initial_points_of
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
-from structgstream.pipeline import Coder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
+from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
 from structgstream.rate_control import RateController
 from structgstream.resuming import check_resumable
-from structgstream.similarity import normalising_similarity
+from structgstream.similarity import normalizing_similarity
 from structgstream.training.pictures import FramePictures
 from structgstream.training.result import StepListener
 
@@ -61,7 +61,7 @@ class Session(Generic[State, Memory]):
         self._backend = backend
         self._resumed = resumed if resumed is not None and len(resumed) else None
         self._on_step = on_step
-        self._similarity = normalising_similarity(source.rig, radius=pipeline.normalised_radius)
+        self._similarity = normalizing_similarity(source.rig, radius=pipeline.normalised_radius)
         self._rig = self._similarity.rig(source.rig)
         self._facts = StreamFacts(
             codec=pipeline.codec.name,
@@ -73,7 +73,7 @@ class Session(Generic[State, Memory]):
         )
         self._key_interval = pipeline.codec.key_interval(source.fps)
         self._controller = RateController(pipeline.rate, source.fps, key_interval=self._key_interval)
-        self._coder: Coder[State] | None = None
+        self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
         if resumed is not None:
             check_resumable(resumed.header, self._facts)
@@ -93,7 +93,7 @@ class Session(Generic[State, Memory]):
             else:
                 self._reopen(resumed)
                 if len(resumed) < len(self._source):
-                    yield from self._frames(self._past(resumed), len(resumed))
+                    yield from self._frames(self._restore_past(resumed), len(resumed))
         except BaseException:
             with suppress(StorageError):  # The first error is the one to report.
                 self._sink.close()
@@ -102,7 +102,7 @@ class Session(Generic[State, Memory]):
 
     def _frames(self, past: Past[State, Memory] | None, start: int) -> Iterator[FrameReport]:
         method = self._pipeline.method
-        with Lookahead(self._observed(start)) as observed:
+        with Lookahead(self._observe_frames(start)) as observed:
             for meter, task in metered(self._tasks(observed), self._backend.device):
                 fit = method.first(task) if past is None else method.next(past, task)
                 meter.end("fit", peak="fit")
@@ -110,11 +110,11 @@ class Session(Generic[State, Memory]):
                 meter.end("encode")
                 size = self._write(encoded.packet)
                 meter.end("write", peak="store")
-                past = self._after(past, encoded.reconstruction, task)
+                past = self._advance(past, encoded.reconstruction, task)
                 meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
                 yield meter.report(fit, encoded, size)
 
-    def _observed(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
+    def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
         """Each frame from ``start`` on with its preprocessed pictures."""
         method = self._pipeline.method
         # Changes are relative to the previous frame, so a resumed stream reads that one again.
@@ -166,13 +166,13 @@ class Session(Generic[State, Memory]):
         self._controller.add(size, packet.kind)
         return size
 
-    def _open(self, header: StreamHeader) -> Coder[State]:
+    def _open(self, header: StreamHeader) -> FrameCoder[State]:
         self._steps = header.steps
         coder = self._pipeline.codec.coder(header, self._backend.device)
         self._sink.open(header)
         return coder
 
-    def _after(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
+    def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
         """The state from which the next frame is fitted."""
         method = self._pipeline.method
         if past is None:
@@ -185,11 +185,11 @@ class Session(Generic[State, Memory]):
         for info in resumed.packets:
             self._controller.add(info.bytes, info.kind)
 
-    def _past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
+    def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
         """The state from which the next frame is fitted, decoded from the existing stream."""
         assert self._coder is not None, "reopened before"
         method, count = self._pipeline.method, len(resumed)
-        state = deque(map(self._coder.follow, resumed.group(count - 1)), maxlen=1).pop()
+        state = deque(map(self._coder.replay, resumed.group(count - 1)), maxlen=1).pop()
         older = resumed.scene(count - 2) if method.needs_older and count > 1 else None
         return Past(state, method.prepare(resumed.scene(0), self._first_task), older)
 

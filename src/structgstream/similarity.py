@@ -46,7 +46,7 @@ def rig_radius(rig: CameraRig) -> float:
     return float((centers - centers.mean(0)).norm(dim=1).max())
 
 
-def normalising_similarity(rig: CameraRig, *, radius: float) -> Similarity:
+def normalizing_similarity(rig: CameraRig, *, radius: float) -> Similarity:
     """The similarity that moves the training cameras' mean to the origin and makes the rig's radius ``radius``."""
     centers = torch.stack([rig[name].center for name in rig.training])
     center = centers.mean(0)

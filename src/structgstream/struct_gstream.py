@@ -10,13 +10,13 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past, Pipeline
 from structgstream.presets import StreamConfig, to_json
-from structgstream.rate_control import pressed
+from structgstream.rate_control import with_rate_control
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.scene_codecs import scene_codec
-from structgstream.training.environment import fitted_environment
+from structgstream.training.environment import fit_environment
 from structgstream.training.initial import fit_first_frame
-from structgstream.training.online import fit_next_frame, remembers
+from structgstream.training.online import fit_next_frame, needs_older
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.result import FitResult
@@ -42,8 +42,8 @@ class StructGStream:
 
     @property
     def needs_older(self) -> bool:
-        """See ``training.online.remembers``."""
-        return remembers(self.config.online)
+        """See ``training.online.needs_older``."""
+        return needs_older(self.config.online)
 
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
@@ -70,7 +70,7 @@ class StructGStream:
         if not config.environment.enabled:
             return fit
         views = task.pictures.views
-        found = fitted_environment(fit.scene, views, config=config.environment, backend=backend)
+        found = fit_environment(fit.scene, views, config=config.environment, backend=backend)
         return replace(fit, scene=replace(fit.scene, environment=found))
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> ResidualFloor | None:
@@ -89,7 +89,7 @@ class StructGStream:
             on_device(past.state, device),
             task.frame,
             task.rig,
-            config=pressed(self.config.online, task.pressure),
+            config=with_rate_control(self.config.online, task.pressure),
             backend=task.backend,
             seed=task.seed,
             pictures=task.pictures,

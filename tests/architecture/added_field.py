@@ -14,7 +14,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of, with_dynamic_fields
-from structgstream.training.motion import changed_since
+from structgstream.training.motion import changed_movers
 from structgstream.training.online import OnlineConfig, online_rates
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import Parameters, detached, parameters_of_fields
@@ -35,7 +35,7 @@ def check() -> None:
     scene = with_dynamic_fields(plain, DYNAMIC)
     assert state_of(scene)[NAME].tolist() == [[0.0]] * 40
     trained = fitted(scene)
-    assert changed_since(scene, trained)[:40].any()
+    assert changed_movers(scene, trained)[:40].any()
     frames = [scene, trained, fitted(trained)]
     for header in (header_for(scene, dynamic=DYNAMIC), compact_header(scene, dynamic=DYNAMIC)):
         sink = MemorySink()

@@ -6,7 +6,7 @@ from benchmarks.stream_entropy import counted_init, packet_bytes, told
 
 from streams import compact_header, moved, small_scene, write_stream
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
-from structgstream.codec.entropy.coder import Decoder
+from structgstream.codec.entropy.section_coder import SectionDecoder
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 
@@ -20,17 +20,17 @@ def stream(tmp_path: Path) -> str:
 
 
 def test_sections_of_the_init_record_are_counted(stream: str) -> None:
-    section = Decoder._section
+    section = SectionDecoder._section
     found = counted_init(stream)
-    assert Decoder._section is section
+    assert SectionDecoder._section is section
     assert 1000 < found.bytes < open_stream(stream).header_bytes
     assert 0.5 * found.bytes < found.entropy_bytes < found.bytes
 
 
 def test_bytes_of_packets_add_up(stream: str) -> None:
-    looked_at = AdaptiveDecoder._looked_at
+    looked_at = AdaptiveDecoder._check_coded
     found = packet_bytes(stream)
-    assert AdaptiveDecoder._looked_at is looked_at
+    assert AdaptiveDecoder._check_coded is looked_at
     packets = open_stream(stream).packets
     # Heads of the blocks are not in it.
     assert found.total() == sum(size - 8 for info in packets for size in info.field_bytes.values())

@@ -347,4 +347,4 @@ def test_time_on_a_path_runs_forth_and_back(count: int, frames: list[int]) -> No
         def scenes(self, start: int) -> list[tuple[int, int]]:
             return [(i, i) for i in self.packets[start:]]
 
-    assert list(render._forth_and_back(Reader(), None, count=count)) == frames  # pyright: ignore
+    assert list(render._ping_pong(Reader(), None, count=count)) == frames  # pyright: ignore

@@ -28,7 +28,7 @@ def test_what_is_missing_comes_with_its_cure(monkeypatch: pytest.MonkeyPatch) ->
     reasons = {"cuda": "No GPU here.", "cpu": None, "reference": None}
     monkeypatch.setattr(backend, "backend_reasons", lambda: reasons)
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)
-    found = doctor.examination()
+    found = doctor.diagnose()
     assert [entry["state"] for entry in found["backends"]] == ["missing", "chosen by --device auto", "available"]
     assert found["backends"][0]["advice"] == "No GPU here."
     advice = {entry["name"]: entry["advice"] for entry in found["packages"]}

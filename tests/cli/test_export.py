@@ -15,7 +15,7 @@ from streams import compact_header, header_for, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.exporters.bake import Baking
+from structgstream.exporters.bake import BakingConfig
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 
@@ -63,7 +63,7 @@ def test_a_frame_in_the_units_of_the_capture(stream: Path, tmp_path: Path, capsy
     assert len(wanted) > 20
     assert float(torch.cdist(wanted.double(), found.double()).min(1).values.max()) < 1e-5
     assert len([name for name in vertices.dtype.names if name.startswith("f_rest")]) == 3 * (
-        (Baking().degree + 1) ** 2 - 1
+        (BakingConfig().degree + 1) ** 2 - 1
     )
 
 

@@ -6,20 +6,26 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import CaptureOptions, opened_capture, parsed, parsed_with_rest, resolved_config
+from structgstream.cli.options import (
+    CaptureOptions,
+    open_selected_capture,
+    parse_known_options,
+    parse_options,
+    resolve_config,
+)
 from structgstream.data.clip import bundled_clip_path
 from structgstream.presets import DEFAULT_PRESET, PRESETS
 
 
 def test_no_option_is_the_whole_capture() -> None:
-    assert parsed(CaptureOptions, "reconstruct", arguments=[]) == CaptureOptions()
+    assert parse_options(CaptureOptions, "reconstruct", arguments=[]) == CaptureOptions()
 
 
 def test_options_of_a_capture_choose_its_part() -> None:
     arguments = ["--held-out", "cam01", "cam02", "--scale", "0.25", "--start", "3", "--frames", "4", "--near", "0.5"]
-    options = parsed(CaptureOptions, "reconstruct", arguments=arguments)
+    options = parse_options(CaptureOptions, "reconstruct", arguments=arguments)
     assert options == CaptureOptions(("cam01", "cam02"), 0.25, 3, 4, 0.5)
-    source = opened_capture(Path(bundled_clip_path()), options)
+    source = open_selected_capture(Path(bundled_clip_path()), options)
     assert len(source) == 4
     assert source.rig.testing == ("cam01", "cam02")
     camera = source.rig["cam00"]
@@ -27,7 +33,7 @@ def test_options_of_a_capture_choose_its_part() -> None:
 
 
 def test_what_is_no_option_of_the_command_is_left_over() -> None:
-    options, rest = parsed_with_rest(
+    options, rest = parse_known_options(
         CaptureOptions, "reconstruct", arguments=["--online.iterations", "50", "--start", "2", "--codec", "raw"]
     )
     assert options == CaptureOptions(start=2)
@@ -35,20 +41,20 @@ def test_what_is_no_option_of_the_command_is_left_over() -> None:
 
 
 def test_a_configuration_is_a_preset_with_edits() -> None:
-    config, name = resolved_config(None, [], command="reconstruct", seed=None)
+    config, name = resolve_config(None, [], command="reconstruct", seed=None)
     assert (config, name) == (PRESETS[DEFAULT_PRESET], DEFAULT_PRESET)
-    config, name = resolved_config("tiny", ["--online.iterations", "7"], command="reconstruct", seed=9)
+    config, name = resolve_config("tiny", ["--online.iterations", "7"], command="reconstruct", seed=9)
     assert (config.online.iterations, config.seed, name) == (7, 9, "tiny")
     assert config.initial == PRESETS["tiny"].initial
 
 
 def test_a_preset_that_there_is_not_is_wrong_usage() -> None:
     with pytest.raises(UsageError, match="there is no preset 'tinny'"):
-        resolved_config("tinny", [], command="reconstruct", seed=None)
+        resolve_config("tinny", [], command="reconstruct", seed=None)
 
 
 def test_a_field_that_there_is_not_ends_the_command_with_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        resolved_config("tiny", ["--online.iteratons", "7"], command="reconstruct", seed=None)
+        resolve_config("tiny", ["--online.iteratons", "7"], command="reconstruct", seed=None)
     assert caught.value.code == 2
     assert "--online.iteratons" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from structgstream.cli.stream_tables import facts, header_table, packet_table, rate
+from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table
 from structgstream.cli.tables import SHOWN_FRAMES
 from structgstream.evaluation.byte_count import Row
 
@@ -51,7 +51,7 @@ def test_what_a_stream_is_in_a_line_for_each_fact() -> None:
         packet({"grown": 5, "removed": 2}, {"lifted": 3}),
         packet({"spawned": 4}, {"lifted": 4, "jumps": 0}),
     ]
-    lines = shown(facts(HEADER, rows(2), packets=packets))
+    lines = shown(facts_table(HEADER, rows(2), packets=packets))
     for line in (
         "capture hall [1]",
         "frames 2 at 25 a second, 0.08 s",
@@ -68,14 +68,14 @@ def test_what_a_stream_is_in_a_line_for_each_fact() -> None:
 @pytest.mark.parametrize(("damage", "state"), [([], "not finished"), ([{"offset": 1}], "damaged")])
 def test_a_stream_that_is_not_whole_says_why(damage: list[dict[str, int]], state: str) -> None:
     header = HEADER | {"damage": damage, "complete": False, "cut_reason": "it ends in frame 3"}
-    lines = shown(facts(header, [], packets=[]))
+    lines = shown(facts_table(header, [], packets=[]))
     assert f"state {state}: it ends in frame 3" in lines
     assert not [line for line in lines if line.startswith(("rate ", "came, ", "acts "))]
 
 
 def test_the_rate_by_hand() -> None:
     """50 kB a frame, 30 times a second, 8 bits each."""
-    assert rate(rows(3, bytes=50_000), 30.0) == "12.00 Mbit/s without the header"
+    assert bit_rate_text(rows(3, bytes=50_000), 30.0) == "12.00 Mbit/s without the header"
 
 
 def test_the_header_by_field_the_largest_first() -> None:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from properties import examples
 from streams import header_for, same, small_scene
-from structgstream.codec.container.blocks import packed_block
-from structgstream.codec.container.payload import packet_of
+from structgstream.codec.container.blocks import pack_raw_block
+from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind
@@ -23,7 +23,7 @@ PAYLOAD = SceneEncoder(HEADER).encode(SCENE, index=7, pts_seconds=0.25, kind=Pac
 
 
 def test_a_packet_holds_the_scene() -> None:
-    assert same(SceneDecoder(HEADER).decode(packet_of(PAYLOAD, PacketKind.DELTA)), SCENE)
+    assert same(SceneDecoder(HEADER).decode(parse_packet(PAYLOAD, PacketKind.DELTA)), SCENE)
 
 
 def test_another_codec_is_refused() -> None:
@@ -34,17 +34,17 @@ def test_another_codec_is_refused() -> None:
 def test_fields_that_the_header_does_not_announce() -> None:
     state = state_of(SCENE)
     head = struct.pack("<Id", 0, 0.0)
-    whole = [packed_block(row.name, state[row.name]) for row in STATE_TABLE if row.name in PAPER_DYNAMIC]
-    for blocks in (whole[1:], [*whole, packed_block("anchor_offsets", state["anchor_offsets"])], []):
-        packet = packet_of(head + b"".join(blocks), PacketKind.KEY)
+    whole = [pack_raw_block(row.name, state[row.name]) for row in STATE_TABLE if row.name in PAPER_DYNAMIC]
+    for blocks in (whole[1:], [*whole, pack_raw_block("anchor_offsets", state["anchor_offsets"])], []):
+        packet = parse_packet(head + b"".join(blocks), PacketKind.KEY)
         with pytest.raises(StreamError, match="Packet 0 holds .*; the header announces anchor_positions, cov"):
             SceneDecoder(HEADER).decode(packet)
 
 
 def test_a_packet_whose_sizes_contradict_the_header() -> None:
     state = {**state_of(SCENE), "free": torch.zeros(3, 14)}
-    blocks = [packed_block(row.name, state[row.name]) for row in STATE_TABLE if row.name in PAPER_DYNAMIC]
-    packet = packet_of(struct.pack("<Id", 0, 0.0) + b"".join(blocks), PacketKind.KEY)
+    blocks = [pack_raw_block(row.name, state[row.name]) for row in STATE_TABLE if row.name in PAPER_DYNAMIC]
+    packet = parse_packet(struct.pack("<Id", 0, 0.0) + b"".join(blocks), PacketKind.KEY)
     with pytest.raises(StreamError, match=r"field free_births as \(2,\) .* expected \(3\)"):
         SceneDecoder(HEADER).decode(packet)
 
@@ -57,7 +57,7 @@ def test_a_mangled_packet_gives_a_scene_or_one_kind_of_error(at: int, xor: int, 
     mangled[at] ^= xor
     for payload in (bytes(mangled), PAYLOAD[:end]):
         try:
-            packet = packet_of(payload, PacketKind.KEY)
+            packet = parse_packet(payload, PacketKind.KEY)
             assert isinstance(packet, Packet)
             scene = SceneDecoder(HEADER).decode(packet)
         except StreamError:

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from properties import examples
 from rigs import random_scene
 from streams import header_for, moved, same, small_scene
-from structgstream.codec.container.payload import packet_of
+from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.header import pack_header, unpack_header
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
@@ -34,8 +34,8 @@ def test_decoding_gives_the_scene_back_bit_for_bit(anchors: int, free: int, seed
     scene = replace(scene, environment=torch.rand(9, 3))
     header = header_for(scene, dynamic=frozenset(dynamic))
     encoded = SceneEncoder(header).encode(scene, index=3, pts_seconds=0.1, kind=PacketKind(kind))
-    receiver = SceneDecoder(unpacked_header(packed_header(header)))
-    packet = packet_of(encoded.packet.payload, PacketKind(kind))
+    receiver = SceneDecoder(unpack_header(pack_header(header)))
+    packet = parse_packet(encoded.packet.payload, PacketKind(kind))
     assert packet == encoded.packet
     assert same(receiver.decode(packet), scene)
     assert same(encoded.reconstruction, scene)

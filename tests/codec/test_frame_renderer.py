@@ -9,7 +9,7 @@ from rigs import arc_rig
 from streams import moved, small_scene
 from structgstream.codec.frame_renderer import FrameRenderer
 from structgstream.kernels.backend import reference_backend
-from structgstream.scene.render import quantised, render
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 
 RIG, BACKEND = arc_rig(), reference_backend()
@@ -33,6 +33,6 @@ def test_a_scene_is_decoded_when_frame_or_back_end_change_and_not_before() -> No
     for index, name, backend in asked:
         picture = renderer.picture(index, RIG[name], decode=decode, backend=backend)
         assert (picture.shape, picture.dtype) == ((32, 48, 3), np.uint8)
-        expected = quantised(render(moved(small_scene(free=2), index), RIG[name], BACKEND).image)
+        expected = to_8bit_image(render(moved(small_scene(free=2), index), RIG[name], BACKEND).image)
         assert np.array_equal(picture, expected)
     assert decoded == [0, 1, 1]

@@ -10,9 +10,9 @@ import torch
 import zstandard
 
 from streams import header_for, small_scene
-from structgstream.codec.container.blocks import packed_block
+from structgstream.codec.container.blocks import pack_raw_block
 from structgstream.codec.container.init_record import MAX_JSON_BYTES
-from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.header import pack_header, unpack_header
 from structgstream.errors import StreamError
 from structgstream.scene.state import STATE_TABLE
 
@@ -29,7 +29,7 @@ def closed(text: bytes, blocks: bytes) -> bytes:
 
 
 def edited(edit: Callable[[dict[str, Any]], object]) -> bytes:
-    description, blocks = opened(packed_header(header_for(small_scene())))
+    description, blocks = opened(pack_header(header_for(small_scene())))
     edit(description)
     return closed(json.dumps(description).encode(), blocks)
 
@@ -37,7 +37,7 @@ def edited(edit: Callable[[dict[str, Any]], object]) -> bytes:
 def test_a_header_comes_back() -> None:
     header = header_for(small_scene(7))
     header = replace(header, config={"a": {"b": [1, 0.1, None, "ä"]}}, metadata={"capture": "c", "n": 1})
-    back = unpacked_header(packed_header(header))
+    back = unpack_header(pack_header(header))
     assert (back.similarity, back.fps, back.codec, back.dynamic) == (
         header.similarity,
         header.fps,
@@ -53,13 +53,13 @@ def test_a_header_comes_back() -> None:
         assert (back.rig[name].width, back.rig[name].height, back.rig[name].near) == (48, 32, 0.1)
     assert back.static.keys() == header.static.keys()
     assert all(torch.equal(back.static[name], value) for name, value in header.static.items())
-    assert packed_header(back) == packed_header(header)
+    assert pack_header(back) == pack_header(header)
 
 
 @pytest.mark.parametrize("dynamic", [frozenset(), frozenset(row.name for row in STATE_TABLE)])
 def test_any_set_of_dynamic_fields(dynamic: frozenset) -> None:
     header = header_for(small_scene(2, free=1), dynamic=dynamic)
-    assert unpacked_header(packed_header(header)).dynamic == dynamic
+    assert unpack_header(pack_header(header)).dynamic == dynamic
 
 
 EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
@@ -91,34 +91,34 @@ EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
 @pytest.mark.parametrize("message", EDITS)
 def test_descriptions_that_break_the_format(message: str) -> None:
     with pytest.raises(StreamError, match=message):
-        unpacked_header(edited(EDITS[message]))
+        unpack_header(edited(EDITS[message]))
 
 
 def test_static_fields_that_do_not_fit_each_other() -> None:
-    description, _ = opened(packed_header(header_for(small_scene(3))))
+    description, _ = opened(pack_header(header_for(small_scene(3))))
     other = header_for(small_scene(4)).static
     mixed = {**header_for(small_scene(3)).static, "anchor_features": other["anchor_features"]}
-    blocks = b"".join(packed_block(row.name, mixed[row.name]) for row in STATE_TABLE if row.name in mixed)
+    blocks = b"".join(pack_raw_block(row.name, mixed[row.name]) for row in STATE_TABLE if row.name in mixed)
     with pytest.raises(StreamError, match=r"field anchor_features as \(4, 2\) .* expected \(3, D\)"):
-        unpacked_header(closed(json.dumps(description).encode(), blocks))
+        unpack_header(closed(json.dumps(description).encode(), blocks))
 
 
 @pytest.mark.parametrize("text", [b"", b"null", b"[1]", b"\xff", b"{", b"[" * 200_000, b'{"cameras":[3]}'])
 def test_texts_that_are_no_description(text: bytes) -> None:
     with pytest.raises(StreamError, match="init record"):
-        unpacked_header(closed(text, b""))
+        unpack_header(closed(text, b""))
 
 
 def test_a_description_that_no_reader_would_unpack_is_not_written() -> None:
     long = replace(header_for(small_scene(1)), metadata={"note": "a" * MAX_JSON_BYTES})
     with pytest.raises(StreamError, match=f"at most {MAX_JSON_BYTES} are allowed; leave out metadata or cameras"):
-        packed_header(long)
+        pack_header(long)
 
 
 @pytest.mark.parametrize("value", ["yes", 1, None])
 def test_cameras_are_held_out_or_not(value: object) -> None:
     with pytest.raises(StreamError, match="held_out"):
-        unpacked_header(edited(lambda d: d["cameras"][0].update(held_out=value)))
+        unpack_header(edited(lambda d: d["cameras"][0].update(held_out=value)))
 
 
 @pytest.mark.parametrize(
@@ -126,11 +126,11 @@ def test_cameras_are_held_out_or_not(value: object) -> None:
 )
 def test_lengths_beyond_the_record(payload: bytes) -> None:
     with pytest.raises(StreamError, match="init record"):
-        unpacked_header(payload)
+        unpack_header(payload)
 
 
 def test_a_header_cut_anywhere() -> None:
-    payload = packed_header(header_for(small_scene(1)))
+    payload = pack_header(header_for(small_scene(1)))
     for cut in range(len(payload)):
         with pytest.raises(StreamError):
-            unpacked_header(payload[:cut])
+            unpack_header(payload[:cut])

@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from streams import compact_header, small_scene
-from structgstream.codec.container.blocks import BLOCK, blocks_in, mixed_blocks
+from structgstream.codec.container.blocks import BLOCK, iterate_blocks, unpack_blocks
 from structgstream.codec.container.init_record import LENGTH
-from structgstream.codec.entropy import coder, rans
-from structgstream.codec.entropy.coder import Decoder, varint
-from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.entropy import rans, section_coder
+from structgstream.codec.entropy.section_coder import SectionDecoder, varint
+from structgstream.codec.header import pack_header, unpack_header
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
-from structgstream.codec.scene.static_fields import decoded_fields
+from structgstream.codec.scene.static_fields import decode_fields
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of
@@ -50,10 +50,10 @@ def header_with_all() -> StreamHeader:
 def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]:
     """Where decoding reads counts: numbers, and those in the heads of sections."""
     found: set[Count] = set()
-    number, section_bytes, read = Decoder.number, coder.section_bytes, rans._read_varint
+    number, section_bytes, read = SectionDecoder.number, section_coder.section_bytes, rans._read_varint
     sections: list[tuple[FieldName, int]] = []
 
-    def logged_number(self: Decoder, name: str, value: int | None) -> int:
+    def logged_number(self: SectionDecoder, name: str, value: int | None) -> int:
         field: FieldName = next(known for known in fields if known == name.partition(".")[0])
         start = len(fields[field]) - len(self._left[field])
         result = number(self, name, value)
@@ -73,8 +73,8 @@ def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]
         return value, end
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Decoder, "number", logged_number)
-        patch.setattr(coder, "section_bytes", logged_section)
+        patch.setattr(SectionDecoder, "number", logged_number)
+        patch.setattr(section_coder, "section_bytes", logged_section)
         patch.setattr(rans, "_read_varint", logged_read)
         decode(fields)
     return sorted(found)
@@ -101,13 +101,13 @@ def check_all_refused(fields: Fields, counts: list[Count], decode: Callable[[Fie
 
 def test_counts_in_the_init_record() -> None:
     header = header_with_all()
-    payload = packed_header(header)
+    payload = pack_header(header)
     (length,) = LENGTH.unpack_from(payload)
-    coded = mixed_blocks(payload, LENGTH.size + length, where="")[1]
+    coded = unpack_blocks(payload, LENGTH.size + length, where="")[1]
     fields: Fields = {name: bytes(data) for name, data in coded.items()}
 
     def decode(given: Fields) -> object:
-        return decoded_fields(given, header.init_steps)
+        return decode_fields(given, header.init_steps)
 
     counts = counts_of(fields, decode)
     assert len(counts) > 80
@@ -116,15 +116,15 @@ def test_counts_in_the_init_record() -> None:
 
 
 def test_sizes_in_blocks() -> None:
-    payload = packed_header(header_with_all())
+    payload = pack_header(header_with_all())
     (length,) = LENGTH.unpack_from(payload)
     tracemalloc.start()
-    for block in blocks_in(payload, LENGTH.size + length, where=""):
+    for block in iterate_blocks(payload, LENGTH.size + length, where=""):
         for place in range(block.start + BLOCK.size, block.data, 4):
             for value in HUGE:
                 tracemalloc.reset_peak()
                 with pytest.raises(StreamError, match="The init record"):
-                    unpacked_header(payload[:place] + value.to_bytes(4, "little") + payload[place + 4 :])
+                    unpack_header(payload[:place] + value.to_bytes(4, "little") + payload[place + 4 :])
                 assert tracemalloc.get_traced_memory()[1] < MOST_BYTES
     tracemalloc.stop()
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
-from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scanned
+from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import packed_header
+from structgstream.codec.header import pack_header
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader, open_stream, readable_part
 from structgstream.codec.sinks import MemorySink
@@ -25,7 +25,7 @@ def packet_record(index: int, kind: PacketKind, *, pts_seconds: float | None = N
 
 
 def with_records(*records: bytes) -> bytes:
-    return prefix() + packed(RecordType.INIT, packed_header(header_for(small_scene()))) + b"".join(records)
+    return prefix() + packed(RecordType.INIT, pack_header(header_for(small_scene()))) + b"".join(records)
 
 
 def test_a_reader_sees_what_the_encoder_promised() -> None:
@@ -71,7 +71,7 @@ def test_a_stream_cut_at_any_byte_plays_up_to_the_cut() -> None:
 @pytest.mark.parametrize("damaged", range(5))
 def test_what_comes_before_damage_plays(damaged: int) -> None:
     data = bytearray(small_stream())
-    record = list(scanned(bytes(data)))[damaged]
+    record = list(scan_records(bytes(data)))[damaged]
     data[record.offset + 8 + len(record.payload) // 2] ^= 0x10
     if damaged == 0:
         with pytest.raises(StreamError, match="the record at byte 12 .* is damaged"):
@@ -97,7 +97,7 @@ def test_damage_after_opening_is_noticed() -> None:
 
 def test_unknown_records_are_skipped() -> None:
     data = small_stream()
-    second = list(scanned(data))[2]
+    second = list(scan_records(data))[2]
     foreign = struct.pack("<BBHI", 77, 0, 0, 3) + b"abc"
     foreign += struct.pack("<I", zlib.crc32(foreign))
     reader = StreamReader(data[: second.offset] + foreign + data[second.offset :])
@@ -162,7 +162,7 @@ def test_files_that_are_no_streams(tmp_path: Path) -> None:
 
 def test_the_readable_part_leaves_out_the_index() -> None:
     data = small_stream()
-    records = list(scanned(data))
+    records = list(scan_records(data))
     assert readable_part(data, name="x") == records[-1].offset
     assert readable_part(data[: records[3].end + 5], name="x") == records[3].end
     assert readable_part(data[:40], name="x") is None

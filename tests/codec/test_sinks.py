@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
-from structgstream.codec.container.records import RecordType, scanned
+from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.reader import StreamReader, open_stream
@@ -68,7 +68,7 @@ def test_writes_return_their_bytes_and_index_and_footer_point_at_them() -> None:
     sink.close()
     offset, magic = struct.unpack("<Q8s", sink.data[-16:])
     assert (offset, magic) == (sum(sizes), b"SGSINDEX")
-    index = list(scanned(sink.data))[-1]
+    index = list(scan_records(sink.data))[-1]
     assert (index.type, index.offset, index.end) == (RecordType.INDEX, offset, len(sink.data) - 16)
     entries = list(struct.iter_unpack("<IBQ", index.payload))
     assert entries == [(i, kind, sum(sizes[: i + 1])) for i, kind in enumerate((2, 3, 3, 2))]
@@ -105,7 +105,7 @@ def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
 def test_a_disk_that_fills_up_leaves_whole_frames(tmp_path: Path, disk: type[FullDisk]) -> None:
     """In the header, all over a packet record and what closes the file; resumed, it equals an uninterrupted run."""
     whole = small_stream()
-    records = list(scanned(whole))
+    records = list(scan_records(whole))
     path = tmp_path / "a.sgs"
     packet, closing = range(records[2].offset, records[2].end, 5), range(records[5].offset, len(whole), 2)
     for room in [0, 5, records[0].end - 1, *packet, *closing]:
@@ -165,7 +165,7 @@ def test_a_device_that_is_full() -> None:
 def test_a_file_cut_anywhere_is_continued(tmp_path: Path) -> None:
     whole = small_stream()
     path = tmp_path / "a.sgs"
-    ends = [record.end for record in scanned(whole)][:5]
+    ends = [record.end for record in scan_records(whole)][:5]
     for cut in range(0, len(whole) + 1, 13):
         path.write_bytes(whole[:cut])
         sink, reader = FileSink.resume(path)

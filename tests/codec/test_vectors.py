@@ -15,7 +15,7 @@ import pytest
 import torch
 import zstandard
 
-from structgstream.codec.container.records import scanned
+from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.scene.state import state_of
 from vectors.generate import (
@@ -34,7 +34,7 @@ from vectors.generate import (
 
 def canonical(data: bytes) -> tuple[bytes, bytes, list[tuple[int, bytes]], bytes]:
     """The stream with the description unpacked, since releases of zstd compress differently: prefix, text, records."""
-    records = list(scanned(data))
+    records = list(scan_records(data))
     init = records[0].payload
     (length,) = struct.unpack_from("<I", init)
     text = zstandard.ZstdDecompressor().decompress(init[4 : 4 + length])
@@ -44,7 +44,7 @@ def canonical(data: bytes) -> tuple[bytes, bytes, list[tuple[int, bytes]], bytes
 
 def relative_index(data: bytes) -> list[tuple[int, int, int]]:
     """Entries of the index with offsets from the end of the init record, and the footer's last."""
-    records = list(scanned(data))
+    records = list(scan_records(data))
     entries = list(struct.iter_unpack("<IBQ", records[-1].payload))
     (footer,) = struct.unpack_from("<Q", data, len(data) - 16)
     return [(a, b, offset - records[0].end) for a, b, offset in [*entries, (0, 0, footer)]]

@@ -16,7 +16,7 @@ from structgstream.data.colmap import PARAMETERS
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import LAYOUTS, open_capture
 from structgstream.data.pose_check import check_poses
-from structgstream.data.undistortion import Undistorted, Undistortion
+from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.presets import PAPER_DATA
 
@@ -43,7 +43,7 @@ def test_every_tool_with_videos_and_with_pictures(tool: str, videos: bool, tmp_p
     else:
         write_pictures(tmp_path)
     source = open_capture(tmp_path)
-    assert isinstance(source, Undistorted)
+    assert isinstance(source, UndistortedSource)
     assert list(source.rig) == names
     assert source.rig.testing == ()
     first = source.rig[names[0]].viewmat

@@ -14,7 +14,7 @@ from structgstream.cameras import Camera
 from structgstream.data.immersive import open_immersive, read_models
 from structgstream.data.lenses import Fisheye, LensCamera
 from structgstream.data.open import open_capture
-from structgstream.data.undistortion import Undistorted, Undistortion
+from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError
 
 
@@ -22,7 +22,7 @@ def test_fisheye_videos_become_pinholes_of_half_the_focal_length(tmp_path: Path)
     """The videos have half of the pixels that the file is for, and so have the pinholes."""
     rig = write_immersive(tmp_path)
     source = open_immersive(tmp_path)
-    assert isinstance(source, Undistorted)
+    assert isinstance(source, UndistortedSource)
     assert source.rig.testing == ("camera_0001",)
     for name in rig:
         torch.testing.assert_close(source.rig[name].viewmat, rig[name].viewmat)

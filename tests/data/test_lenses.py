@@ -70,8 +70,8 @@ def test_undistortion_is_the_inverse_wherever_the_lens_reaches(lens: Lens) -> No
     points = grid(min(0.98 * lens.reach, math.tan(math.radians(80))))
     np.testing.assert_allclose(lens.undistort(lens.distort(points)), points, rtol=1e-6, atol=1e-7)
     camera = filmed(lens)
-    pixels = camera.placed(points)
-    np.testing.assert_allclose(camera.normalised(pixels), points, rtol=1e-6, atol=1e-7)
+    pixels = camera.to_pixels(points)
+    np.testing.assert_allclose(camera.to_normalized(pixels), points, rtol=1e-6, atol=1e-7)
 
 
 def test_a_lens_that_folds_sees_nothing_beyond_the_fold() -> None:
@@ -93,8 +93,8 @@ def test_a_lens_that_folds_sees_nothing_beyond_the_fold() -> None:
 def test_a_fisheye_is_equidistant() -> None:
     lens = Fisheye()
     for degrees in (1, 45, 75, 89):
-        placed = lens.distort(np.array([0.0, math.tan(math.radians(degrees))]))
-        np.testing.assert_allclose(placed, [0, math.radians(degrees)], atol=1e-9)
+        to_pixels = lens.distort(np.array([0.0, math.tan(math.radians(degrees))]))
+        np.testing.assert_allclose(to_pixels, [0, math.radians(degrees)], atol=1e-9)
     assert np.isnan(lens.undistort(np.array([math.radians(91), 0.0]))).all()
 
 
@@ -132,9 +132,9 @@ def test_any_coefficients_are_inverted_up_to_where_they_fold() -> None:
     """Within a hundredth of the fold the inverse is ill-conditioned; nothing is raised, and nothing is warned of."""
     points = grid(2.0)
     for lens in random_lenses(60):
-        placed = lens.distort(points)
+        to_pixels = lens.distort(points)
         inside = np.linalg.norm(points, axis=1) < 0.99 * lens.reach
-        assert np.isfinite(placed[inside]).all()
-        back = lens.undistort(placed)[inside]
+        assert np.isfinite(to_pixels[inside]).all()
+        back = lens.undistort(to_pixels)[inside]
         assert (np.abs(back - points[inside]) < 1e-4).all(1).mean() > 0.97, lens
         lens.undistort(points)

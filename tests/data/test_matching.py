@@ -15,7 +15,7 @@ from structgstream.data.matching import (
     guided_matches,
     inside,
     level_normal,
-    neighbour_views,
+    neighbor_views,
     project,
     sift_features,
     triangulate,
@@ -57,7 +57,7 @@ def test_a_rig_that_looks_at_one_place_says_how_far_it_is() -> None:
 
 def test_every_pair_of_neighbours_comes_once() -> None:
     cameras = dict(arc_rig(5).cameras)
-    neighbours = neighbour_views(cameras, count=2, distance=3.0)
+    neighbours = neighbor_views(cameras, count=2, distance=3.0)
     assert all(len(others) == 2 and name not in others for name, others in neighbours.items())
     pairs = unique_pairs(neighbours)
     assert len({frozenset(pair) for pair in pairs}) == len(pairs)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from planes import WIDTH, distance_to_surface, room_depth, room_frame, room_rig
-from structgstream.data.matching import level_normal, neighbour_views
+from structgstream.data.matching import level_normal, neighbor_views
 from structgstream.data.plane_sweep import (
     DepthMap,
     SweepBounds,
@@ -94,7 +94,7 @@ def test_points_lie_on_the_planes_whatever_the_number_of_threads() -> None:
         return sweep_points(
             cameras,
             frame.images,
-            neighbours=neighbour_views(cameras, count=4, distance=2.6),
+            neighbours=neighbor_views(cameras, count=4, distance=2.6),
             bounds=dict.fromkeys(cameras, BOUNDS),
             workers=workers,
             levels=(CONFIG, SweepConfig(width=60, window=7)),

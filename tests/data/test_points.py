@@ -10,7 +10,7 @@ import pytest
 from planes import distance_to_surface, room_frame, room_rig
 from structgstream.data.clip import bundled_clip
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
-from structgstream.data.points import InitialPoints, PointsConfig, _has_company, initial_points
+from structgstream.data.points import InitialPoints, PointsConfig, _has_neighbors, initial_points
 from structgstream.data.wrappers import resized
 from structgstream.frames import MultiViewFrame
 
@@ -118,7 +118,7 @@ def test_a_point_without_company_is_left_out() -> None:
     """Three others in the cells around it; where cells are so small that none has them, all found points go."""
     together, few, alone = np.zeros((4, 3)), np.full((3, 3), 5.0), np.full((1, 3), 9.0)
     beside = np.full((1, 3), 0.9)
-    kept = _has_company(np.concatenate([together, few, alone, beside]), cell=1.0)
+    kept = _has_neighbors(np.concatenate([together, few, alone, beside]), cell=1.0)
     assert kept.tolist() == [True] * 4 + [False] * 4 + [True]
     rig = room_rig()
     config = PointsConfig(sweep_levels=(), isolation_share=1e-6, random_points=400)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from captures import small_rig
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.undistortion import WIDEST_DEGREES, Undistorted, Undistortion, rectilinear, undistorted
-from structgstream.data.wrappers import of_cameras, resized, section
+from structgstream.data.undistortion import WIDEST_DEGREES, UndistortedSource, Undistortion, rectilinear, undistort
+from structgstream.data.wrappers import resized, section, select_cameras
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MultiViewFrame
 
@@ -43,7 +43,7 @@ def centers(camera: Camera) -> NDArray[np.float64]:
 
 
 def expected(camera: Camera) -> NDArray[np.uint8]:
-    return pattern(LensCamera(camera, Pinhole()).normalised(centers(camera)))
+    return pattern(LensCamera(camera, Pinhole()).to_normalized(centers(camera)))
 
 
 @pytest.mark.parametrize(("lens", "focal"), LENSES)
@@ -54,7 +54,7 @@ def test_the_pinhole_sees_what_is_there(lens: Lens, focal: float, degrees: float
     Half a pixel of shift, the difference of the two conventions, would be 0.8 levels and more.
     """
     camera = filmed(lens, focal, width=640, height=480)
-    taken = pattern(camera.normalised(centers(camera.camera)))
+    taken = pattern(camera.to_normalized(centers(camera.camera)))
     target = rectilinear(camera, degrees=degrees)
     plan = Undistortion(camera, target)
     shown = np.ones((480, 640), bool) if plan.shown is None else plan.shown
@@ -157,7 +157,7 @@ class Filmed:
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         for index in range(start, 2):
             images = {
-                name: (pattern(own.normalised(centers(own.camera))) // (index + 1)).astype(np.uint8)
+                name: (pattern(own.to_normalized(centers(own.camera))) // (index + 1)).astype(np.uint8)
                 for name, own in self.cameras.items()
             }
             yield MultiViewFrame(index, index / self.fps, images)
@@ -175,8 +175,8 @@ def source() -> Filmed:
 
 
 def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
-    made = undistorted(source, source.cameras)
-    assert isinstance(made, Undistorted)
+    made = undistort(source, source.cameras)
+    assert isinstance(made, UndistortedSource)
     assert made.rig.testing == ("cam00",)
     assert (made.name, made.fps, len(made)) == ("take", 30.0, 2)
     assert {camera.near for camera in made.rig.cameras.values()} == {0.3}
@@ -195,11 +195,11 @@ def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
 
 def test_a_capture_of_pinholes_is_left_alone(source: Filmed) -> None:
     plain = replace(source, cameras={name: replace(own, lens=Pinhole()) for name, own in source.cameras.items()})
-    assert undistorted(plain, plain.cameras) is plain
+    assert undistort(plain, plain.cameras) is plain
 
 
 def test_a_smaller_picture_is_resampled_once(source: Filmed) -> None:
-    half = section(resized(undistorted(source, source.cameras), 0.5), start=1)
+    half = section(resized(undistort(source, source.cameras), 0.5), start=1)
     (frame,) = half.frames()
     for name in half.rig:
         camera = half.rig[name]
@@ -209,9 +209,9 @@ def test_a_smaller_picture_is_resampled_once(source: Filmed) -> None:
 
 
 def test_some_of_the_cameras(source: Filmed) -> None:
-    part = of_cameras(undistorted(source, source.cameras), ("cam02", "cam03"))
+    part = select_cameras(undistort(source, source.cameras), ("cam02", "cam03"))
     assert [*part.rig] == ["cam02", "cam03"]
-    whole = next(undistorted(source, source.cameras).frames())
+    whole = next(undistort(source, source.cameras).frames())
     for name, image in next(part.frames()).images.items():
         np.testing.assert_array_equal(image, whole.images[name])
 
@@ -222,4 +222,4 @@ def test_a_broken_lens_names_its_camera(source: Filmed, tmp_path: Path) -> None:
     K[1, 2] = -10
     cameras = {**source.cameras, "cam02": replace(broken, camera=replace(broken.camera, K=K))}
     with pytest.raises(CalibrationError, match="Camera 'cam02' of take"):
-        undistorted(source, cameras)
+        undistort(source, cameras)

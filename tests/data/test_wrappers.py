@@ -10,7 +10,7 @@ from captures import all_numbers, numbers, write_clip, write_panoptic
 from structgstream.data.json_videos import open_json_videos
 from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig, of_cameras, resized, section, thinned
+from structgstream.data.wrappers import WithRig, every_nth_frame, resized, section, select_cameras
 from structgstream.errors import CaptureError, ConfigError
 
 
@@ -86,7 +86,7 @@ def test_the_cameras_that_are_asked_for_give_the_same_pictures(
     """Through every wrapper, and one more camera where a rig would have one alone."""
     whole = section(WithRig(resized(source, 0.5), resized(source, 0.5).rig), start=1, frames=4)
     names = [*whole.rig]
-    part = of_cameras(whole, tuple(names[i] for i in wanted))
+    part = select_cameras(whole, tuple(names[i] for i in wanted))
     assert [*part.rig] == [names[i] for i in kept]
     assert len(part) == len(whole) == 4
     for frame, expected in zip(part.frames(1), whole.frames(1), strict=True):
@@ -101,11 +101,11 @@ def test_a_source_of_another_kind_keeps_its_cameras(source: FrameSource) -> None
         rig = source.rig
 
     other: Any = Other()
-    assert of_cameras(other, (*source.rig,)[:2]) is other
+    assert select_cameras(other, (*source.rig,)[:2]) is other
 
 
 def test_every_third_frame_counts_and_times_from_zero(source: FrameSource) -> None:
-    few = thinned(source, 3)
+    few = every_nth_frame(source, 3)
     assert len(few) == 2
     assert all_numbers(few.frames()) == [all_numbers(source.frames())[i] for i in (0, 3)]
     assert [(frame.index, frame.pts_seconds) for frame in few.frames()] == [(0, 0.0), (1, 1 / source.fps)]
@@ -115,10 +115,10 @@ def test_every_third_frame_counts_and_times_from_zero(source: FrameSource) -> No
 
 
 def test_steps_of_a_thinned_capture(source: FrameSource) -> None:
-    assert thinned(source, 1) is source
-    assert [len(thinned(source, step)) for step in (2, 4, 5, 6, 7)] == [3, 2, 2, 1, 1]
-    part = thinned(section(source, start=1, frames=5), 4)
+    assert every_nth_frame(source, 1) is source
+    assert [len(every_nth_frame(source, step)) for step in (2, 4, 5, 6, 7)] == [3, 2, 2, 1, 1]
+    part = every_nth_frame(section(source, start=1, frames=5), 4)
     assert all_numbers(part.frames()) == [all_numbers(source.frames())[i] for i in (1, 5)]
     for step in (0, -1):
         with pytest.raises(ConfigError, match="at least 1, got"):
-            thinned(source, step)
+            every_nth_frame(source, step)

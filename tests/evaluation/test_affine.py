@@ -7,8 +7,8 @@ import pytest
 from structgstream.evaluation.affine import (
     ChannelFit,
     affine_fit,
+    apply_color_matrix,
     channel_fit,
-    corrected,
     psnr_affine,
     psnr_camera_color,
 )
@@ -23,14 +23,14 @@ def picture(seed: int = 0) -> np.ndarray:
 
 def test_a_planted_matrix_is_recovered() -> None:
     source = picture()
-    truth = np.rint(corrected(source, PLANTED)).astype(np.uint8)
+    truth = np.rint(apply_color_matrix(source, PLANTED)).astype(np.uint8)
     # Rounding of the truth is noise of 0.29 / 255 a value, averaged over 744 pixels.
     np.testing.assert_allclose(affine_fit(source, truth), PLANTED, atol=1e-3)
 
 
 def test_colour_is_forgiven_and_structure_is_not() -> None:
     source = picture()
-    truth = np.rint(corrected(source, PLANTED)).astype(np.uint8)
+    truth = np.rint(apply_color_matrix(source, PLANTED)).astype(np.uint8)
     assert psnr(source, truth) < 26
     assert psnr_affine(source, truth) > 55  # what rounding leaves
     assert psnr_affine(picture(1), truth) < 20
@@ -55,7 +55,7 @@ IDENTITY = ChannelFit(gains=(1.0, 1.0, 1.0), biases=(0.0, 0.0, 0.0))
 
 def taken(scene: np.ndarray, fit: ChannelFit = EXPOSURE) -> np.ndarray:
     """What a camera of that exposure records."""
-    return np.rint(corrected(scene, np.column_stack([np.diag(fit.gains), fit.biases]))).astype(np.uint8)
+    return np.rint(apply_color_matrix(scene, np.column_stack([np.diag(fit.gains), fit.biases]))).astype(np.uint8)
 
 
 def test_a_cameras_gain_and_bias_are_found_in_one_frame_and_hold_in_another() -> None:
@@ -72,7 +72,7 @@ def test_a_held_fit_does_not_forgive_light_that_changes_nor_colours_that_mix() -
     later = picture(1)
     darker = taken(later, ChannelFit(gains=(0.6, 0.6, 0.6), biases=EXPOSURE.biases))
     assert psnr_camera_color(later, darker, fit) < 20 < psnr_affine(later, darker)
-    mixed = np.rint(corrected(later, PLANTED)).astype(np.uint8)
+    mixed = np.rint(apply_color_matrix(later, PLANTED)).astype(np.uint8)
     assert psnr_camera_color(later, mixed, channel_fit(later, mixed)) < psnr_affine(later, mixed) - 10
 
 

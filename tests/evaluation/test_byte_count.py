@@ -14,11 +14,11 @@ from structgstream.evaluation.byte_count import (
     FIRST,
     REST,
     Row,
-    fields_of,
     groups_of,
     mean_of,
+    occurring_fields,
+    packet_rows,
     parts_of,
-    rows_of,
     with_rest,
 )
 
@@ -33,7 +33,7 @@ def reader_of(*, frames: int, compact: bool) -> StreamReader:
 @pytest.mark.parametrize("compact", [False, True])
 def test_all_bytes_of_a_stream_are_counted_once(compact: bool) -> None:
     reader = reader_of(frames=7, compact=compact)
-    rows = rows_of(reader)
+    rows = packet_rows(reader)
     assert [(row.index, row.kind) for row in rows] == [(i, "delta" if i % 3 else "key") for i in range(7)]
     assert all(sum(row.sizes.values()) == row.bytes and row.sizes[REST] > 0 for row in rows)
     assert [row.offset for row in rows[1:]] == [row.offset + row.bytes for row in rows[:-1]]
@@ -47,12 +47,12 @@ def test_a_first_packet_without_news_is_no_part() -> None:
     sink = MemorySink()
     write_stream(sink, scenes, header=compact_header(scenes[0]))
     reader = StreamReader(sink.data)
-    still = parts_of(reader, rows_of(reader))
+    still = parts_of(reader, packet_rows(reader))
     assert [*still] == ["header", "key packets", "delta packets"]
     raw = reader_of(frames=7, compact=False)
-    assert [*parts_of(raw, rows_of(raw))] == ["header", FIRST, "key packets", "delta packets"]
+    assert [*parts_of(raw, packet_rows(raw))] == ["header", FIRST, "key packets", "delta packets"]
     alone = reader_of(frames=1, compact=False)
-    assert [*parts_of(alone, rows_of(alone))] == ["header", FIRST]
+    assert [*parts_of(alone, packet_rows(alone))] == ["header", FIRST]
     assert [*parts_of(alone, [])] == ["header"]
 
 
@@ -73,4 +73,4 @@ def test_means_by_kind_leave_the_first_packet_apart() -> None:
 
 def test_the_largest_field_comes_first_and_the_rest_last() -> None:
     assert with_rest({"free": 5, "appearance": 7}, 100) == {"free": 5, "appearance": 7, REST: 88}
-    assert fields_of([{"a": 5, REST: 50}, {"b": 4, "c": 9}, {"b": 4}]) == ["c", "b", "a", REST]
+    assert occurring_fields([{"a": 5, REST: 50}, {"b": 4, "c": 9}, {"b": 4}]) == ["c", "b", "a", REST]

@@ -10,8 +10,8 @@ import pytest
 from drawn import coloured, pixels_of
 from structgstream.errors import StorageError
 from structgstream.evaluation.byte_count import REST, Parts, Row, groups_of
-from structgstream.evaluation.byte_plot import colours_of, write_byte_plot
-from structgstream.evaluation.figure import COLOURS, OTHER
+from structgstream.evaluation.byte_plot import field_colors, write_byte_plot
+from structgstream.evaluation.figure import COLORS, OTHER
 
 HEADER = {"anchor_features": 6e5, "anchor_positions": 3e5, REST: 4e3}
 
@@ -31,14 +31,14 @@ def parts(rows: list[Row]) -> Parts:
 
 
 def test_colours_go_to_the_largest_fields_of_the_delta_packets_first() -> None:
-    assert colours_of(parts(packets(6))) == {
-        "anchor_positions": COLOURS[0],
-        "free": COLOURS[1],
-        "anchor_features": COLOURS[2],
+    assert field_colors(parts(packets(6))) == {
+        "anchor_positions": COLORS[0],
+        "free": COLORS[1],
+        "anchor_features": COLORS[2],
         REST: OTHER,
     }
     many = {"header": {f"field {i}": 1.0 for i in range(20)}}
-    assert len(colours_of(many)) == len(COLOURS) + 1
+    assert len(field_colors(many)) == len(COLORS) + 1
 
 
 def test_every_field_is_seen_in_both_panels(tmp_path: Path) -> None:
@@ -47,10 +47,10 @@ def test_every_field_is_seen_in_both_panels(tmp_path: Path) -> None:
     picture = pixels_of(tmp_path / "new" / "bytes.png")
     bars, shares = np.split(picture[:, : int(0.8 * picture.shape[1])], [int(0.7 * picture.shape[0])])
     for panel in (bars, shares):
-        first, second = coloured(panel, COLOURS[0]), coloured(panel, COLOURS[1])
+        first, second = coloured(panel, COLORS[0]), coloured(panel, COLORS[1])
         assert first > second > 1000
-    assert coloured(bars, COLOURS[0]) == pytest.approx(2 * coloured(bars, COLOURS[1]), rel=0.05)
-    assert coloured(shares, COLOURS[2]) > 1000 > coloured(bars, COLOURS[2])
+    assert coloured(bars, COLORS[0]) == pytest.approx(2 * coloured(bars, COLORS[1]), rel=0.05)
+    assert coloured(shares, COLORS[2]) > 1000 > coloured(bars, COLORS[2])
 
 
 def bars_of(path: Path, rows: list[Row]) -> float:
@@ -58,7 +58,7 @@ def bars_of(path: Path, rows: list[Row]) -> float:
     write_byte_plot(path, rows, parts(rows), title="")
     picture = pixels_of(path)
     panel = picture[: int(0.7 * picture.shape[0]), : int(0.8 * picture.shape[1])]
-    return coloured(panel, COLOURS[0]) / panel[..., 0].size
+    return coloured(panel, COLORS[0]) / panel[..., 0].size
 
 
 def test_a_towering_key_packet_does_not_hide_the_others(tmp_path: Path) -> None:

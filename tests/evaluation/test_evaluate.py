@@ -22,7 +22,7 @@ from structgstream.evaluation.facts import start_of
 from structgstream.evaluation.flow import FlowField
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.recording import placed
+from structgstream.evaluation.recording import to_device
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
@@ -395,7 +395,7 @@ def test_another_methods_file_is_scored_alike(world: World) -> None:
     assert [(frame.anchors, frame.free) for frame in report.frames] == [(0, 1)] * 4
     assert 5 < report.mean.psnr < 40
     with pytest.raises(BackendError, match="Ball cannot be drawn on meta"):
-        placed(Ball(1.0), torch.device("meta"))
+        to_device(Ball(1.0), torch.device("meta"))
 
 
 def replace_camera(source: MemoryCapture, camera: Any) -> MemoryCapture:

@@ -8,7 +8,7 @@ import pytest
 
 from drawn import pixels_of
 from structgstream.errors import MissingExtraError, StorageError
-from structgstream.evaluation.figure import COLOURS, figure_of, save_figure, without_frame
+from structgstream.evaluation.figure import COLORS, figure_of, save_figure, without_frame
 
 
 def test_a_figure_has_its_size_and_makes_its_folder(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_a_figure_has_its_size_and_makes_its_folder(tmp_path: Path) -> None:
 
 
 def test_no_two_colours_are_alike() -> None:
-    values = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in COLOURS]
+    values = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in COLORS]
     apart = [max(abs(a - b) for a, b in zip(one, other)) for one in values for other in values if one is not other]
     assert min(apart) > 40
 

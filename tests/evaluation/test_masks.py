@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.evaluation.masks import changed_pixels, grown
+from structgstream.evaluation.masks import changed_pixels, dilate
 
 
 def test_nothing_changed() -> None:
@@ -41,4 +41,4 @@ def test_dilation_is_a_square_that_stays_in_the_picture() -> None:
     mask[0, 0] = mask[6, 7] = True
     expected = np.zeros_like(mask)
     expected[:3, :3] = expected[4:9, 5:10] = True
-    np.testing.assert_array_equal(grown(mask, 2), expected)
+    np.testing.assert_array_equal(dilate(mask, 2), expected)

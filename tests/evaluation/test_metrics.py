@@ -20,7 +20,7 @@ from structgstream.evaluation.metrics import (
 )
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
-from structgstream.scene.render import quantised
+from structgstream.scene.render import to_8bit_image
 
 
 def pictures(height: int = 37, width: int = 53) -> tuple[np.ndarray, np.ndarray]:
@@ -33,7 +33,7 @@ def pictures(height: int = 37, width: int = 53) -> tuple[np.ndarray, np.ndarray]
 
 def test_a_rendering_is_clamped_and_rounded_before_it_is_scored() -> None:
     image = torch.tensor([-0.2, 0.0, 0.5, 0.501, 1.0, 1.7]).reshape(1, 2, 3)
-    assert quantised(image).ravel().tolist() == [0, 0, 128, 128, 255, 255]
+    assert to_8bit_image(image).ravel().tolist() == [0, 0, 128, 128, 255, 255]
 
 
 def test_psnr_of_a_constant_offset() -> None:

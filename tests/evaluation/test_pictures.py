@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from drawn import pixels_of
-from structgstream.evaluation.pictures import contact_sheet, difference, sampled, side_by_side, thumbnail
+from structgstream.evaluation.pictures import contact_sheet, difference, side_by_side, spread_indices, thumbnail
 
 
 def test_difference_is_four_times_the_error_and_clamped() -> None:
@@ -32,9 +32,9 @@ def test_thumbnails_are_block_means() -> None:
 
 
 def test_sampled_frames_hold_the_first_and_the_last() -> None:
-    assert sampled(12, 4) == [0, 4, 7, 11]
-    assert sampled(2, 5) == [0, 1]
-    assert sampled(1, 5) == [0]
+    assert spread_indices(12, 4) == [0, 4, 7, 11]
+    assert spread_indices(2, 5) == [0, 1]
+    assert spread_indices(1, 5) == [0]
 
 
 def test_a_contact_sheet_shows_every_picture_pixel_for_pixel(tmp_path: Path) -> None:

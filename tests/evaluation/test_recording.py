@@ -7,7 +7,7 @@ import torch
 from streams import small_scene
 from structgstream.cameras import Camera
 from structgstream.errors import BackendError
-from structgstream.evaluation.recording import placed
+from structgstream.evaluation.recording import to_device
 from structgstream.frame_report import counts
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
@@ -40,10 +40,10 @@ def test_a_scene_has_anchors_and_free_gaussians_and_others_are_free_altogether()
 
 def test_a_drawable_goes_to_a_device_if_it_can() -> None:
     scene, fixed, roaming = small_scene(), Fixed(), Roaming()
-    found = placed(scene, ELSEWHERE)
+    found = to_device(scene, ELSEWHERE)
     assert found.anchors.positions.device == ELSEWHERE  # type: ignore[attr-defined]
-    assert placed(fixed, CPU) is fixed
-    assert placed(roaming, ELSEWHERE) is roaming
+    assert to_device(fixed, CPU) is fixed
+    assert to_device(roaming, ELSEWHERE) is roaming
     assert roaming.device == ELSEWHERE
     with pytest.raises(BackendError, match="A Fixed cannot be drawn on meta; choose --device cpu"):
-        placed(fixed, ELSEWHERE)
+        to_device(fixed, ELSEWHERE)

@@ -15,9 +15,9 @@ from structgstream.evaluation.report import (
     Report,
     Scores,
     as_json,
-    course,
     drawing_facts,
     mean_scores,
+    psnr_trend,
     slope,
     write_json,
 )
@@ -53,7 +53,7 @@ def small_report() -> Report:
             )
         )
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in ("left", "right")}
-    facts = course([frame.mean.psnr for frame in frames]) | drawing_facts(frames) | {"total_bytes": 5000}
+    facts = psnr_trend([frame.mean.psnr for frame in frames]) | drawing_facts(frames) | {"total_bytes": 5000}
     return Report(frames, by_camera, mean_scores(frame.mean for frame in frames), facts, {"python": "3"})
 
 
@@ -64,7 +64,7 @@ def test_means_skip_what_is_not_there() -> None:
 
 
 def test_the_course_of_psnr() -> None:
-    assert course([30.0, 29.0, 28.5, 29.5])["drop_from_first_db"] == 1.5
+    assert psnr_trend([30.0, 29.0, 28.5, 29.5])["drop_from_first_db"] == 1.5
     assert slope([30.0, 29.0, 28.0]) == pytest.approx(-1.0)
     assert slope([30.0]) == 0.0
 

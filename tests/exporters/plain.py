@@ -6,7 +6,7 @@ from torch import Tensor
 
 from rigs import arc_rig
 from structgstream.cameras import Camera
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render
 

@@ -9,8 +9,8 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.errors import StreamError
-from structgstream.exporters.bake import Baking, baked, blend_weights, matrix_quaternions
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.bake import BakingConfig, bake, blend_weights, matrix_quaternions
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import MAX_DEGREE, sh_basis
@@ -53,7 +53,7 @@ def test_the_basis_is_orthonormal_and_signed_as_viewers_have_it() -> None:
 @pytest.mark.parametrize("shape", ["parts", "covariance"])
 def test_free_gaussians_stay_as_they_are(degree: int, shape: str) -> None:
     scene = random_scene(0, free=7, cameras=5)
-    found = baked(scene, CAMERAS, BACKEND, baking=Baking(degree=degree, shape=shape))  # pyright: ignore[reportArgumentType]
+    found = bake(scene, CAMERAS, BACKEND, baking=BakingConfig(degree=degree, shape=shape))  # pyright: ignore[reportArgumentType]
     wanted = scene.free_gaussians()
     torch.testing.assert_close(found.means, wanted.means)
     torch.testing.assert_close(found.opacities, wanted.opacities)
@@ -63,12 +63,12 @@ def test_free_gaussians_stay_as_they_are(degree: int, shape: str) -> None:
 
 
 def test_for_one_camera_nothing_is_lost(scene: Scene) -> None:
-    found = baked(scene, CAMERAS[:1], BACKEND, baking=Baking(degree=0))
+    found = bake(scene, CAMERAS[:1], BACKEND, baking=BakingConfig(degree=0))
     assert distance(found, scene, RIG.training[:1]) > 55
 
 
 def test_pictures_are_close_and_a_degree_more_is_closer(scene: Scene) -> None:
-    flat, linear = (baked(scene, CAMERAS, BACKEND, baking=Baking(degree=degree)) for degree in (0, 1))
+    flat, linear = (bake(scene, CAMERAS, BACKEND, baking=BakingConfig(degree=degree)) for degree in (0, 1))
     assert flat.degree == 0
     assert linear.degree == 1
     assert distance(flat, scene) > 25
@@ -94,7 +94,7 @@ def test_averages_are_what_the_cameras_draw(scene: Scene) -> None:
     over_drawn = {number: sum(o for o, _ in found) / len(found) for number, found in drawn.items()}
     assert any(abs(over_seen[number] - over_drawn[number]) > 0.01 for number in drawn)
     for opacity, wanted in (("seen", over_seen), ("drawn", over_drawn)):
-        found = baked(structured, CAMERAS, BACKEND, baking=Baking(opacity=opacity))  # pyright: ignore[reportArgumentType]
+        found = bake(structured, CAMERAS, BACKEND, baking=BakingConfig(opacity=opacity))  # pyright: ignore[reportArgumentType]
         kept = sorted(number for number, value in wanted.items() if value >= 1 / 255)
         torch.testing.assert_close(found.opacities, torch.tensor([wanted[number] for number in kept]))
         logs = [sum(o * s for o, s in drawn[n]) / sum(o for o, _ in drawn[n]) for n in kept]
@@ -106,7 +106,7 @@ def test_blend_weights_sum_to_the_coverage(scene: Scene) -> None:
     weights = blend_weights(gaussians, CAMERAS[0], BACKEND)
     assert weights.min() >= 0
     torch.testing.assert_close(weights.sum(), render(scene, CAMERAS[0], BACKEND).alpha.sum(), rtol=1e-4, atol=1e-3)
-    blend = baked(scene, CAMERAS, BACKEND, baking=Baking(weight="blend"))
+    blend = bake(scene, CAMERAS, BACKEND, baking=BakingConfig(weight="blend"))
     assert distance(blend, scene) > 25
 
 
@@ -121,7 +121,7 @@ def test_units_of_the_capture(scene: Scene) -> None:
     """A camera of the capture sees the same in the capture's units as in the scene's."""
     similarity = Similarity((0.4, -0.2, 0.3), 0.25)
     rig = similarity.rig(RIG)
-    shrunk = baked(scene, CAMERAS, BACKEND)
+    shrunk = bake(scene, CAMERAS, BACKEND)
     x, y, z = similarity.center
     inverse = Similarity((-0.25 * x, -0.25 * y, -0.25 * z), 1.0 / 0.25)
     small = shrunk.in_capture_units(inverse)
@@ -135,11 +135,11 @@ def test_units_of_the_capture(scene: Scene) -> None:
 
 def test_a_scene_without_gaussians_is_refused() -> None:
     with pytest.raises(StreamError, match="nothing to export"):
-        baked(random_scene(0, cameras=5), CAMERAS, BACKEND)
+        bake(random_scene(0, cameras=5), CAMERAS, BACKEND)
 
 
 def test_rows_are_selected_in_order(scene: Scene) -> None:
-    found: BakedGaussians = baked(scene, CAMERAS, BACKEND)
+    found: BakedGaussians = bake(scene, CAMERAS, BACKEND)
     part = found.select(torch.tensor([3, 1]))
     assert len(part) == 2
     assert torch.equal(part.sh, found.sh[[3, 1]])

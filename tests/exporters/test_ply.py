@@ -11,7 +11,7 @@ from plyfile import PlyData
 from torch import Tensor
 
 from exporters.plain import picture, psnr, some
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.write import write_gaussians
 

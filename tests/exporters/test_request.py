@@ -7,7 +7,7 @@ import pytest
 
 from structgstream.errors import ConfigError
 from structgstream.exporters.formats import Format, PageFormat
-from structgstream.exporters.request import check_page, checked_degree, chosen_frames, destination, is_one_file
+from structgstream.exporters.request import check_degree, check_page, choose_frames, destination, is_one_file
 
 STREAM = Path("/videos/ball.sgs")
 
@@ -45,23 +45,23 @@ def test_a_folder_that_is_there_is_a_folder_whatever_its_name(tmp_path: Path) ->
 
 def test_frames_of_a_stream_with_a_gap() -> None:
     runs, folder = [range(4), range(6, 8)], Path("out")
-    assert chosen_frames(runs, folder, frame=None, frames=None) == [0, 1, 2, 3, 6, 7]
-    assert chosen_frames(runs, folder, frame=None, frames=(1, 3)) == [1, 2, 3]
-    assert chosen_frames(runs, Path("x.ply"), frame=6, frames=None) == [6]
-    assert chosen_frames(runs, Path("x.ply"), frame=0, frames=None) == [0]
+    assert choose_frames(runs, folder, frame=None, frames=None) == [0, 1, 2, 3, 6, 7]
+    assert choose_frames(runs, folder, frame=None, frames=(1, 3)) == [1, 2, 3]
+    assert choose_frames(runs, Path("x.ply"), frame=6, frames=None) == [6]
+    assert choose_frames(runs, Path("x.ply"), frame=0, frames=None) == [0]
     for frame, frames in ((5, None), (None, (3, 6))):
         with pytest.raises(ConfigError, match="the stream has frames 0 to 3 and 6 to 7; there is no"):
-            chosen_frames(runs, folder, frame=frame, frames=frames)
+            choose_frames(runs, folder, frame=frame, frames=frames)
     with pytest.raises(ConfigError, match="no whole frame"):
-        chosen_frames([], folder, frame=None, frames=None)
+        choose_frames([], folder, frame=None, frames=None)
 
 
 def test_a_degree_is_what_the_format_can_hold() -> None:
-    assert [checked_degree(degree, "ply") for degree in (None, 0, 2)] == [None, 0, 2]
-    assert [checked_degree(degree, "splat") for degree in (None, 0)] == [0, 0]
+    assert [check_degree(degree, "ply") for degree in (None, 0, 2)] == [None, 0, 2]
+    assert [check_degree(degree, "splat") for degree in (None, 0)] == [0, 0]
     for degree in (-1, 3):
         with pytest.raises(ConfigError, match=f"--sh-degree {degree} is not one of 0 to 2"):
-            checked_degree(degree, "spz")
+            check_degree(degree, "spz")
 
 
 def test_a_page_has_no_wishes() -> None:

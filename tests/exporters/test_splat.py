@@ -11,7 +11,7 @@ from torch import Tensor
 
 from exporters.plain import picture, psnr, some
 from structgstream.errors import ConfigError
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.splat import splat_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices

@@ -15,7 +15,7 @@ import torch
 
 from exporters.plain import RIG, picture, psnr, some
 from structgstream.errors import ConfigError
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.spz import fractional_bits, spz_bytes
 from structgstream.exporters.write import write_gaussians
 

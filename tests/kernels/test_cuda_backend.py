@@ -34,7 +34,7 @@ def test_the_loss_is_the_kernels_or_says_why_not(
 def test_doctor_tells_what_the_loss_runs_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backend, "backend_reasons", lambda: {"cuda": None, "cpu": None, "reference": None})
     monkeypatch.setattr(_nvcc, "find_nvcc", lambda environment: None)
-    first = doctor.examination()["backends"][0]
+    first = doctor.diagnose()["backends"][0]
     assert first["name"] == "cuda"
     assert first["advice"].startswith("L1 and SSIM run in torch")
     assert "put nvcc on PATH" in first["advice"]

@@ -18,7 +18,7 @@ from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, nonblocking, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.prototypes import CUDA_PROTOTYPES
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 
 PROTOCOLS = {
     "rasterize": operations.Rasterize,
@@ -106,7 +106,7 @@ def test_signatures_are_the_protocols(build: Callable[[], Backend]) -> None:
 @pytest.mark.parametrize("build", BUILDERS)
 def test_a_picture_is_drawn_onto_in_its_own_memory_and_nothing_else_changes(build: Callable[[], Backend]) -> None:
     backend, camera = build(), arc_rig()["cam01"]
-    mask = torch.zeros(tiles_of(camera.width, camera.height), dtype=torch.bool)
+    mask = torch.zeros(tile_grid(camera.width, camera.height), dtype=torch.bool)
     mask[1, 1] = True
     tiles = TileSelection(mask, camera.width, camera.height)
     gaussians = random_scene(40).gaussians(camera, backend)

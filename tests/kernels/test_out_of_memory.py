@@ -15,7 +15,7 @@ from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_raster
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.anchor_types import Anchors
-from structgstream.kernels.motion_types import Neighbours, ViewFlows
+from structgstream.kernels.motion_types import Neighbors, ViewFlows
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
 Z = torch.zeros
@@ -57,7 +57,7 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         lambda: cpu_lift.lift(
             Z(1, 3),
             ViewFlows(Z(1, 1), Z(1, 1, 2), Z(1, 4, 4), Z(1, 3, 3), Z(1)),
-            Neighbours(Z(1, 1).long(), Z(1, 1)),
+            Neighbors(Z(1, 1).long(), Z(1, 1)),
             Z(1, 3),
             share=0.5,
         ),

@@ -3,7 +3,7 @@
 
 import torch
 
-from structgstream.kernels.motion_types import Neighbours, ViewFlows
+from structgstream.kernels.motion_types import Neighbors, ViewFlows
 from structgstream.kernels.reference_lift import lift, projection_jacobians
 
 MOTION = torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
@@ -30,7 +30,7 @@ def lifted(flows: torch.Tensor, weights: torch.Tensor | None = None, prior: torc
     return lift(
         centers(),
         ViewFlows(torch.full_like(flows[..., 0], 5.0) if weights is None else weights, flows, viewmats, Ks, near),
-        Neighbours(torch.arange(MOVERS)[:, None], torch.ones(MOVERS, 1, dtype=torch.float64)),
+        Neighbors(torch.arange(MOVERS)[:, None], torch.ones(MOVERS, 1, dtype=torch.float64)),
         torch.zeros(MOVERS, 3, dtype=torch.float64) if prior is None else prior,
         share=0.4,
     )

@@ -10,7 +10,7 @@ from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -209,7 +209,7 @@ def test_culling(isa: int, tiled: bool) -> None:
     viewmat = torch.eye(4)
     viewmat[:3, 3] = torch.tensor([0.2, -0.1, 1.0])
     K = torch.tensor([[90.0, 0, 50], [0, 95.0, 41], [0, 0, 1]])
-    tiles = TileSelection(torch.rand(tiles_of(101, 77)) < 0.2, 101, 77) if tiled else None
+    tiles = TileSelection(torch.rand(tile_grid(101, 77)) < 0.2, 101, 77) if tiled else None
     found = [
         module.visible_anchors(
             Anchors(*(tensor.to(dtype) for tensor in values[:5])),

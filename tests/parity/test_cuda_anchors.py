@@ -11,7 +11,7 @@ from splats import viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda_anchors, reference_anchors, reference_raster
 from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 
 M, K, D, HIDDEN = 60, 5, 12, 16
 WIDTH, HEIGHT = 53, 41
@@ -58,7 +58,7 @@ def generate(
 def test_who_is_looked_at(device: str, tiled: bool) -> None:
     """All anchors, and those that the reference does not look at say that they draw nothing."""
     values = [value.to(device) for value in tensors(distance_input=True)]
-    mask = (torch.rand(tiles_of(WIDTH, HEIGHT)) < 0.3).to(device)
+    mask = (torch.rand(tile_grid(WIDTH, HEIGHT)) < 0.3).to(device)
     tiles = TileSelection(mask, WIDTH, HEIGHT) if tiled else None
     ours, exact = (generate(module, values, tiles=tiles) for module in (cuda_anchors, reference_anchors))
     assert torch.equal(ours.anchors, torch.arange(M, device=device))

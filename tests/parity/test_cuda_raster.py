@@ -16,7 +16,7 @@ from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, reference_raster
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.operations import Rasterize
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
 
 WIDTH, HEIGHT, NEAR, COUNT = 41, 35, 0.2, 30
 PAIRS = 700
@@ -131,7 +131,7 @@ def run(rasterize: Rasterize, values: list[Tensor], **options) -> tuple[list[Ten
 
 
 def asked(device: str) -> TileSelection:
-    mask = torch.ones(tiles_of(WIDTH, HEIGHT), dtype=torch.bool, device=device)
+    mask = torch.ones(tile_grid(WIDTH, HEIGHT), dtype=torch.bool, device=device)
     mask[0, 1] = mask[2, 0] = False
     return TileSelection(mask, WIDTH, HEIGHT)
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_ssim, cuda_ssim, reference_ssim
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 Loss = Callable[..., tuple[Tensor, Tensor]]
@@ -101,7 +101,7 @@ def test_value_and_gradient(loss: Loss, size: tuple[int, int], as_bytes: bool) -
 def test_a_corrected_picture_and_some_of_its_tiles(loss: Loss, tiled: bool) -> None:
     image, target = pictures(75, 110, as_bytes=True)
     gains, biases = torch.tensor([1.1, 0.9, 1.05]), torch.tensor([0.02, -0.03, 0.01])
-    tiles = TileSelection(torch.rand(tiles_of(110, 75)) < 0.3, 110, 75) if tiled else None
+    tiles = TileSelection(torch.rand(tile_grid(110, 75)) < 0.3, 110, 75) if tiled else None
     l1, ssim, gradient = value_and_gradient(loss, image, target, (1.0, -0.2), gains=gains, biases=biases, tiles=tiles)
     exact_options = {"gains": gains.double(), "biases": biases.double()}
     oracle = partial(value_and_gradient, reference_ssim.l1_ssim, image.double(), target, (1.0, -0.2), **exact_options)
@@ -115,7 +115,7 @@ def test_a_corrected_picture_and_some_of_its_tiles(loss: Loss, tiled: bool) -> N
 @pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 def test_tiles_mean_the_same_as_on_the_cpu(loss: Loss) -> None:
     image, target = pictures(60, 90, as_bytes=True)
-    tiles = TileSelection(torch.zeros(tiles_of(90, 60), dtype=torch.bool), 90, 60)
+    tiles = TileSelection(torch.zeros(tile_grid(90, 60), dtype=torch.bool), 90, 60)
     tiles.mask[1, 2] = tiles.mask[3, 5] = True
     ours = value_and_gradient(loss, image, target, (1.0, -0.2), tiles=tiles)
     theirs = value_and_gradient(cpu_ssim.l1_ssim, image, target, (1.0, -0.2), tiles=tiles)
@@ -124,7 +124,7 @@ def test_tiles_mean_the_same_as_on_the_cpu(loss: Loss) -> None:
 
 def test_no_gradient_is_asked_for(loss: Loss) -> None:
     image, target = pictures(40, 40)
-    tiles = TileSelection(torch.rand(tiles_of(40, 40)) < 0.5, 40, 40)
+    tiles = TileSelection(torch.rand(tile_grid(40, 40)) < 0.5, 40, 40)
     with torch.no_grad():
         for chosen in (None, tiles):
             l1, ssim = loss(image, target, tiles=chosen)
@@ -148,7 +148,7 @@ def test_repeats_bit_for_bit(loss: Loss) -> None:
 
 def test_within_a_phase_threads_may_run_in_any_order(emulation: Callable[[int], cuda_ssim.LossLibrary]) -> None:
     image, target = pictures(45, 120)
-    tiles = TileSelection(torch.rand(tiles_of(120, 45)) < 0.5, 120, 45)
+    tiles = TileSelection(torch.rand(tile_grid(120, 45)) < 0.5, 120, 45)
     forth, back = (
         value_and_gradient(partial(cuda_ssim.l1_ssim, emulation(order)), image, target, (0.8, -0.2), tiles=tiles)
         for order in (0, 1)

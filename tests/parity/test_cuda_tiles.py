@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels.cuda_tiles import PairBudget, tile_lists, with_enough_room
-from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
+from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget, tile_lists
+from structgstream.kernels.raster_types import TILE_PIXELS, tile_grid
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
 
@@ -27,7 +27,7 @@ def splats(count: int, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]
 
 def expected(means2d: Tensor, radii: Tensor, depths: Tensor, width: int, height: int) -> list[list[int]]:
     """Each tile's list, as gsplat defines it."""
-    rows, columns = tiles_of(width, height)
+    rows, columns = tile_grid(width, height)
     lists: list[list[int]] = [[] for _ in range(rows * columns)]
     drawn = [i for i in range(len(depths)) if (radii[i] > 0).all()]
     for i in sorted(drawn, key=lambda i: (float(depths[i]), i)):
@@ -59,7 +59,7 @@ def test_each_tile_lists_its_gaussians_front_to_back(device: str, size: tuple[in
     assert count > 20
     for capacity in (count, count + 500):
         lists = tile_lists(*(value.to(device) for value in values), width=width, height=height, capacity=capacity)
-        rows, columns = tiles_of(width, height)
+        rows, columns = tile_grid(width, height)
         assert lists.starts.shape == (rows + 1, columns)
         assert lists.starts.dtype == lists.ids.dtype == torch.int32
         assert int(lists.needed) == count
@@ -110,7 +110,7 @@ def test_work_that_was_short_of_room_is_done_again() -> None:
         budget.needed.fill_(100)
         return "done"
 
-    assert with_enough_room(work, capacity=30, device=torch.device("cpu")) == "done"
+    assert run_with_pair_budget(work, capacity=30, device=torch.device("cpu")) == "done"
     assert capacities == [30, 170]
-    assert with_enough_room(work, capacity=100, device=torch.device("cpu")) == "done"
+    assert run_with_pair_budget(work, capacity=100, device=torch.device("cpu")) == "done"
     assert capacities == [30, 170, 100]

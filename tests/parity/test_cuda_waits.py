@@ -16,8 +16,8 @@ from splats import viewport_of
 from structgstream.kernels import cuda_adam, cuda_anchors, reference_anchors
 from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights
 from structgstream.kernels.cuda_tiles import tile_lists
-from structgstream.kernels.raster_types import TileSelection, tiles_of
-from structgstream.kernels.reference_raster import reaching
+from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.reference_raster import boxes_reaching_tiles
 
 VIEW = viewport_of(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 20], [0, 0, 1]]), width=40, height=40, near=0.1)
 WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2", "unique_dim")
@@ -48,7 +48,7 @@ def anchors(m: int = 30, k: int = 3, d: int = 5) -> tuple[list[Tensor], MLPWeigh
 @pytest.mark.parametrize("tiled", [False, True])
 def test_seeing_and_dressing_anchors(tiled: bool) -> None:
     values, mlps = anchors()
-    tiles = TileSelection(torch.rand(tiles_of(40, 40)) < 0.5, 40, 40) if tiled else None
+    tiles = TileSelection(torch.rand(tile_grid(40, 40)) < 0.5, 40, 40) if tiled else None
     with NoWaiting():
         g = cuda_anchors.generate_structured(Anchors(*values), mlps, VIEW, distance_input=True, tiles=tiles).gaussians
         total = g.means.sum() + g.quats.sum() + g.scales.sum() + g.opacities.sum() + g.colors.sum()
@@ -57,12 +57,12 @@ def test_seeing_and_dressing_anchors(tiled: bool) -> None:
 
 def test_tile_lists_and_masks_of_pixels() -> None:
     means2d, radii = torch.rand(50, 2) * 60, torch.randint(0, 9, (50, 2), dtype=torch.int32)
-    depths, tiles = torch.rand(50), TileSelection(torch.rand(tiles_of(60, 60)) < 0.5, 60, 60)
+    depths, tiles = torch.rand(50), TileSelection(torch.rand(tile_grid(60, 60)) < 0.5, 60, 60)
     low, high = torch.rand(50, 2) * 30, torch.rand(50, 2) * 60
     with NoWaiting():
         tile_lists(means2d, radii, depths, width=60, height=60, capacity=900)
         tiles.pixels()
-        reaching(low, high, tiles)
+        boxes_reaching_tiles(low, high, tiles)
 
 
 def test_the_optimiser() -> None:

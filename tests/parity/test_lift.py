@@ -6,7 +6,7 @@ import torch
 
 from structgstream.kernels import cpu_lift, reference_lift
 from structgstream.kernels._load import native_library, native_reason
-from structgstream.kernels.motion_types import Lifted, Neighbours, ViewFlows
+from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -54,7 +54,7 @@ def single(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 def lifted(module, given: dict[str, torch.Tensor]) -> Lifted:
     seen = ViewFlows(*(given[name] for name in ViewFlows._fields))
-    around = Neighbours(given["neighbours"], given["affinities"])
+    around = Neighbors(given["neighbours"], given["affinities"])
     return module.lift(given["centers"], seen, around, given["priors"], share=0.4)
 
 

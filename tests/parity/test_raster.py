@@ -14,7 +14,7 @@ from splats import splats_of, viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cpu_raster, cuda, reference_raster
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 from structgstream.kernels.reference_raster import rasterize as reference
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
@@ -193,7 +193,7 @@ def test_another_precision_is_refused_with_a_way_out() -> None:
 
 
 def some_tiles() -> TileSelection:
-    mask = torch.zeros(tiles_of(WIDTH, HEIGHT), dtype=torch.bool)
+    mask = torch.zeros(tile_grid(WIDTH, HEIGHT), dtype=torch.bool)
     mask[0, 1] = mask[2, 2] = mask[2, 3] = mask[3, 4] = True
     return TileSelection(mask, WIDTH, HEIGHT)
 

@@ -9,7 +9,7 @@ from published import published_ssim
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_ssim, reference_ssim
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -92,7 +92,7 @@ def test_a_corrected_picture_and_some_of_its_tiles(isa: int, as_bytes: bool, til
     if as_bytes:
         target = (target * 255).round().to(torch.uint8)
     gains, biases = torch.tensor([1.1, 0.9, 1.05]), torch.tensor([0.02, -0.03, 0.01])
-    tiles = TileSelection(torch.rand(tiles_of(310, 75)) < 0.4, 310, 75) if tiled else None
+    tiles = TileSelection(torch.rand(tile_grid(310, 75)) < 0.4, 310, 75) if tiled else None
 
     def run(module, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x = x.clone().requires_grad_()
@@ -123,7 +123,7 @@ def run_whole(image: Tensor, target: Tensor, gains: Tensor, biases: Tensor) -> T
 
 def test_tiles_do_not_depend_on_threads() -> None:
     image, target = pictures(90, 200)
-    tiles = TileSelection(torch.rand(tiles_of(200, 90)) < 0.5, 200, 90)
+    tiles = TileSelection(torch.rand(tile_grid(200, 90)) < 0.5, 200, 90)
     results = []
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)

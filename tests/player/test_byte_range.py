@@ -3,7 +3,7 @@
 
 import pytest
 
-from structgstream.player.byte_range import UnsatisfiableRange, asked_bytes
+from structgstream.player.byte_range import UnsatisfiableRange, requested_range
 
 SIZE = 1000
 
@@ -22,19 +22,19 @@ SIZE = 1000
     ],
 )
 def test_ranges(header: str, expected: range) -> None:
-    assert asked_bytes(header, SIZE) == expected
+    assert requested_range(header, SIZE) == expected
 
 
 @pytest.mark.parametrize("header", ["bytes=1000-", "bytes=1000-1001", "bytes=-0", "bytes=999999999999999999-"])
 def test_nothing_of_it_is_there(header: str) -> None:
     with pytest.raises(UnsatisfiableRange):
-        asked_bytes(header, SIZE)
+        requested_range(header, SIZE)
 
 
 @pytest.mark.parametrize("header", ["bytes=0-", "bytes=-5", "bytes=0-0"])
 def test_an_empty_file_has_no_range(header: str) -> None:
     with pytest.raises(UnsatisfiableRange):
-        asked_bytes(header, 0)
+        requested_range(header, 0)
 
 
 @pytest.mark.parametrize(
@@ -56,4 +56,4 @@ def test_an_empty_file_has_no_range(header: str) -> None:
     ],
 )
 def test_what_counts_as_no_range(header: str | None) -> None:
-    assert asked_bytes(header, SIZE) is None
+    assert requested_range(header, SIZE) is None

@@ -9,7 +9,7 @@ from streams import small_stream
 from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StreamError
-from structgstream.player.stream_file import PIECE_BYTES, StreamFile, check_begun, pieces
+from structgstream.player.stream_file import PIECE_BYTES, StreamFile, check_has_header, pieces
 
 STREAM = small_stream()
 HEADER_BYTES = StreamReader(STREAM).header_bytes
@@ -21,10 +21,10 @@ def file(tmp_path: Path) -> StreamFile:
 
 
 def test_it_begins_with_its_header_and_is_complete_with_its_footer(file: StreamFile) -> None:
-    assert not file.has_begun()
+    assert not file.has_header()
     for length in (0, 5, 12, 13, HEADER_BYTES - 1, HEADER_BYTES, HEADER_BYTES + 3, len(STREAM) - 1, len(STREAM)):
         file.path.write_bytes(STREAM[:length])
-        assert file.has_begun() == (length >= HEADER_BYTES)
+        assert file.has_header() == (length >= HEADER_BYTES)
         assert file.state() == (length, length == len(STREAM))
 
 
@@ -58,7 +58,7 @@ def test_what_cannot_be_shown_is_told(file: StreamFile, data: bytes, words: str)
     with pytest.raises(StreamError, match=words):
         file.check()
     with pytest.raises(StreamError, match=words):
-        check_begun(data, "memory")
+        check_has_header(data, "memory")
 
 
 def test_a_missing_file_is_told(file: StreamFile) -> None:

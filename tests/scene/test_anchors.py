@@ -6,7 +6,7 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.kernels.anchor_types import Anchors
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 from structgstream.kernels.reference_anchors import activate_anchors
 from structgstream.scene.render import draw
 
@@ -23,20 +23,20 @@ def test_culling_never_changes_a_pixel() -> None:
             anchors, scene.mlps, camera.center.float(), torch.arange(300), distance_input=True
         )
         culled = draw(scene.gaussians(camera, backend), camera, backend)
-        full = draw(scene.dressed(everything), camera, backend)
+        full = draw(scene.with_free_gaussians(everything), camera, backend)
         assert torch.allclose(culled.image, full.image, atol=1e-6)
 
 
 def test_culling_for_tiles_never_changes_a_pixel_in_them() -> None:
     scene, backend = random_scene(300, seed=3), reference_backend()
     for camera in list(arc_rig(radius=0.6).cameras.values()):
-        mask = torch.zeros(tiles_of(camera.width, camera.height), dtype=torch.bool)
+        mask = torch.zeros(tile_grid(camera.width, camera.height), dtype=torch.bool)
         mask[-1, 1] = True
         tiles = TileSelection(mask, camera.width, camera.height)
         culled = scene.structured(camera, backend, tiles=tiles)
         assert len(culled.anchors) < len(scene.structured(camera, backend).anchors)
         inside = tiles.pixels()
-        part = draw(scene.dressed(culled), camera, backend).image[inside]
+        part = draw(scene.with_free_gaussians(culled), camera, backend).image[inside]
         assert torch.allclose(part, draw(scene.gaussians(camera, backend), camera, backend).image[inside], atol=1e-6)
 
 

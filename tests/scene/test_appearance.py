@@ -45,9 +45,9 @@ def test_baked_it_looks_the_same() -> None:
     dressed = with_appearance(random_scene(free=3), 4)
     appearance = torch.randn(len(dressed.anchors), 4, generator=torch.Generator().manual_seed(0))
     changed = replace(dressed, anchors=replace(dressed.anchors, appearance=appearance))
-    baked = changed.baked()
-    assert torch.equal(baked.features, changed.features)
-    assert baked.appearance_basis is None
-    assert baked.anchors.appearance is None
+    folded = changed.with_folded_appearance()
+    assert torch.equal(folded.features, changed.features)
+    assert folded.appearance_basis is None
+    assert folded.anchors.appearance is None
     plain = random_scene()
-    assert plain.baked() is plain
+    assert plain.with_folded_appearance() is plain

@@ -6,24 +6,24 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.scene.order import in_space_order, morton_cells, morton_keys, space_order
+from structgstream.scene.order import in_morton_order, morton_cells, morton_keys, morton_order
 from structgstream.scene.render import draw
 from structgstream.scene.state import state_of
 
 
 def test_a_cube_is_walked_through_octant_by_octant() -> None:
     corners = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    walked = corners[space_order(corners)]
+    walked = corners[morton_order(corners)]
     assert walked.tolist() == [[float(n & 1), float(n >> 1 & 1), float(n >> 2 & 1)] for n in range(8)]
 
 
 def test_order_does_not_depend_on_scale_place_or_the_order_before() -> None:
     g = torch.Generator().manual_seed(2)
     points = torch.randn(300, 3, generator=g)
-    ordered = points[space_order(points)]
+    ordered = points[morton_order(points)]
     shuffled = points[torch.randperm(300, generator=g)]
-    assert torch.equal(shuffled[space_order(shuffled)], ordered)
-    assert torch.equal((points * 8)[space_order(points * 8)], ordered * 8)
+    assert torch.equal(shuffled[morton_order(shuffled)], ordered)
+    assert torch.equal((points * 8)[morton_order(points * 8)], ordered * 8)
 
 
 def test_neighbours_in_memory_are_neighbours_in_space() -> None:
@@ -32,7 +32,7 @@ def test_neighbours_in_memory_are_neighbours_in_space() -> None:
     def step(positions: torch.Tensor) -> float:
         return float((positions[1:] - positions[:-1]).norm(dim=1).mean())
 
-    assert step(points[space_order(points)]) < 0.2 * step(points)
+    assert step(points[morton_order(points)]) < 0.2 * step(points)
 
 
 def test_keys_and_cells() -> None:
@@ -46,35 +46,35 @@ def test_the_order_of_a_grid() -> None:
     g = torch.Generator().manual_seed(4)
     cells = torch.randint(-4, 6, (500, 3), generator=g)
     positions = cells * 0.37 + (torch.rand(500, 3, generator=g) - 0.5) * 0.3
-    order = space_order(positions, step=0.37)
+    order = morton_order(positions, step=0.37)
     keys = morton_keys(cells - cells.min(0).values)
     assert (keys[order].diff() >= 0).all()
     same = keys[order].diff() == 0
     assert same.any()
     assert (order.diff()[same] > 0).all(), "ties stay as they were"
-    assert torch.equal(space_order(positions, step=1e-9), space_order(positions)), "cells cannot be as small"
+    assert torch.equal(morton_order(positions, step=1e-9), morton_order(positions)), "cells cannot be as small"
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.ones(1, 3), torch.ones(5, 3), torch.full((3, 3), -1e30)])
 def test_nothing_one_and_many_of_the_same(points: torch.Tensor) -> None:
-    assert space_order(points).tolist() == [*range(len(points))]
-    assert space_order(points, step=0.5).tolist() == [*range(len(points))]
+    assert morton_order(points).tolist() == [*range(len(points))]
+    assert morton_order(points, step=0.5).tolist() == [*range(len(points))]
 
 
 def test_the_picture_stays() -> None:
     scene, rig, backend = random_scene(60, seed=5), arc_rig(4), reference_backend()
-    ordered = in_space_order(scene)
+    ordered = in_morton_order(scene)
     assert not torch.equal(ordered.anchors.positions, scene.anchors.positions)
     for name in rig:
         one, other = (draw(s.gaussians(rig[name], backend), rig[name], backend).image for s in (scene, ordered))
         assert one.max() > 0.1
         torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
-    order = space_order(scene.anchors.positions)
+    order = morton_order(scene.anchors.positions)
     for name in ("anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "anchor_features"):
         assert torch.equal(state_of(ordered)[name], state_of(scene)[name][order])
-    assert torch.equal(in_space_order(ordered).anchors.features, ordered.anchors.features)
+    assert torch.equal(in_morton_order(ordered).anchors.features, ordered.anchors.features)
 
 
 def test_free_gaussians_must_come_later() -> None:
     with pytest.raises(AssertionError, match="ids of free Gaussians"):
-        in_space_order(replace(random_scene(5), free=random_scene(1, free=2).free))
+        in_morton_order(replace(random_scene(5), free=random_scene(1, free=2).free))

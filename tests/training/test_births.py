@@ -7,7 +7,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
-from structgstream.training.births import BirthConfig, Missing, blamed, born, missing_in
+from structgstream.training.births import BirthConfig, ViewResidual, blamed_mask, sweep_births, view_residual
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
 from worlds import moving_world
@@ -18,12 +18,14 @@ VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 
 
 def test_blame_takes_two_views_and_half_of_those_that_see() -> None:
-    cover = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
+    coverage = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
     wrong = torch.tensor([[6.0, 6, 6, 6], [6, 0, 6, 0.1], [0, 0, 6, 0.1], [0, 0, 0, 0.1]])
-    found = blamed(cover, wrong, least_pixels=0.3, config=CONFIG)
+    found = blamed_mask(coverage, wrong, least_pixels=0.3, config=CONFIG)
     # Two of four; one of three; three of four; one, since the others do not see it.
     assert found.tolist() == [True, False, True, False]
-    assert not blamed(cover, 0.5 * cover, least_pixels=0.3, config=CONFIG).any(), "half is not more than half"
+    assert not blamed_mask(coverage, 0.5 * coverage, least_pixels=0.3, config=CONFIG).any(), (
+        "half is not more than half"
+    )
 
 
 def spoiled(view: View) -> torch.Tensor:
@@ -35,25 +37,25 @@ def spoiled(view: View) -> torch.Tensor:
 
 def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:
     view = VIEWS[1]
-    none = missing_in(view.colors, view, floor=None, config=CONFIG)
+    none = view_residual(view.colors, view, floor=None, config=CONFIG)
     assert not none.wrong.any()
-    assert not none.share.any()
-    found = missing_in(spoiled(view), view, floor=None, config=CONFIG)
+    assert not none.missing_share.any()
+    found = view_residual(spoiled(view), view, floor=None, config=CONFIG)
     inner = (view.colors[20:32, 30:42] - 0.5).abs().mean(-1) > 0.2  # grey has no opposite
     assert found.wrong[20:32, 30:42][inner].all()
-    assert not found.share[:15].any()
+    assert not found.missing_share[:15].any()
     floor = ResidualFloor(1.0, {view.index: torch.full((64, 96), 1.0)})
-    assert not missing_in(spoiled(view), view, floor=floor, config=CONFIG).share.any()
+    assert not view_residual(spoiled(view), view, floor=floor, config=CONFIG).missing_share.any()
 
 
 def test_pictures_are_looked_at_in_the_width_that_is_asked_for() -> None:
-    found = missing_in(VIEWS[0].colors, VIEWS[0], floor=None, config=replace(CONFIG, picture_width=48))
+    found = view_residual(VIEWS[0].colors, VIEWS[0], floor=None, config=replace(CONFIG, picture_width=48))
     assert (found.view.camera.width, found.view.camera.height) == (48, 32)
-    assert found.share.shape == (32, 48)
+    assert found.missing_share.shape == (32, 48)
 
 
 def test_without_anything_missing_nothing_is_born() -> None:
-    views = [Missing(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
+    views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
-    assert not len(born(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend()))
+    assert not len(sweep_births(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend()))

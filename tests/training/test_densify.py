@@ -29,9 +29,9 @@ def prepared():
 
 def test_schedule() -> None:
     densifier = prepared()[2]
-    assert [i for i in range(12) if densifier.due(i)] == [5, 10]
+    assert [i for i in range(12) if densifier.is_due(i)] == [5, 10]
     late = scheduled(GrowthConfig(start=5, stop=9, interval=3), iterations=20)
-    assert [i for i in range(20) if late.due(i)] == [6, 9]
+    assert [i for i in range(20) if late.is_due(i)] == [6, 9]
     assert not late.collects(500)
 
 
@@ -41,7 +41,7 @@ def scheduled(config: GrowthConfig, *, iterations: int) -> Densifier:
 
 def test_nothing_grows_that_is_not_fitted() -> None:
     paper = scheduled(GrowthConfig(), iterations=4000)
-    due = [i for i in range(4001) if paper.due(i)]
+    due = [i for i in range(4001) if paper.is_due(i)]
     assert (due[0], due[-1], len(due)) == (1600, 3900, 24)
     assert paper.collects(3900)
     assert not paper.collects(3901)  # Nobody would ask.
@@ -92,11 +92,11 @@ def test_who_hardly_contributes_goes_from_every_table() -> None:
     _, parameters, densifier, adam = prepared()
     config = replace(CONFIG, least_contribution=0.2, contribution_at=(7,))
     densifier = replace(densifier, config=config)
-    assert [i for i in range(20) if densifier.judges(i)] == [7]
-    assert not replace(densifier, config=CONFIG).judges(7)
+    assert [i for i in range(20) if densifier.prunes_by_contribution(i)] == [7]
+    assert not replace(densifier, config=CONFIG).prunes_by_contribution(7)
     shares = torch.ones(30)
     shares[:6] = 0.1
-    assert densifier.judge(shares, adam) == densifier.pruned == 6
+    assert densifier.prune_by_contribution(shares, adam) == densifier.pruned == 6
     assert densifier.grown == 0
     for name in ANCHOR_ROWS:
         assert len(parameters.values[name]) == len(adam.first[name]) == 24

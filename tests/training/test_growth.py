@@ -6,7 +6,7 @@ import torch
 from rigs import random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import StructuredGaussians
-from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
+from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable_mask
 
 VOXEL = 0.01
 
@@ -115,7 +115,7 @@ def test_transparent_anchors_go_once_they_were_seen_enough() -> None:
     for step in range(81):
         visible = torch.tensor([0, 1, 2]) if step else torch.tensor([0, 1])
         statistics.add(StructuredGaussians(none, visible, raw[: len(visible)]))
-    assert prunable(statistics, GrowthConfig()).tolist() == [
+    assert prunable_mask(statistics, GrowthConfig()).tolist() == [
         True,
         False,
         False,

@@ -11,9 +11,9 @@ from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.state import state_of
-from structgstream.training.disturbance import DisturbanceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
+from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.seeding import voxel_centers
 from structgstream.training.solidity import SolidityConfig
 from worlds import moving_world, psnr, rendered
@@ -88,7 +88,7 @@ def test_solid_surfaces_and_few_anchors() -> None:
     world = moving_world(1)
     config = replace(
         QUICK,
-        disturbance=DisturbanceConfig(view_noise=0.1),
+        disturbance=PerturbationConfig(view_noise=0.1),
         solidity=SolidityConfig(weight=0.05),
         growth=replace(QUICK.growth, least_contribution=0.3, contribution_at=(60,)),
     )

@@ -4,7 +4,7 @@
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.lifting import LiftConfig, lifted_motion
+from structgstream.training.lifting import LiftConfig, lift_motion
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import training_views
 from worlds import World, moving_world
@@ -34,7 +34,7 @@ def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
 
     def lengths(bandwidth: float) -> tuple[float, float]:
         config = LiftConfig(color_bandwidth=bandwidth)
-        found = lifted_motion(
+        found = lift_motion(
             evidence_of(colors, flows, len(views)), centers, torch.zeros(40, 3), views, config=config, backend=BACKEND
         ).displacements.norm(dim=1)
         return float(found[ball].mean()), float(found[~ball].mean())
@@ -50,6 +50,6 @@ def test_without_evidence_movers_follow_their_priors() -> None:
     views = training_views(scenery.frames[1], scenery.rig, CPU)
     nothing = MotionEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2), torch.zeros(4, 3))
     priors = torch.rand(4, 3)
-    found = lifted_motion(nothing, torch.zeros(4, 3), priors, views, config=LiftConfig(), backend=BACKEND)
+    found = lift_motion(nothing, torch.zeros(4, 3), priors, views, config=LiftConfig(), backend=BACKEND)
     assert torch.equal(found.displacements, priors)
     assert not found.lifted.any()

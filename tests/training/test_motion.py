@@ -9,7 +9,7 @@ from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, changed_since
+from structgstream.training.motion import MotionConfig, changed_movers
 from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
@@ -46,13 +46,13 @@ def test_one_view_is_not_enough() -> None:
 def test_each_view_tells_which_gaussians_it_shows() -> None:
     backend, found = reference_backend(), moving()
     views = training_views(WORLD.frames[1], WORLD.rig, CPU)
-    assert found.shown.keys() == {view.index for view in views}
+    assert found.visible.keys() == {view.index for view in views}
     for view in views:
         drawn = torch.zeros(60 * 5, dtype=torch.bool)
         drawn[WORLD.scene.gaussians(view.camera, backend).ids] = True
-        shown = found.shown[view.index]
-        assert 0 < shown.sum() < drawn.sum()  # Some are hidden behind others.
-        assert not shown[~drawn].any()
+        visible = found.visible[view.index]
+        assert 0 < visible.sum() < drawn.sum()  # Some are hidden behind others.
+        assert not visible[~drawn].any()
 
 
 def test_what_most_views_see_unchanged_stays() -> None:
@@ -93,7 +93,7 @@ def test_what_changed_is_told_by_row_and_by_birth() -> None:
     older = random_scene(6, free=4)
     births = torch.tensor([1, 4, 6, 9])
     older = replace(older, free=replace(older.free, births=births))
-    assert not changed_since(older, older).any()
+    assert not changed_movers(older, older).any()
     scales = older.anchors.log_base_scales.clone()
     scales[3, 2] += 0.1
     # One died, one is new, one has another colour.
@@ -102,7 +102,7 @@ def test_what_changed_is_told_by_row_and_by_birth() -> None:
     colors[2] += 0.1
     free = replace(free, colors=colors).append(replace(free.select(torch.tensor([0])), births=torch.tensor([12])))
     scene = replace(older, anchors=replace(older.anchors, log_base_scales=scales), free=free)
-    assert changed_since(older, scene).nonzero()[:, 0].tolist() == [3, 6 + 2, 6 + 3]
+    assert changed_movers(older, scene).nonzero()[:, 0].tolist() == [3, 6 + 2, 6 + 3]
 
 
 def test_free_gaussians_that_no_view_shows_are_gone() -> None:
@@ -121,6 +121,6 @@ def test_free_gaussians_that_no_view_shows_are_gone() -> None:
     found = moved_since(scene, views, views, config=config, backend=reference_backend())
     assert found.unseen.tolist() == [False, True, True]
     part = Partition.of(scene, found)
-    assert part.together(part.moving).free.births.tolist() == [1]
+    assert part.merge(part.moving).free.births.tolist() == [1]
     kept = moved_since(scene, views, views, config=CONFIG, backend=reference_backend())
     assert not kept.unseen.any()

@@ -5,7 +5,12 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
-from structgstream.training.motion_start import MotionStartConfig, displaced, flow_views, started
+from structgstream.training.motion_start import (
+    MotionStartConfig,
+    estimate_initial_motion,
+    flow_views,
+    with_displacements,
+)
 from structgstream.training.partition import Partition
 from structgstream.training.views import training_views
 from worlds import World, moved_since, moving_world
@@ -23,36 +28,36 @@ def world() -> World:
 def begun(scenery: World, *, rounds: int = 2, enabled: bool = True):
     config = MotionStartConfig(enabled=enabled, rounds=rounds)
     views, before = (training_views(scenery.frames[t], scenery.rig, CPU) for t in (1, 0))
-    which = moved_since(
+    segmentation = moved_since(
         scenery.scene, views, before, config=MOTION, backend=BACKEND, flow_from=flow_views(views, 1, config)
     )
-    partition = Partition.of(scenery.scene, which)
-    priors = torch.zeros(len(which.movers), 3)
-    return partition, started(partition, views, priors, config=config, motion=MOTION, backend=BACKEND)
+    partition = Partition.of(scenery.scene, segmentation)
+    priors = torch.zeros(len(segmentation.movers), 3)
+    return partition, estimate_initial_motion(partition, views, priors, config=config, motion=MOTION, backend=BACKEND)
 
 
 def test_anchors_begin_near_where_they_have_gone() -> None:
     partition, start = begun(world())
-    assert start.lifted > 0.5 * len(start.displacements)
+    assert start.lifted_count > 0.5 * len(start.displacements)
     moved = start.displacements.median(0).values
     assert abs(float(moved[0]) - SPEED) < 0.35 * SPEED
     assert moved[1:].abs().max() < 0.35 * SPEED
-    assert start.places, "it shows somewhere"
+    assert start.focuses, "it shows somewhere"
     assert len(start.displacements) == len(partition.moving.anchors)
 
 
 def test_the_second_round_acts() -> None:
     once, twice = (begun(world(), rounds=rounds)[1] for rounds in (1, 2))
-    assert once.corrected == 0
-    assert twice.corrected > 0
+    assert once.corrected_count == 0
+    assert twice.corrected_count > 0
     assert not torch.equal(once.displacements, twice.displacements)
 
 
 def test_off_everything_begins_where_its_prior_says() -> None:
     _, start = begun(world(), enabled=False)
     assert not start.displacements.any()
-    assert start.lifted == start.corrected == 0
-    assert start.places
+    assert start.lifted_count == start.corrected_count == 0
+    assert start.focuses
 
 
 def test_the_start_is_repeated_bit_for_bit() -> None:
@@ -62,7 +67,7 @@ def test_the_start_is_repeated_bit_for_bit() -> None:
 def test_displaced_moves_anchors_and_free_gaussians() -> None:
     scene = world().scene
     by = torch.arange(3.0 * len(scene.anchors)).reshape(-1, 3)
-    assert torch.equal(displaced(scene, by).anchors.positions, scene.anchors.positions + by)
+    assert torch.equal(with_displacements(scene, by).anchors.positions, scene.anchors.positions + by)
 
 
 def test_flow_is_looked_for_in_turns_where_there_are_many_views() -> None:

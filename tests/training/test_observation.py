@@ -8,7 +8,7 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.observation import by_mover, flow_evidence, gathered, mover_centers, slots_of
+from structgstream.training.observation import flow_evidence, gather_maps, mover_centers, slot_count, sum_by_mover
 from worlds import emerging_ball
 
 RIG = arc_rig(4, width=48, height=32)
@@ -19,9 +19,9 @@ BACKEND = reference_backend()
 def test_movers_are_anchors_then_free_gaussians() -> None:
     scene = random_scene(4, free=2)
     k = scene.anchors.offsets_per_anchor
-    assert slots_of(scene) == 4 * k + 2
-    sums = torch.arange(float(slots_of(scene)))[:, None]
-    found = by_mover(sums, scene)[:, 0]
+    assert slot_count(scene) == 4 * k + 2
+    sums = torch.arange(float(slot_count(scene)))[:, None]
+    found = sum_by_mover(sums, scene)[:, 0]
     assert found.tolist() == [sum(range(i * k, i * k + k)) for i in range(4)] + [4 * k, 4 * k + 1]
 
 
@@ -29,11 +29,11 @@ def test_gathered_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_fro
     scene = random_scene(30, free=3)
     gaussians = scene.gaussians(CAMERA, BACKEND)
     maps = torch.ones(32, 48, 1)
-    alone = gathered(gaussians, scene, CAMERA, maps, BACKEND)
-    assert alone.shape == (slots_of(scene), 1)
+    alone = gather_maps(gaussians, scene, CAMERA, maps, BACKEND)
+    assert alone.shape == (slot_count(scene), 1)
     ball = emerging_ball(0.99)
     before = replace(ball, means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
-    covered = gathered(gaussians, scene, CAMERA, maps, BACKEND, still=before)
+    covered = gather_maps(gaussians, scene, CAMERA, maps, BACKEND, still=before)
     assert covered.shape == alone.shape, "what hides is not told of"
     assert float(covered.sum()) < 0.8 * float(alone.sum())
     assert (covered <= alone + 1e-4).all()
@@ -57,9 +57,9 @@ def test_evidence_is_a_mean_with_bounds() -> None:
 def test_a_mover_is_where_its_gaussians_are_seen() -> None:
     scene = random_scene(2, free=1)
     anchors, k = scene.anchors, scene.anchors.offsets_per_anchor
-    cover = torch.zeros(2 * k + 1)
-    cover[3] = 5.0  # of the first anchor only its fourth Gaussian shows, of the second none
-    found = mover_centers(scene, cover)
+    coverage = torch.zeros(2 * k + 1)
+    coverage[3] = 5.0  # of the first anchor only its fourth Gaussian shows, of the second none
+    found = mover_centers(scene, coverage)
     fourth = anchors.positions[0] + anchors.offsets[0, 3] * anchors.log_offset_scales[0].exp()
     torch.testing.assert_close(found[0], fourth)
     torch.testing.assert_close(found[1], anchors.positions[1])

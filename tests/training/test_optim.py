@@ -4,12 +4,12 @@ import torch
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.optim import BETAS, EPS, Adam, Rate, constant, leaves
+from structgstream.training.optim import BETAS, EPS, Adam, LearningRate, constant, leaves
 from structgstream.training.parameters import Parameters
 
 
 def test_rates_are_log_linear() -> None:
-    rate = Rate(1e-2, 1e-4)
+    rate = LearningRate(1e-2, 1e-4)
     assert rate.at(0.0) == pytest.approx(1e-2)
     assert rate.at(0.5) == pytest.approx(1e-3)
     assert rate.at(2.0) == pytest.approx(1e-4)

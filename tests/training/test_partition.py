@@ -14,10 +14,10 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.training.losses import LossWeights
-from structgstream.training.motion import SHARED_FIELDS, MotionConfig, Moving
+from structgstream.training.motion import SHARED_FIELDS, MotionConfig, MotionSegmentation
 from structgstream.training.optimize import gradients_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
-from structgstream.training.partition import Partition, focuses
+from structgstream.training.partition import Partition, focus_views
 from structgstream.training.step import view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import training_views
@@ -35,7 +35,9 @@ def some(scene=SCENE) -> Partition:
     anchors[[3, 17]] = True
     free = torch.arange(len(scene.free)) == 5
     slots = torch.ones(len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free), dtype=torch.bool)
-    return Partition.of(scene, Moving(anchors, free, torch.zeros_like(free), {view.index: slots for view in VIEWS}))
+    return Partition.of(
+        scene, MotionSegmentation(anchors, free, torch.zeros_like(free), {view.index: slots for view in VIEWS})
+    )
 
 
 def test_the_parts_make_the_whole_again() -> None:
@@ -43,7 +45,7 @@ def test_the_parts_make_the_whole_again() -> None:
     assert len(partition.moving.anchors) == 2
     assert len(partition.moving.anchors) + len(partition.still.anchors) == 60
     assert len(partition.moving.free) + len(partition.still.free) == 8
-    before, after = state_of(SCENE), state_of(partition.together(partition.moving))
+    before, after = state_of(SCENE), state_of(partition.merge(partition.moving))
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
@@ -56,7 +58,7 @@ def test_what_moved_moves_and_births_stay_in_order() -> None:
         anchors=replace(moving.anchors, positions=moving.anchors.positions + 1.0),
         free=moving.free.append(born),
     )
-    whole = partition.together(moved)
+    whole = partition.merge(moved)
     difference = (whole.anchors.positions - SCENE.anchors.positions).abs().sum(1)
     assert difference.nonzero()[:, 0].tolist() == [3, 17]
     assert whole.free.births.tolist() == [*range(8), 77]
@@ -73,12 +75,12 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
     backend = build()
     config = MotionConfig(enabled=True, margin_pixels=24, tiles=tiles)
     partition = some()
-    places = focuses(partition, VIEWS, config=config, backend=backend)
+    focuses = focus_views(partition, VIEWS, config=config, backend=backend)
     trained = parameters_of_fields(PAPER_DYNAMIC.difference(SHARED_FIELDS))
-    assert places.keys() == {view.index for view in VIEWS}
+    assert focuses.keys() == {view.index for view in VIEWS}
     shares = []
     for view in VIEWS:
-        focus, camera = places[view.index], view.camera
+        focus, camera = focuses[view.index], view.camera
         inside = focus.tiles.pixels()
         shares.append(float(inside.float().mean()))
         whole = draw(SCENE.gaussians(camera, backend), camera, backend).image.detach()
@@ -99,7 +101,7 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
             )
             found.append(gradients_of(loss, parameters.values, Stopwatch(CPU))[0])
         for name, theirs in found[1].items():
-            rows = partition.which.free if name.startswith("free") else partition.which.anchors
+            rows = partition.segmentation.free if name.startswith("free") else partition.segmentation.anchors
             ours = found[0][name][rows]
             assert (ours - theirs).norm() <= 1e-4 * ours.norm(), name
     assert max(shares) == 1.0 if not tiles else max(shares) < 0.9

@@ -10,10 +10,10 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.training.patching import (
     BIRTHS_PER_FRAME,
     PatchingConfig,
-    children_of,
+    choose_parents,
     gaussians_by_id,
-    parents_of,
-    surviving,
+    spawn_children,
+    survivor_mask,
 )
 from structgstream.training.views import View
 
@@ -38,7 +38,9 @@ def parents(count: int) -> Gaussians:
 def test_children_are_drawn_from_two_sigma() -> None:
     source = parents(200_000)
     config = PatchingConfig()
-    means = children_of(source, first_birth=1 * BIRTHS_PER_FRAME, config=config, generator=generator()).means.double()
+    means = spawn_children(
+        source, first_birth=1 * BIRTHS_PER_FRAME, config=config, generator=generator()
+    ).means.double()
     rotation = quaternion_matrices(source.quats[:1].double())[0]
     sigma = rotation @ torch.diag(source.scales[0].double() ** 2) @ rotation.T
     assert torch.allclose(means.mean(0), source.means[0].double(), atol=5e-3)
@@ -47,7 +49,7 @@ def test_children_are_drawn_from_two_sigma() -> None:
 
 def test_a_childs_other_attributes() -> None:
     source = parents(3)
-    children = children_of(source, first_birth=7 * BIRTHS_PER_FRAME, config=PatchingConfig(), generator=generator())
+    children = spawn_children(source, first_birth=7 * BIRTHS_PER_FRAME, config=PatchingConfig(), generator=generator())
     assert torch.allclose(children.log_scales.exp(), source.scales)
     assert torch.equal(children.colors, source.colors)
     assert torch.equal(children.quats, torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))
@@ -58,13 +60,13 @@ def test_a_childs_other_attributes() -> None:
 def test_the_threshold_chooses_parents_structured_or_free() -> None:
     gradient = torch.tensor([0.0009, 0.0011, 0.5, 0.002])
     count = torch.tensor([3.0, 3.0, 0.0, 1.0])  # The third was never drawn.
-    chosen = parents_of(gradient, count, room=10, config=PatchingConfig(), generator=generator())
+    chosen = choose_parents(gradient, count, room=10, config=PatchingConfig(), generator=generator())
     assert chosen.tolist() == [1, 3]
 
 
 def test_the_cap_prefers_large_gradients() -> None:
     gradient = torch.tensor([0.002, 0.004, 0.003])
-    chosen = parents_of(gradient, torch.ones(3), room=2, config=PatchingConfig(), generator=generator())
+    chosen = choose_parents(gradient, torch.ones(3), room=2, config=PatchingConfig(), generator=generator())
     assert chosen.tolist() == [1, 2]
 
 
@@ -72,20 +74,20 @@ def test_random_spawning_takes_as_many_but_others() -> None:
     gradient = torch.zeros(1000)
     gradient[:50] = 1.0
     config = PatchingConfig(spawn="random")
-    chosen = parents_of(gradient, torch.ones(1000), room=999, config=config, generator=generator())
+    chosen = choose_parents(gradient, torch.ones(1000), room=999, config=config, generator=generator())
     assert len(chosen) == 50
     assert (chosen >= 50).any()
 
 
 def test_off_spawns_nothing() -> None:
     config = PatchingConfig(spawn="off")
-    assert parents_of(torch.ones(4), torch.ones(4), room=9, config=config, generator=generator()).numel() == 0
+    assert choose_parents(torch.ones(4), torch.ones(4), room=9, config=config, generator=generator()).numel() == 0
 
 
 def test_pruning_by_opacity() -> None:
     free = replace(random_scene(free=3).free, logit_opacities=torch.logit(torch.tensor([0.004, 0.006, 0.5])))
-    assert surviving(free, PatchingConfig()).tolist() == [False, True, True]
-    assert surviving(free, PatchingConfig(prune_opacity=None)).all()
+    assert survivor_mask(free, PatchingConfig()).tolist() == [False, True, True]
+    assert survivor_mask(free, PatchingConfig(prune_opacity=None)).all()
 
 
 def test_parents_are_found_in_the_first_view_that_draws_them() -> None:

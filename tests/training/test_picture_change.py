@@ -8,7 +8,7 @@ import torch
 from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.picture_change import PictureChange, picture_changes
+from structgstream.training.picture_change import PictureChange, detect_picture_changes
 from structgstream.training.views import View, training_views
 
 RIG = arc_rig(3)
@@ -24,7 +24,7 @@ def views(*, square_at: int | None = None) -> list[View]:
 
 
 def changes(now: list[View], before: list[View], *, reach_pixels: int = 0, flow_from: tuple[int, ...] = ()):
-    return picture_changes(
+    return detect_picture_changes(
         now,
         before,
         threshold=0.1,
@@ -37,7 +37,7 @@ def changes(now: list[View], before: list[View], *, reach_pixels: int = 0, flow_
 
 def test_pixels_that_changed_and_views_that_did_not() -> None:
     first, second = changes(views(square_at=5), views())
-    assert (first.same, second.same) == (False, True)
+    assert (first.identical, second.identical) == (False, True)
     assert first.changed[11:19, 6:14].all(), "inside of the square"
     assert not first.changed[:, 17:].any()
     assert not second.changed.any()

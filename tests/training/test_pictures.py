@@ -24,12 +24,12 @@ def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
     found = pictures()
     assert found.changes is not None
     assert len(found.changes) == len(found.views) == len(WORLD.rig.training)
-    told = [view.index for view, change in zip(found.views, found.changes) if change.flow is not None]
-    assert 2 <= len(told) <= 3
+    views_with_flow = [view.index for view, change in zip(found.views, found.changes) if change.flow is not None]
+    assert 2 <= len(views_with_flow) <= 3
     for view, change in zip(found.views, found.changes):
         assert change.changed.shape == view.image.shape[:2]
         assert 0.0 < float(change.changed.float().mean()) < 0.9
-        assert not change.same
+        assert not change.identical
         if change.flow is not None:
             assert change.flow.shape == (48, 64, 6)
             confidence, shift = change.flow[..., 0], change.flow[..., 1:3]
@@ -42,7 +42,7 @@ def test_equal_pictures_are_the_same() -> None:
     frozen = replace(WORLD.frames[0], index=1)
     found = pictures_of(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
     assert found.changes is not None
-    assert all(change.same and not change.changed.any() for change in found.changes)
+    assert all(change.identical and not change.changed.any() for change in found.changes)
     assert all(change.flow is None or not change.flow[..., :3].any() for change in found.changes)
 
 

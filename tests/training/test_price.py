@@ -6,22 +6,22 @@ import torch
 
 from rigs import random_scene
 from structgstream.training.parameters import Parameters, parameters_of_fields
-from structgstream.training.price import Rate
+from structgstream.training.price import BitPrice
 
 
 def test_leaving_a_bin_has_a_price() -> None:
     parameters = Parameters.of(random_scene(10), trained=parameters_of_fields({"anchor_positions", "offset_scales"}))
     steps = {"anchor_positions": 0.5, "offset_scales": 0.25, "covariance_mlp": 0.1}
-    rate = Rate.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
-    assert rate is not None
-    assert rate.price(parameters.values).item() == 0.0
+    bit_price = BitPrice.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
+    assert bit_price is not None
+    assert bit_price.price(parameters.values).item() == 0.0
     values = dict(parameters.values)
     values["anchor_positions"] = values["anchor_positions"].detach().clone()
     values["anchor_positions"][2, 1] -= 0.5
     values["offset_scales"] = values["offset_scales"].detach().clone()
     values["offset_scales"][7, 0] += 0.75
-    assert rate.price(values).item() == pytest.approx(0.5 * (1.0 + 2.0) / 10, rel=1e-4)
-    price = rate.price({**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1})
+    assert bit_price.price(values).item() == pytest.approx(0.5 * (1.0 + 2.0) / 10, rel=1e-4)
+    price = bit_price.price({**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1})
     (gradient,) = torch.autograd.grad(price, [parameters.values["anchor_positions"]])
     assert (gradient > 0).all(), "it pulls back"
 
@@ -30,20 +30,20 @@ def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
     scene = random_scene(10, free=6)
     parameters = Parameters.of(scene, trained=parameters_of_fields({"free"}))
     steps: dict = {"free_means": 0.5, "free_colors": 0.1}
-    assert Rate.of(parameters, steps, weight=1.0, free=False) is None
-    rate = Rate.of(parameters, steps, weight=1.0, free=True)
-    assert rate is not None
+    assert BitPrice.of(parameters, steps, weight=1.0, free=False) is None
+    bit_price = BitPrice.of(parameters, steps, weight=1.0, free=True)
+    assert bit_price is not None
     keep = torch.tensor([True, False, True, True, False, True])
-    rate, old = rate.kept(keep), parameters.values["free_means"]
+    bit_price, old = bit_price.after_pruning(keep), parameters.values["free_means"]
     values: dict = {name: value.detach()[keep] for name, value in parameters.values.items() if name in steps}
     values["free_means"] = torch.cat([values["free_means"], old[:3].detach() + 7.0])
     values["free_colors"] = torch.cat([values["free_colors"], values["free_colors"][:3]])
-    assert rate.price(values).item() == 0.0
+    assert bit_price.price(values).item() == 0.0
     values["free_means"][2, 1] += 1.5  # Two bits for one of ten anchors.
-    assert rate.price(values).item() == pytest.approx(2.0 / 10, rel=1e-4)
+    assert bit_price.price(values).item() == pytest.approx(2.0 / 10, rel=1e-4)
 
 
 @pytest.mark.parametrize(("steps", "weight"), [({}, 1.0), ({"covariance_mlp": 0.1}, 1.0), ({"base_scales": 0.1}, 0.0)])
 def test_no_price_where_nothing_is_paid(steps: dict, weight: float) -> None:
     parameters = Parameters.of(random_scene(3), trained=parameters_of_fields({"anchor_positions"}))
-    assert Rate.of(parameters, steps, weight=weight, free=True) is None
+    assert BitPrice.of(parameters, steps, weight=weight, free=True) is None

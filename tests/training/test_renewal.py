@@ -12,9 +12,9 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig
 from structgstream.training.motion import MotionConfig
-from structgstream.training.partition import Partition, focuses
+from structgstream.training.partition import Partition, focus_views
 from structgstream.training.patching import BIRTHS_PER_FRAME
-from structgstream.training.renewal import Renewal, renewal
+from structgstream.training.renewal import Renewal, renew_free_gaussians
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
 from worlds import emerging_ball, moved_since, moving_world
@@ -32,10 +32,10 @@ def renewed(backend: Backend, *, scene: Scene = WORLD.scene, config: BirthConfig
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     partition = Partition.of(scene, moved_since(scene, views, first, config=motion, backend=backend))
-    return renewal(
+    return renew_free_gaussians(
         partition,
         views,
-        focuses(partition, views, config=motion, backend=backend),
+        focus_views(partition, views, config=motion, backend=backend),
         frame_index=1,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend),
         room=room,
@@ -48,7 +48,7 @@ def renewed(backend: Backend, *, scene: Scene = WORLD.scene, config: BirthConfig
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
     found, ball = renewed(backend()), emerging_ball(0.95)
-    born = found.born
+    born = found.new_free
     assert len(born) >= 3
     assert not found.refused
     near = (born.means - ball.means).norm(dim=1)
@@ -66,23 +66,23 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         return draw(*arguments, **options)
 
     monkeypatch.setattr("structgstream.training.renewal.draw", counting)
-    assert not len(renewed(reference_backend(), config=replace(CONFIG, residual_threshold=10.0)).born)
+    assert not len(renewed(reference_backend(), config=replace(CONFIG, residual_threshold=10.0)).new_free)
     assert not drawn
-    assert len(renewed(reference_backend()).born)
+    assert len(renewed(reference_backend()).new_free)
     assert drawn, "where something is missing it is"
 
 
 def test_births_keep_to_the_room_there_is() -> None:
     everything = renewed(reference_backend())
-    assert len(renewed(reference_backend(), config=replace(CONFIG, most=2)).born) == 2
-    assert len(renewed(reference_backend(), room=1).born) == 1
-    assert len(renewed(reference_backend(), room=0).born) == 0
-    assert len(everything.born) > 2
+    assert len(renewed(reference_backend(), config=replace(CONFIG, most=2)).new_free) == 2
+    assert len(renewed(reference_backend(), room=1).new_free) == 1
+    assert len(renewed(reference_backend(), room=0).new_free) == 0
+    assert len(everything.new_free) > 2
 
 
 def test_off_nothing_is_born() -> None:
     found = renewed(reference_backend(), config=replace(CONFIG, enabled=False))
-    assert len(found.born) == 0
+    assert len(found.new_free) == 0
     assert found.kept.all()
 
 
@@ -90,11 +90,11 @@ def test_when_everything_is_missing_nothing_is_born_and_that_is_told() -> None:
     found = renewed(reference_backend(), config=replace(CONFIG, most_missing_share=1e-4))
     assert found.refused
     assert found.missing_share > 1e-4
-    assert len(found.born) == 0
+    assert len(found.new_free) == 0
 
 
 def test_births_are_repeated_bit_for_bit() -> None:
-    one, other = (renewed(reference_backend()).born for _ in range(2))
+    one, other = (renewed(reference_backend()).new_free for _ in range(2))
     assert torch.equal(one.means, other.means)
     assert torch.equal(one.colors, other.colors)
 
@@ -116,13 +116,13 @@ def test_a_ghost_dies() -> None:
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05)
     floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    which = moved_since(scene, views, first, config=motion, backend=backend, floor=floor)
-    assert which.free.all(), "what is wrong passes the gate"
-    partition = Partition.of(scene, which)
-    found = renewal(
+    segmentation = moved_since(scene, views, first, config=motion, backend=backend, floor=floor)
+    assert segmentation.free.all(), "what is wrong passes the gate"
+    partition = Partition.of(scene, segmentation)
+    found = renew_free_gaussians(
         partition,
         views,
-        focuses(partition, views, config=motion, backend=backend),
+        focus_views(partition, views, config=motion, backend=backend),
         frame_index=1,
         floor=floor,
         room=1000,

@@ -7,7 +7,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
-from structgstream.training.residuals import as_recorded, box_mean, residual, residual_floor
+from structgstream.training.residuals import apply_camera_color, box_mean, residual, residual_floor
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
@@ -38,7 +38,7 @@ def test_equal_pictures_have_no_residual() -> None:
 
 def test_a_rendering_is_compared_as_its_camera_would_have_recorded_it() -> None:
     color = replace(WORLD.scene.camera_color, gains=torch.full((4, 3), 2.0), biases=torch.full((4, 3), 0.1))
-    torch.testing.assert_close(as_recorded(torch.full((2, 2, 3), 0.3), color, 1), torch.full((2, 2, 3), 0.7))
+    torch.testing.assert_close(apply_camera_color(torch.full((2, 2, 3), 0.3), color, 1), torch.full((2, 2, 3), 0.7))
 
 
 def test_the_floor_is_what_frame_0_missed_nearby() -> None:

@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.codec.scene.bins import LARGEST, binned, valued
+from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, ParameterName, parameters_of, state_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
-from structgstream.training.rounding import RoundingConfig, pixel_size, rounded
+from structgstream.training.rounding import RoundingConfig, pixel_size, round_straight_through
 
 
 def test_rounding_is_drawn_and_not_felt() -> None:
     value = torch.tensor([0.1, 0.26, -0.9, 0.0], requires_grad=True)
-    found = rounded(value, 0.25)
+    found = round_straight_through(value, 0.25)
     assert found.tolist() == [0.0, 0.25, -1.0, 0.0]
     (found * torch.tensor([1.0, 2.0, 3.0, 4.0])).sum().backward()
     assert value.grad is not None
@@ -30,8 +30,8 @@ def test_a_value_of_a_bin_stays_where_it_is(step: float) -> None:
     step = float(np.float32(step))
     bins = np.unique(np.rint(np.geomspace(1, LARGEST, 20_000))).astype(np.int64)
     values = torch.from_numpy(bins.astype(np.float32) * np.float32(step))
-    assert torch.equal(rounded(values, step), values)
-    assert torch.equal(rounded(-values, step), -values)
+    assert torch.equal(round_straight_through(values, step), values)
+    assert torch.equal(round_straight_through(-values, step), -values)
 
 
 def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
@@ -44,7 +44,7 @@ def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
         name: value.detach() for name, value in state_of(parameters.scene(scene)).items()
     }
     of_codec: dict[str, float] = {**steps}
-    sent = valued(binned(drawn, CODABLE, of_codec), CODABLE, of_codec)
+    sent = dequantize_state(quantize_state(drawn, CODABLE, of_codec), CODABLE, of_codec)
     for name, value in sent.items():
         assert torch.equal(value, drawn[name]), name
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from structgstream.errors import CaptureError
-from structgstream.training.seeding import neighbour_distances, seeded_scene, voxel_centers
+from structgstream.training.seeding import neighbor_distances, seeded_scene, voxel_centers
 
 
 def seeded(points: torch.Tensor, **options):
@@ -29,7 +29,7 @@ def test_one_anchor_a_voxel() -> None:
 def test_scales_start_at_the_distance_to_three_neighbours() -> None:
     points = torch.rand(50, 3)
     squared = torch.cdist(points.double(), points.double()).square().sort(dim=1).values[:, 1:4].mean(1)
-    assert torch.allclose(neighbour_distances(points).double(), squared.sqrt(), rtol=1e-5)
+    assert torch.allclose(neighbor_distances(points).double(), squared.sqrt(), rtol=1e-5)
 
 
 def test_the_start_is_neutral() -> None:

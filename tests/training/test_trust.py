@@ -7,39 +7,39 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
-from structgstream.training.trust import ViewChange, believed, jumped
+from structgstream.training.trust import ViewChange, is_scene_cut, trusted_views
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
-USUAL = ViewChange(changed=0.05, wrong=0.02, same=False)
+USUAL = ViewChange(changed_share=0.05, wrong_share=0.02, identical=False)
 WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)
 CONFIG = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0)
 
 
 def test_usual_pictures_are_believed() -> None:
-    assert believed([USUAL] * 5) == [True] * 5
-    assert not jumped([USUAL] * 5)
+    assert trusted_views([USUAL] * 5) == [True] * 5
+    assert not is_scene_cut([USUAL] * 5)
 
 
 def test_a_picture_that_changed_or_is_wrong_everywhere_is_not() -> None:
-    for odd in (replace(USUAL, changed=0.9), replace(USUAL, wrong=0.9)):
-        assert believed([USUAL, odd, USUAL, USUAL]) == [True, False, True, True]
+    for odd in (replace(USUAL, changed_share=0.9), replace(USUAL, wrong_share=0.9)):
+        assert trusted_views([USUAL, odd, USUAL, USUAL]) == [True, False, True, True]
 
 
 def test_a_frozen_picture_is_not_while_others_change() -> None:
-    frozen = ViewChange(changed=0.0, wrong=0.0, same=True)
-    assert believed([USUAL, USUAL, USUAL, frozen]) == [True, True, True, False]
-    assert believed([frozen] * 3) == [True] * 3, "nothing moves: all are equal to the last"
+    frozen = ViewChange(changed_share=0.0, wrong_share=0.0, identical=True)
+    assert trusted_views([USUAL, USUAL, USUAL, frozen]) == [True, True, True, False]
+    assert trusted_views([frozen] * 3) == [True] * 3, "nothing moves: all are equal to the last"
 
 
 def test_when_all_change_everywhere_it_is_a_jump_and_all_are_believed() -> None:
-    everywhere = [replace(USUAL, changed=0.95)] * 4
-    assert jumped(everywhere)
-    assert all(believed(everywhere))
+    everywhere = [replace(USUAL, changed_share=0.95)] * 4
+    assert is_scene_cut(everywhere)
+    assert all(trusted_views(everywhere))
 
 
 def test_two_views_are_always_left() -> None:
-    assert believed([USUAL, replace(USUAL, changed=0.9)]) == [True, True]
+    assert trusted_views([USUAL, replace(USUAL, changed_share=0.9)]) == [True, True]
 
 
 def test_a_black_picture_moves_nothing() -> None:
@@ -61,6 +61,6 @@ def test_a_light_switched_on_is_a_jump() -> None:
     before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
     bright = [replace(v, image=(v.image.int() + 60).clamp(max=255).to(torch.uint8)) for v in views]
     found = moved_since(WORLD.scene, bright, before, config=CONFIG, backend=backend, flow_from=range(len(views)))
-    assert found.jumped
+    assert found.scene_cut
     assert found.evidence is None
     assert len(found.trusted) == len(views)

@@ -141,20 +141,20 @@ def compact_scene(frame: int) -> Scene:
     features = whole(COMPACT_ANCHORS, FEATURES, salt=5, most=4) * powers
     columns = free.split([*COLUMNS.values()], dim=1)
     state: dict[FieldName, Tensor] = {
-        "anchor_positions": valued(rows[:, :3], steps["anchor_positions"]),
-        "offset_scales": valued(rows[:, 3:], steps["offset_scales"]),
-        "base_scales": valued(whole(COMPACT_ANCHORS, 3, salt=3, most=9) * powers - 400, init_steps["base_scales"]),
+        "anchor_positions": dequantize(rows[:, :3], steps["anchor_positions"]),
+        "offset_scales": dequantize(rows[:, 3:], steps["offset_scales"]),
+        "base_scales": dequantize(whole(COMPACT_ANCHORS, 3, salt=3, most=9) * powers - 400, init_steps["base_scales"]),
         "anchor_offsets": numbers(COMPACT_ANCHORS, K, 3, salt=4),
-        "anchor_features": valued(features, init_steps["anchor_features"]),
+        "anchor_features": dequantize(features, init_steps["anchor_features"]),
         "opacity_mlp": numbers(mlp_size(1), salt=6),
         "color_mlp": numbers(mlp_size(3), salt=7),
-        "covariance_mlp": valued(weights, steps["covariance_mlp"]),
-        "free": torch.cat([valued(part, steps[name]) for part, name in zip(columns, COLUMNS, strict=True)], dim=1),
+        "covariance_mlp": dequantize(weights, steps["covariance_mlp"]),
+        "free": torch.cat([dequantize(part, steps[name]) for part, name in zip(columns, COLUMNS, strict=True)], dim=1),
         "free_births": births,
         "camera_color": numbers(2, 6, salt=11),
-        "appearance": valued(whole(COMPACT_ANCHORS, 3, salt=12, most=1) * powers, init_steps["appearance"]),
-        "appearance_basis": valued(whole(3, FEATURES, salt=13, most=300), init_steps["appearance_basis"]),
-        "environment": valued(whole(4, 3, salt=14, most=250), init_steps["environment"]),
+        "appearance": dequantize(whole(COMPACT_ANCHORS, 3, salt=12, most=1) * powers, init_steps["appearance"]),
+        "appearance_basis": dequantize(whole(3, FEATURES, salt=13, most=300), init_steps["appearance_basis"]),
+        "environment": dequantize(whole(4, 3, salt=14, most=250), init_steps["environment"]),
     }
     return scene_of(state, distance_input=True)
 
@@ -165,7 +165,7 @@ def whole(*shape: int, salt: int, most: int) -> Tensor:
     return ((torch.arange(count) * 7919 + salt * 104_729) % (2 * most + 1) - most).reshape(shape)
 
 
-def valued(bins: Tensor, step: float) -> Tensor:
+def dequantize(bins: Tensor, step: float) -> Tensor:
     """What bins stand for: the product of two float32."""
     return torch.from_numpy(bins.numpy().astype(np.float32) * np.float32(step))
 

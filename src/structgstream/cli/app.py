@@ -41,7 +41,7 @@ class Interrupted(Exception):
 
 
 @contextmanager
-def usage_checked() -> Iterator[None]:
+def usage_errors() -> Iterator[None]:
     """Converts ``ConfigError`` to ``UsageError`` while options are checked.
 
     Raises:

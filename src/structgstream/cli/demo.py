@@ -10,8 +10,8 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
-from structgstream.cli.options import Device, parsed_with_rest, resolved_config
-from structgstream.cli.tables import quality, report_tables
+from structgstream.cli.options import Device, parse_known_options, resolve_config
+from structgstream.cli.tables import quality_text, report_tables
 
 SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
 
@@ -38,11 +38,11 @@ class Demo:
 
 def main(arguments: list[str]) -> None:
     """Runs the demo."""
-    options, rest = parsed_with_rest(Demo, "demo", arguments=arguments)
+    options, rest = parse_known_options(Demo, "demo", arguments=arguments)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
-    from structgstream.cli.evaluate import scored
-    from structgstream.cli.reconstruct import reconstructed
+    from structgstream.cli.evaluate import run_evaluation
+    from structgstream.cli.reconstruct import run_reconstruction
     from structgstream.cli.render import path_pictures, write_pictures
     from structgstream.codec.reader import open_stream
     from structgstream.data.clip import bundled_clip_path
@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> None:
 
     began = time.perf_counter()
     console = Console()
-    config, preset = resolved_config(options.preset or DEMO_PRESET, rest, command="demo", seed=None)
+    config, preset = resolve_config(options.preset or DEMO_PRESET, rest, command="demo", seed=None)
     source = open_capture(bundled_clip_path(), scale=options.scale, frames=options.frames)
     backend = select_backend(options.device)
     stream = options.output / "clip.sgs"
@@ -70,7 +70,7 @@ def main(arguments: list[str]) -> None:
         highlight=False,
     )
     try:
-        reconstructed(
+        run_reconstruction(
             source,
             config,
             output=stream,
@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> None:
         raise Interrupted(f"What was done is in {options.output}; the demo starts again from the beginning.") from None
     reader = open_stream(stream)
     report_folder = options.output / "report"
-    report = scored(reader, source, stream=stream, backend=backend, cameras=None, folder=report_folder)
+    report = run_evaluation(reader, source, stream=stream, backend=backend, cameras=None, folder=report_folder)
     held_out, orbit = options.output / "held-out.mp4", options.output / "orbit.mp4"
     pairs = compared_frames(reader, source, backend=backend, camera=camera)
     write_pictures(held_out, (side_by_side(*pair) for pair in pairs), fps=source.fps * SLOWED)
@@ -101,7 +101,7 @@ def main(arguments: list[str]) -> None:
     for name, path in places.items():
         console.print(f"{name:<14}  {path}", highlight=False, markup=False, soft_wrap=True)
     console.print(
-        f"\nHeld-out PSNR {quality(report)} over {len(report.frames)} frames, "
+        f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, "
         f"everything in {time.perf_counter() - began:.0f} s.",
         highlight=False,
     )

@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from structgstream.cli.options import JsonPath, parsed
-from structgstream.cli.tables import columns, grid, plain
+from structgstream.cli.options import JsonPath, parse_options
+from structgstream.cli.tables import compact_table, literal_cells, name_value_table
 
 # Import name, distribution, extra, what it is for.
 OPTIONAL = (
@@ -39,16 +39,16 @@ class Doctor:
 
 def main(arguments: list[str]) -> None:
     """Examines the machine and prints the result."""
-    options = parsed(Doctor, "doctor", arguments=arguments)
+    options = parse_options(Doctor, "doctor", arguments=arguments)
     from structgstream.evaluation.report import write_json
 
-    found = examination()
+    found = diagnose()
     if options.json is not None:
         write_json(options.json, found)
     console = Console()
-    machine = grid()
+    machine = name_value_table()
     for name, value in found["environment"].items():
-        machine.add_row(*plain(name, "-" if value is None else str(value)))
+        machine.add_row(*literal_cells(name, "-" if value is None else str(value)))
     console.print(machine)
     console.print()
     console.print(_table(("back-end", "state", ""), [(e["name"], e["state"], e["advice"]) for e in found["backends"]]))
@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> None:
     console.print(_table(("package", "version", ""), rows))
 
 
-def examination() -> dict[str, Any]:
+def diagnose() -> dict[str, Any]:
     """Machine, back-ends and optional packages as plain values: ``environment``, ``backends``, ``packages``."""
     from structgstream.evaluation.environment import environment
     from structgstream.kernels.backend import backend_reasons, backend_remarks
@@ -82,9 +82,9 @@ def examination() -> dict[str, Any]:
 
 
 def _table(names: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
-    table = columns()
+    table = compact_table()
     for name in names:
         table.add_column(name)
     for row in rows:
-        table.add_row(*plain(*row))
+        table.add_row(*literal_cells(*row))
     return table

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, parsed
-from structgstream.cli.tables import quality, report_tables
+from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, parse_options
+from structgstream.cli.tables import quality_text, report_tables
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
-    from structgstream.evaluation.instruments import Selection
+    from structgstream.evaluation.optional_metrics import MetricSelection
     from structgstream.evaluation.report import Report
     from structgstream.kernels.backend import Backend
 
@@ -52,7 +52,7 @@ class Evaluate:
 
 def main(arguments: list[str]) -> None:
     """Evaluates and prints a table."""
-    options = parsed(Evaluate, "evaluate", arguments=arguments)
+    options = parse_options(Evaluate, "evaluate", arguments=arguments)
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.report import as_json, write_json
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
 
     reader = open_stream(options.stream)
     source = capture_of(reader.header, options.scene, frames=len(reader.packets))
-    report = scored(
+    report = run_evaluation(
         reader,
         source,
         stream=options.stream,
@@ -78,7 +78,7 @@ def main(arguments: list[str]) -> None:
         console.print(f"Report: {options.report}", highlight=False, markup=False, soft_wrap=True)
 
 
-def scored(
+def run_evaluation(
     reader: "StreamReader",
     source: "FrameSource",
     *,
@@ -86,18 +86,18 @@ def scored(
     backend: "Backend",
     cameras: tuple[str, ...] | None,
     folder: Path | None,
-    metrics: "Selection" = "all",
+    metrics: "MetricSelection" = "all",
     lpips_weights: Path | None = None,
 ) -> "Report":
     """Evaluates with a progress display, and writes the report into ``folder`` (None: nowhere)."""
     from structgstream.evaluation.evaluate import Compared, evaluate
-    from structgstream.evaluation.pictures import contact_sheet, sampled
+    from structgstream.evaluation.pictures import contact_sheet, spread_indices
     from structgstream.evaluation.plots import write_plots
     from structgstream.evaluation.report import as_json, write_json
     from structgstream.evaluation.run_log import read_log
 
     frames = len(reader.packets)
-    wanted = set(sampled(frames, SHEET_COLUMNS)) if frames else set()
+    wanted = set(spread_indices(frames, SHEET_COLUMNS)) if frames else set()
     kept: dict[str, dict] = {}
     console = Console(stderr=True)
     with console.status("evaluating") as status:
@@ -118,7 +118,7 @@ def scored(
             lpips_weights=lpips_weights,
         )
     if folder is not None:
-        title = f"{source.name}, {stream.name}: {quality(report)} over {frames} frames"
+        title = f"{source.name}, {stream.name}: {quality_text(report)} over {frames} frames"
         write_json(folder / "report.json", as_json(report))
         write_plots(folder / "over_time.png", report, title=title)
         contact_sheet(folder / "contact_sheet.png", kept, title=title)

@@ -9,8 +9,8 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from structgstream.cli.app import usage_checked
-from structgstream.cli.options import Device, StreamFile, parsed
+from structgstream.cli.app import usage_errors
+from structgstream.cli.options import Device, StreamFile, parse_options
 from structgstream.cli.progress import human_bytes
 from structgstream.exporters.formats import Format, PageFormat
 
@@ -51,24 +51,24 @@ class Export:
 
 def main(arguments: list[str]) -> None:
     """Exports and prints the path of the result."""
-    options = parsed(Export, "export", arguments=arguments)
-    from structgstream.exporters.request import check_page, checked_degree, chosen_frames, destination
+    options = parse_options(Export, "export", arguments=arguments)
+    from structgstream.exporters.request import check_degree, check_page, choose_frames, destination
 
     frame, frames = options.frame, options.frames
-    with usage_checked():
+    with usage_errors():
         output, format = destination(options.stream, options.output, format=options.format, frame=frame, frames=frames)
         if format == "html" or format == "site":
             check_page(frame=frame, frames=frames, sh_degree=options.sh_degree)
             _export_page(options.stream, output, format)
             return
-        degree = checked_degree(options.sh_degree, format)
+        degree = check_degree(options.sh_degree, format)
     from structgstream.codec.reader import open_stream
     from structgstream.exporters.frames import write_frames
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream, by_index=options.frame is not None)
-    with usage_checked():
-        numbers = chosen_frames(reader.runs, output, frame=frame, frames=frames)
+    with usage_errors():
+        numbers = choose_frames(reader.runs, output, frame=frame, frames=frames)
     backend = select_backend(options.device)
     written = gaussians = 0
     bar = Progress(

@@ -11,8 +11,8 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import JsonPath, StreamFile, parsed
-from structgstream.cli.stream_tables import facts, header_table, packet_table, rate
+from structgstream.cli.options import JsonPath, StreamFile, parse_options
+from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -45,35 +45,39 @@ class Inspect:
 
 def main(arguments: list[str]) -> None:
     """Reads the file and prints."""
-    options = parsed(Inspect, "inspect", arguments=arguments)
+    options = parse_options(Inspect, "inspect", arguments=arguments)
     plot = options.plot
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UsageError(f"{plot} is no name for a picture; its ending must be one of {', '.join(PICTURES)}.")
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.byte_count import rows_of
+    from structgstream.evaluation.byte_count import packet_rows
     from structgstream.evaluation.report import write_json
     from structgstream.evaluation.run_log import read_log
 
     with open_stream(options.stream) as reader:
-        rows = rows_of(reader)
-        content = described(reader, rows, log=read_log(options.stream))
+        rows = packet_rows(reader)
+        content = describe_stream(reader, rows, log=read_log(options.stream))
         if options.json is not None:
             write_json(options.json, content)
         if plot is not None:
-            drawn(plot, reader, rows, name=options.stream.name)
+            draw_byte_plot(plot, reader, rows, name=options.stream.name)
     console = Console()
     if options.config:
         console.print_json(json.dumps(content["header"]["config"]))
         return
     packets = packet_table(rows, every=options.all_packets)
-    for part in (facts(content["header"], rows, packets=content["packets"]), header_table(content["header"]), packets):
+    for part in (
+        facts_table(content["header"], rows, packets=content["packets"]),
+        header_table(content["header"]),
+        packets,
+    ):
         console.print(part)
         console.print()
     if plot is not None:
         console.print(f"Wrote {plot}", highlight=False, markup=False, soft_wrap=True)
 
 
-def drawn(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:
+def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:
     """Writes the picture.
 
     Raises:
@@ -85,10 +89,14 @@ def drawn(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: st
     from structgstream.evaluation.byte_plot import write_byte_plot
 
     frames = "1 frame" if len(rows) == 1 else f"{len(rows)} frames"
-    write_byte_plot(path, rows, parts_of(reader, rows), title=f"{name}: {frames}, {rate(rows, reader.header.fps)}")
+    write_byte_plot(
+        path, rows, parts_of(reader, rows), title=f"{name}: {frames}, {bit_rate_text(rows, reader.header.fps)}"
+    )
 
 
-def described(reader: "StreamReader", rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+def describe_stream(
+    reader: "StreamReader", rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]
+) -> dict[str, Any]:
     """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``, ...).
 
     ``changes`` of a packet are the numbers of added and removed anchors and free Gaussians, if the run's ``log`` has

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import tyro
 
-from structgstream.cli.app import usage_checked
+from structgstream.cli.app import usage_errors
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -39,17 +39,17 @@ class CaptureOptions:
     """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 rig radii."""
 
 
-def parsed(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
+def parse_options(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
     """The options of a command; prints and exits on ``--help`` or wrong usage."""
     return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE)
 
 
-def parsed_with_rest(kind: type[Options], command: str, *, arguments: list[str]) -> tuple[Options, list[str]]:
-    """As :func:`parsed`, and the arguments that are no options of the command itself."""
+def parse_known_options(kind: type[Options], command: str, *, arguments: list[str]) -> tuple[Options, list[str]]:
+    """As :func:`parse_options`, and the arguments that are no options of the command itself."""
     return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True)
 
 
-def resolved_config(
+def resolve_config(
     preset: str | None, overrides: list[str], *, command: str, seed: int | None
 ) -> tuple["StreamConfig", str]:
     """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name.
@@ -60,7 +60,7 @@ def resolved_config(
     from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named
 
     name = DEFAULT_PRESET if preset is None else preset
-    with usage_checked():
+    with usage_errors():
         default = preset_named(name)
     description = f"Fields of the configuration, with the values of the preset {name!r} as defaults."
     config = tyro.cli(
@@ -74,7 +74,7 @@ def resolved_config(
     return (config if seed is None else replace(config, seed=seed)), name
 
 
-def opened_capture(scene: Path, options: CaptureOptions) -> "FrameSource":
+def open_selected_capture(scene: Path, options: CaptureOptions) -> "FrameSource":
     """The part of a capture that the options select."""
     from structgstream.data.open import open_capture
 

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import StreamFile as StreamPath
-from structgstream.cli.options import parsed
+from structgstream.cli.options import parse_options
 from structgstream.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Play:
 
 def main(arguments: list[str]) -> None:
     """Serves until Ctrl-C."""
-    options = parsed(Play, "play", arguments=arguments)
+    options = parse_options(Play, "play", arguments=arguments)
     if not 0 <= options.port < 65536:
         raise UsageError(f"--port {options.port} is not one of 0 to 65535.")
     try:
@@ -76,10 +76,10 @@ def main(arguments: list[str]) -> None:
 
 
 def _wait_for(stream: "StreamFile") -> None:
-    if not stream.has_begun():
+    if not stream.has_header():
         text = f"Waiting for {stream.path}, which comes when frame 0 is done (Ctrl-C ends)."
         Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
-    while not stream.has_begun():
+    while not stream.has_header():
         time.sleep(LOOK_AGAIN_SECONDS)
 
 

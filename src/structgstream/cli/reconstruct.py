@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import Interrupted, UsageError, usage_checked
+from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
     Folder,
-    opened_capture,
-    parsed_with_rest,
-    resolved_config,
+    open_selected_capture,
+    parse_known_options,
+    resolve_config,
 )
 from structgstream.cli.progress import display, human_bytes
 
@@ -70,19 +70,19 @@ def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
     if "--help-config" in arguments:
         _print_config(arguments)
-    options, rest = parsed_with_rest(Reconstruct, "reconstruct", arguments=arguments)
+    options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
-    config, preset = resolved_config(options.preset, rest, command="reconstruct", seed=options.seed)
+    config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)
     from structgstream.presets import departures, with_budget
     from structgstream.recorder import check_output
 
-    with usage_checked():
+    with usage_errors():
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
     check_output(options.output, may_exist=options.resume or options.overwrite)
     from structgstream.kernels.backend import select_backend
 
-    source = opened_capture(options.scene, options.capture)
+    source = open_selected_capture(options.scene, options.capture)
     backend = select_backend(options.device)
     console = Console()
     console.print(
@@ -94,7 +94,7 @@ def main(arguments: list[str]) -> None:
     )
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
-    peaks = reconstructed(
+    peaks = run_reconstruction(
         source,
         config,
         output=options.output,
@@ -108,7 +108,7 @@ def main(arguments: list[str]) -> None:
     console.print(f"Wrote {options.output}", highlight=False, markup=False, soft_wrap=True)
 
 
-def reconstructed(
+def run_reconstruction(
     source: "FrameSource",
     config: "StreamConfig",
     *,
@@ -163,4 +163,4 @@ def _print_config(arguments: list[str]) -> None:
             preset = following
         elif argument.startswith("--preset="):
             preset = argument.removeprefix("--preset=")
-    resolved_config(preset, ["--help"], command="reconstruct SCENE -o OUT.sgs", seed=None)
+    resolve_config(preset, ["--help"], command="reconstruct SCENE -o OUT.sgs", seed=None)

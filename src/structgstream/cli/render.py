@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, StreamFile, parsed
+from structgstream.cli.options import Device, StreamFile, parse_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -61,7 +61,7 @@ class Render:
 
 def main(arguments: list[str]) -> None:
     """Renders and prints the path of the result."""
-    options = parsed(Render, "render", arguments=arguments)
+    options = parse_options(Render, "render", arguments=arguments)
     if options.compare and (options.scene is None or options.path is not None):
         raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
     if options.scene is not None and not options.compare:
@@ -89,7 +89,7 @@ def main(arguments: list[str]) -> None:
     elif options.scene is not None:
         pictures = compared_pictures(reader, options.scene, backend=backend, options=options)
     else:
-        pictures = camera_pictures(reader, backend, camera=chosen_camera(reader, options.camera), frame=options.frame)
+        pictures = camera_pictures(reader, backend, camera=choose_camera(reader, options.camera), frame=options.frame)
     single = output.suffix.lower() == ".png"
     write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
     Console().print(f"Wrote {output}", highlight=False, markup=False, soft_wrap=True)
@@ -148,7 +148,7 @@ def path_pictures(
     count = max(round(length * header.fps), 1)
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
-    for view, scene in zip(views, _forth_and_back(reader, frame, count=count), strict=True):
+    for view, scene in zip(views, _ping_pong(reader, frame, count=count), strict=True):
         yield rendered(on_device(scene, backend.device), header.camera(view), backend)[0]
 
 
@@ -160,7 +160,7 @@ def compared_pictures(
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
 
-    camera = chosen_camera(reader, options.camera)
+    camera = choose_camera(reader, options.camera)
     _check_frame(reader, options.frame)
     pairs = compared_frames(
         reader, capture_of(reader.header, scene, frames=len(reader.packets)), backend=backend, camera=camera
@@ -172,7 +172,7 @@ def compared_pictures(
             return
 
 
-def chosen_camera(reader: "StreamReader", camera: str | None) -> str:
+def choose_camera(reader: "StreamReader", camera: str | None) -> str:
     """The named camera, the first held-out one, or the one in the middle of the rig.
 
     Raises:
@@ -204,14 +204,14 @@ def scenes_of(reader: "StreamReader", frame: int | None) -> "Iterator[Scene]":
 
 def default_output(options: Render, reader: "StreamReader") -> Path:
     """``ball.sgs`` gives ``ball-orbit.mp4``, ``ball-10.mp4`` or ``ball-10-compare.mp4``."""
-    name = options.path or chosen_camera(reader, options.camera)
+    name = options.path or choose_camera(reader, options.camera)
     ending = "-compare" if options.compare else ""
     still = options.frame is not None and options.path is None
     suffix = f"-{options.frame}.png" if still else ".mp4"
     return options.stream.with_name(f"{options.stream.stem}-{name}{ending}{suffix}")
 
 
-def _forth_and_back(reader: "StreamReader", frame: int | None, *, count: int) -> "Iterator[Scene]":
+def _ping_pong(reader: "StreamReader", frame: int | None, *, count: int) -> "Iterator[Scene]":
     if frame is None and len(reader.packets) >= count:
         yield from islice(scenes_of(reader, None), count)
         return

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 from structgstream.cli.progress import change, human_bytes
-from structgstream.cli.tables import SHOWN_FRAMES, columns, grid, plain
+from structgstream.cli.tables import SHOWN_FRAMES, compact_table, literal_cells, name_value_table
 
 if TYPE_CHECKING:
     from structgstream.evaluation.byte_count import Row
@@ -18,20 +18,22 @@ SMALL_BYTES = 100_000  # if all packets are smaller, sizes are printed in bytes
 SHORT = {"anchor_positions": "positions", "covariance_mlp": "cov. mlp", "the rest": "rest"}  # 80 characters a line
 
 
-def facts(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence[Mapping[str, Any]]) -> Table:
+def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence[Mapping[str, Any]]) -> Table:
     """Facts of the stream: source, length, size, rate, added and removed items, whether it is complete."""
     cameras = header["cameras"]
     held_out = [name for name, camera in cameras.items() if camera["held_out"]]
     sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
-    table = grid()
+    table = name_value_table()
     for name, value in header["metadata"].items():
-        table.add_row(*plain(name, str(value)))
+        table.add_row(*literal_cells(name, str(value)))
     table.add_row("codec", header["codec"])
     table.add_row("frames", f"{len(rows)} at {header['fps']:g} a second, {len(rows) / header['fps']:.2f} s")
-    table.add_row(*plain("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}"))
+    table.add_row(
+        *literal_cells("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}")
+    )
     table.add_row("size", f"{human_bytes(header['total_bytes'])}, header {human_bytes(header['header_bytes'])}")
     if rows:
-        table.add_row("rate", rate(rows, header["fps"]))
+        table.add_row("rate", bit_rate_text(rows, header["fps"]))
     table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
     changes = [packet["changes"] for packet in packets if packet["changes"]]
     if changes:
@@ -50,7 +52,7 @@ def facts(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence
     return table
 
 
-def rate(rows: "Sequence[Row]", fps: float) -> str:
+def bit_rate_text(rows: "Sequence[Row]", fps: float) -> str:
     """The mean rate of at least one packet, as text."""
     mean = sum(row.bytes for row in rows) / len(rows)
     return f"{8e-6 * mean * fps:.2f} Mbit/s without the header"
@@ -58,7 +60,7 @@ def rate(rows: "Sequence[Row]", fps: float) -> str:
 
 def header_table(header: Mapping[str, Any]) -> Table:
     """The fields of the init record, largest first."""
-    table = columns()
+    table = compact_table()
     table.title = "header"
     table.add_column("field")
     for name in ("shape", "bytes", "share", "bits a value"):
@@ -77,9 +79,9 @@ def header_table(header: Mapping[str, Any]) -> Table:
 
 def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
     """A row per packet, or for :data:`SHOWN_FRAMES` of them, and the means below; largest field first."""
-    from structgstream.evaluation.byte_count import FIRST, fields_of, groups_of
+    from structgstream.evaluation.byte_count import FIRST, groups_of, occurring_fields
 
-    names = fields_of(row.sizes for row in rows)
+    names = occurring_fields(row.sizes for row in rows)
     small = max((row.bytes for row in rows), default=0) < SMALL_BYTES
     step = 1 if every else max(-(-len(rows) // SHOWN_FRAMES), 1)
 
@@ -92,7 +94,7 @@ def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
     means = [
         ["mean", name.split()[0], *cells(groups[name].bytes, groups[name].sizes)] for name in groups if name != FIRST
     ]
-    table = columns()
+    table = compact_table()
     table.padding = 0
     table.title = "packets, bytes" if small else "packets, kB"
     if step > 1:

@@ -42,7 +42,7 @@ def report_tables(report: "Report", *, title: str) -> Group:
     return Group(*(part for shown in parts for part in (shown, Text())))
 
 
-def grid() -> Table:
+def name_value_table() -> Table:
     """A table of names and values without lines."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim")
@@ -50,18 +50,18 @@ def grid() -> Table:
     return table
 
 
-def plain(*cells: str) -> tuple[Text, ...]:
+def literal_cells(*cells: str) -> tuple[Text, ...]:
     """Cells without markup, because names and paths may contain square brackets."""
     return tuple(Text(cell) for cell in cells)
 
 
-def columns() -> Table:
+def compact_table() -> Table:
     """A table whose ten columns of numbers fit into 80 characters."""
     return Table(box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False)
 
 
 def _frames(report: "Report", title: str) -> Table:
-    table = columns()
+    table = compact_table()
     table.title = Text(title)
     for name in ("frame", *BASIC, "bytes", "anchors", "free", "seconds"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -84,24 +84,24 @@ def _frames(report: "Report", title: str) -> Table:
 
 
 def _cameras(report: "Report") -> Table:
-    table = columns()
+    table = compact_table()
     for name in ("camera", "", *BASIC, "affine"):
         table.add_column(name, justify="left" if name in ("camera", "") else "right")
     for name, scores in report.cameras.items():
         affine = f"{scores.psnr_affine:.2f}"
-        table.add_row(*plain(name, report.stream["cameras"][name]), *_scores(scores), affine)
+        table.add_row(*literal_cells(name, report.stream["cameras"][name]), *_scores(scores), affine)
     return table
 
 
 def _further(report: "Report") -> Table:
     """The scores of ``FURTHER`` by camera, and their mean."""
-    table = columns()
+    table = compact_table()
     for name in ("camera", *(title for title, _, _ in FURTHER)):
         table.add_column(name, justify="left" if name == "camera" else "right")
     for name, scores in (*report.cameras.items(), ("mean", report.mean)):
         values = [getattr(scores, key) for _, key, _ in FURTHER]
         cells = ["-" if v is None else f"{v:.{digits}f}" for v, (_, _, digits) in zip(values, FURTHER, strict=True)]
-        table.add_row(*plain(name), *cells)
+        table.add_row(*literal_cells(name), *cells)
     return table
 
 
@@ -110,7 +110,7 @@ def _not_available(report: "Report") -> Table:
     reasons: dict[str, list[str]] = {}
     for name, reason in report.stream["not_available"].items():
         reasons.setdefault(reason, []).append(name)
-    table = grid()
+    table = name_value_table()
     for reason, names in reasons.items():
         table.add_row("not available", Text(f"{', '.join(names)}: {reason}", overflow="fold"))
     return table
@@ -118,7 +118,7 @@ def _not_available(report: "Report") -> Table:
 
 def _facts(report: "Report") -> Table:
     s = report.stream
-    table = grid()
+    table = name_value_table()
     table.add_row(
         "PSNR over time",
         f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
@@ -167,7 +167,7 @@ def _scores(scores: "Scores") -> list[str]:
     return ["-" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]
 
 
-def quality(report: "Report") -> str:
+def quality_text(report: "Report") -> str:
     """The mean PSNR as text, with that after frame 0's colour fit."""
     held = report.mean.psnr_camera_color
     beside = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"

@@ -5,7 +5,7 @@ from collections.abc import Set
 
 from torch import Tensor
 
-from structgstream.codec.container.blocks import coded_fields, unpacked_blocks
+from structgstream.codec.container.blocks import coded_payloads, unpack_raw_blocks
 from structgstream.codec.container.payload import FRAME
 from structgstream.codec.packets import Packet, StreamHeader
 from structgstream.codec.scene.compact import CompactDecoder, CompactState
@@ -42,9 +42,9 @@ class SceneDecoder:
         """
         header, where = self._header, f"Packet {packet.index}"
         if self._compact is None:
-            dynamic = unpacked_blocks(packet.payload, FRAME.size, where=where)
+            dynamic = unpack_raw_blocks(packet.payload, FRAME.size, where=where)
         else:
-            coded = coded_fields(packet.payload, FRAME.size, where=where)
+            coded = coded_payloads(packet.payload, FRAME.size, where=where)
             _check_fields(coded.keys(), header, where)
             dynamic = self._compact.decode(coded, kind=packet.kind, index=packet.index)
         _check_fields(dynamic.keys(), header, where)

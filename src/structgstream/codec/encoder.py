@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from structgstream.codec.container.blocks import coded_block, packed_block
-from structgstream.codec.container.payload import packet_with
+from structgstream.codec.container.blocks import pack_coded_block, pack_raw_block
+from structgstream.codec.container.payload import packet_from_blocks
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene.compact import CompactEncoder
@@ -41,7 +41,7 @@ class SceneEncoder:
         self._compact = None if header.codec == "raw" else CompactEncoder(header)
         self._last_pts_seconds = -math.inf
 
-    def follow(self, packet: Packet) -> Scene:
+    def replay(self, packet: Packet) -> Scene:
         """Continue after ``packet`` of another encoder, and return its scene; call it for every packet of the group.
 
         Raises:
@@ -49,7 +49,7 @@ class SceneEncoder:
         """
         scene = self._decoder.decode(packet)
         if self._compact is not None:
-            self._compact.follow(self._decoder.state)
+            self._compact.replay(self._decoder.state)
         self._last_pts_seconds = packet.pts_seconds
         return scene
 
@@ -68,13 +68,13 @@ class SceneEncoder:
         state = state_of(scene)
         coded = None if self._compact is None else self._compact.encode(state, kind=kind, index=index)
         blocks: dict[FieldName, bytes] = {
-            row.name: packed_block(row.name, state[row.name])
+            row.name: pack_raw_block(row.name, state[row.name])
             if coded is None
-            else coded_block(row.name, coded[row.name])
+            else pack_coded_block(row.name, coded[row.name])
             for row in STATE_TABLE
             if row.name in self._header.dynamic
         }
-        packet = packet_with(blocks, index=index, pts_seconds=pts_seconds, kind=kind)
+        packet = packet_from_blocks(blocks, index=index, pts_seconds=pts_seconds, kind=kind)
         encoded = Encoded(packet, self._decoder.decode(packet))
         self._last_pts_seconds = pts_seconds
         return encoded

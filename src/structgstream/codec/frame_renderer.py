@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.kernels.backend import Backend, BackendName, select_backend
-from structgstream.scene.render import quantised, render
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 
@@ -40,4 +40,4 @@ class FrameRenderer:
         if self._last is None or self._last[0] != index:
             self._last = None  # So that two scenes are not in memory at once.
             self._last = index, on_device(decode(index), self._backend.device)
-        return quantised(render(self._last[1], view, self._backend).image)
+        return to_8bit_image(render(self._last[1], view, self._backend).image)

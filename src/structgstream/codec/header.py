@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.container.blocks import coded_block, mixed_blocks, packed_block
-from structgstream.codec.container.init_record import description_of, first_block, packed_init
+from structgstream.codec.container.blocks import pack_coded_block, pack_raw_block, unpack_blocks
+from structgstream.codec.container.init_record import first_block, pack_init, read_description
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.scene.shapes import check_shapes
-from structgstream.codec.scene.static_fields import UNCODED_FIELDS, decoded_fields, encoded_fields
+from structgstream.codec.scene.static_fields import UNCODED_FIELDS, decode_fields, encode_fields
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
@@ -23,7 +23,7 @@ MAX_IMAGE_SIDE = 65_535
 _LEAST_STEP = 2.0**-64
 
 
-def packed_header(header: StreamHeader) -> bytes:
+def pack_header(header: StreamHeader) -> bytes:
     """The payload of an init record.
 
     Raises:
@@ -53,25 +53,25 @@ def packed_header(header: StreamHeader) -> bytes:
         **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
     }
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
-    coded = encoded_fields(fields, header.init_steps) if header.codec == "compact" else {}
+    coded = encode_fields(fields, header.init_steps) if header.codec == "compact" else {}
     blocks = [
-        coded_block(f.name, coded[f.name]) if f.name in coded else packed_block(f.name, part[f.name])
+        pack_coded_block(f.name, coded[f.name]) if f.name in coded else pack_raw_block(f.name, part[f.name])
         for part in (header.static, header.reference)
         for f in STATE_TABLE
         if f.name in part
     ]
-    return packed_init(description, blocks)
+    return pack_init(description, blocks)
 
 
-def unpacked_header(payload: bytes) -> StreamHeader:
+def unpack_header(payload: bytes) -> StreamHeader:
     """The header of an init record's payload.
 
     Raises:
         StreamError: the payload violates the format.
     """
-    values, coded = mixed_blocks(payload, first_block(payload), where="The init record")
+    values, coded = unpack_blocks(payload, first_block(payload), where="The init record")
     try:
-        description = description_of(payload)
+        description = read_description(payload)
         header = _header(description, _fields(description, values, coded))
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
@@ -100,7 +100,7 @@ def _fields(
         return values
     if plain := sorted(values.keys() - UNCODED_FIELDS):
         raise StreamError(f"The init record holds field {plain[0]} raw; expected coded.")
-    return values | decoded_fields(coded, _steps(description.get("init_steps", {})))
+    return values | decode_fields(coded, _steps(description.get("init_steps", {})))
 
 
 def _steps(found: object) -> dict[Any, float]:

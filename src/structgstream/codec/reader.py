@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.codec.container.blocks import blocks_in
-from structgstream.codec.container.damage import Damage, Search, next_index
-from structgstream.codec.container.index import indexed_offsets
-from structgstream.codec.container.init_record import field_bytes_of
-from structgstream.codec.container.payload import FRAME, packet_of
+from structgstream.codec.container.blocks import iterate_blocks
+from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes
+from structgstream.codec.container.damage import Damage, PacketSearch, next_index
+from structgstream.codec.container.index import read_index_offsets
+from structgstream.codec.container.init_record import field_sizes
+from structgstream.codec.container.payload import FRAME, parse_packet
 from structgstream.codec.container.records import (
     CHECKSUM,
     PREFIX,
@@ -33,16 +34,15 @@ from structgstream.codec.container.records import (
     Record,
     RecordType,
     check_prefix,
-    head_at,
+    incomplete_reason,
     prefix,
-    record_at,
-    scanned,
-    why_stopped,
+    read_head,
+    read_record,
+    scan_records,
 )
-from structgstream.codec.container.stored import Part, Stored, StoredFile
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.frame_renderer import FrameRenderer
-from structgstream.codec.header import unpacked_header
+from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName
@@ -80,7 +80,7 @@ class Packets(Sequence[PacketInfo]):
         StreamError: on indexing a packet that was damaged after the stream was opened.
     """
 
-    def __init__(self, data: Stored, name: str) -> None:
+    def __init__(self, data: ByteSource, name: str) -> None:
         self._data = data
         self._name = name
         self.offsets: array[int] = array("Q")
@@ -103,18 +103,18 @@ class Packets(Sequence[PacketInfo]):
     def at(self, index: int) -> PacketInfo:
         """Facts of the packet of a frame that is not lost."""
         offset = self.offsets[index]
-        head = head_at(self._data, offset)
+        head = read_head(self._data, offset)
         if head is None or head[0] not in _KINDS or head[1] < FRAME.size:
             raise self.damaged(index)
         start = offset + RECORD.size
-        payload = Part(self._data, start, start + head[1])
+        payload = ByteSlice(self._data, start, start + head[1])
         number, pts_seconds = FRAME.unpack(payload[: FRAME.size])
         if number != index:
             raise self.damaged(index)
         try:
-            blocks = [*blocks_in(payload, FRAME.size, where=f"Packet {index}")]
+            blocks = [*iterate_blocks(payload, FRAME.size, where=f"Packet {index}")]
         except StreamError as error:
-            if record_at(self._data, offset) is None:  # The record was damaged after opening.
+            if read_record(self._data, offset) is None:  # The record was damaged after opening.
                 raise self.damaged(index) from error
             raise
         field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
@@ -154,7 +154,7 @@ class StreamReader:
         StreamError: not a stream, another major version, no whole init record, or inconsistent records.
     """
 
-    def __init__(self, data: Stored, *, name: str = "The stream", by_index: bool = False) -> None:
+    def __init__(self, data: ByteSource, *, name: str = "The stream", by_index: bool = False) -> None:
         check_prefix(data, name)
         self._data = data
         self._name = name
@@ -163,15 +163,15 @@ class StreamReader:
         self.packets = Packets(data, name)
         self.runs: list[range] = []
         self.damage: list[Damage] = []
-        init = record_at(data, PREFIX.size)
+        init = read_record(data, PREFIX.size)
         if init is None:
-            raise StreamError(f"No frame of {name} can be decoded: {why_stopped(data, PREFIX.size)}.")
+            raise StreamError(f"No frame of {name} can be decoded: {incomplete_reason(data, PREFIX.size)}.")
         if init.type != RecordType.INIT:
             raise StreamError(f"{name} begins with a record of type {init.type}; an init record was expected.")
-        self.header = unpacked_header(init.payload)
+        self.header = unpack_header(init.payload)
         self.header_bytes = end = init.end
-        self.header_field_bytes = field_bytes_of(init.payload)
-        offsets = indexed_offsets(data, end) if by_index else None
+        self.header_field_bytes = field_sizes(init.payload)
+        offsets = read_index_offsets(data, end) if by_index else None
         if offsets is not None:
             self.packets.offsets = offsets
             self.packets.whole = len(offsets)
@@ -186,12 +186,12 @@ class StreamReader:
 
     def _scan(self, end: int) -> int:
         """Verify every record from byte ``end`` on; returns the end of the last whole one."""
-        search, seconds = Search(self._data), -math.inf
+        search, seconds = PacketSearch(self._data), -math.inf
         offsets = self.packets.offsets
         found: list[tuple[int, int]] = []  # damaged records and the frames expected there
         ended = False
         while not ended:
-            for record in scanned(self._data, end):
+            for record in scan_records(self._data, end):
                 end = record.end
                 if ended := record.type == RecordType.INDEX:
                     break
@@ -219,7 +219,7 @@ class StreamReader:
     def _reason(self, end: int) -> str:
         """Why the stream, read up to byte ``end``, is not complete."""
         if not self.damage:
-            return why_stopped(self._data, end)
+            return incomplete_reason(self._data, end)
         reason = f"the record at byte {self.damage[0].offset} of {self.total_bytes} is damaged"
         if len(self.damage) > 1:
             reason += f", and {len(self.damage) - 1} more"
@@ -239,7 +239,7 @@ class StreamReader:
             raise StreamError(f"{self._name} has a second init record, at byte {record.offset}.")
         if record.type not in _KINDS:
             return before_seconds
-        packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
+        packet = parse_packet(record.payload, _KINDS[RecordType(record.type)])
         offsets = self.packets.offsets
         if packet.index != len(offsets):
             raise StreamError(f"{self._name} has packet {packet.index} where packet {len(offsets)} belongs.")
@@ -267,7 +267,7 @@ class StreamReader:
 
     def close(self) -> None:
         """Closes the file, if there is one; later reads raise. Optional: dropping the reader closes it too."""
-        if isinstance(self._data, StoredFile):
+        if isinstance(self._data, FileBytes):
             self._data.close()
 
     def scene(self, index: int) -> Scene:
@@ -327,10 +327,10 @@ class StreamReader:
             yield self._packet(number)
 
     def _packet(self, index: int) -> Packet:
-        record = record_at(self._data, self.packets.offsets[index])
+        record = read_record(self._data, self.packets.offsets[index])
         if record is None or record.type not in _KINDS:
             raise self.packets.damaged(index)
-        packet = packet_of(record.payload, _KINDS[RecordType(record.type)])
+        packet = parse_packet(record.payload, _KINDS[RecordType(record.type)])
         if packet.index != index:
             raise self.packets.damaged(index)
         return packet
@@ -353,13 +353,13 @@ def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
     Raises:
         StreamError: there is no such file, or it is not a stream.
     """
-    data = StoredFile(path)
+    data = FileBytes(path)
     if not len(data):
         raise StreamError(f"{path} is empty; expected a stream made by structgstream reconstruct.")
     return StreamReader(data, name=str(path), by_index=by_index)
 
 
-def readable_part(data: Stored, *, name: str) -> int | None:
+def readable_part(data: ByteSource, *, name: str) -> int | None:
     """End of the last whole packet, before the index; None if the file is truncated within the init record.
 
     Raises:
@@ -370,21 +370,21 @@ def readable_part(data: Stored, *, name: str) -> int | None:
         return None  # Cut within the prefix, or empty.
     check_prefix(data, name)
     end, frames, complete = PREFIX.size, 0, False
-    for record in scanned(data):
+    for record in scan_records(data):
         if complete := record.type == RecordType.INDEX:
             break
         end = record.end
         frames += record.type in _KINDS
     if end > PREFIX.size:
         # A crash cannot leave whole frames after a damaged one; a failing disk can.
-        search = Search(data)
+        search = PacketSearch(data)
         if not complete and search.next(end, expected=frames, after_seconds=-math.inf) is not None:
             raise StreamError(
-                f"Cannot continue {name}: {why_stopped(data, end)}, and continuing would overwrite the whole frames "
-                f"after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them again."
+                f"Cannot continue {name}: {incomplete_reason(data, end)}, and continuing would overwrite the whole "
+                f"frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them again."
             )
         return end
-    reason = why_stopped(data, end)
+    reason = incomplete_reason(data, end)
     if "damaged" in reason:
         raise StreamError(f"Cannot continue {name}: {reason}. Start again with --overwrite.")
     return None

@@ -7,10 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from structgstream.codec.container.index import INDEX_ENTRY, packed_index
+from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes
+from structgstream.codec.container.index import INDEX_ENTRY, pack_index
 from structgstream.codec.container.records import RecordType, packed, prefix
-from structgstream.codec.container.stored import Part, Stored, StoredFile
-from structgstream.codec.header import packed_header
+from structgstream.codec.header import pack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import StreamReader, readable_part
 from structgstream.errors import StorageError
@@ -40,7 +40,7 @@ class _Writer:
         self._file.truncate(end)
 
     def open(self, header: StreamHeader) -> int:
-        return self._append(prefix() + packed(RecordType.INIT, packed_header(header)))
+        return self._append(prefix() + packed(RecordType.INIT, pack_header(header)))
 
     def write(self, packet: Packet) -> int:
         kind = _TYPES[packet.kind]
@@ -51,7 +51,7 @@ class _Writer:
         """Write index and footer and truncate the rest of an interrupted write; does nothing after a failed write."""
         if self._failed:
             return
-        self._append(packed_index(self._written().values(), self._end))
+        self._append(pack_index(self._written().values(), self._end))
         self._file.truncate(self._end)
 
     def _written(self) -> dict[int, tuple[int, int, int]]:
@@ -101,9 +101,9 @@ class FileSink:
             StreamError: the file is no stream, or is damaged so that it cannot be continued.
         """
         sink = cls(path, overwrite=True)
-        data: Stored = StoredFile(path) if sink.path.exists() else b""
+        data: ByteSource = FileBytes(path) if sink.path.exists() else b""
         end = readable_part(data, name=str(path))
-        reader = None if end is None else StreamReader(Part(data, 0, end), name=str(path))
+        reader = None if end is None else StreamReader(ByteSlice(data, 0, end), name=str(path))
         if end is None or reader is None or not reader.packets:
             return sink, None
         sink._resumed = (end, reader)

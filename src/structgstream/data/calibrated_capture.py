@@ -36,7 +36,7 @@ CONVERTERS = tuple(
 )
 
 
-def recognises_calibrated(path: Path) -> bool:
+def recognizes_calibrated(path: Path) -> bool:
     """Whether the folder has a calibration file that is known here, or one that is refused."""
     return _found(path) is not None or bool(_pickles(path))
 

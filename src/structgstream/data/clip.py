@@ -4,7 +4,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-from structgstream.data.json_videos import open_json_videos, recognises_json_videos
+from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
 from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 
@@ -16,7 +16,7 @@ def bundled_clip_path() -> Path:
         CaptureError: the installation lacks the clip.
     """
     folder = Path(str(files("structgstream.data") / "clip"))
-    if not recognises_json_videos(folder):
+    if not recognizes_json_videos(folder):
         raise CaptureError("The bundled clip is missing from the installation; reinstall structgstream.")
     return folder
 

@@ -9,7 +9,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 
 
-def recognises_colmap(path: Path) -> bool:
+def recognizes_colmap(path: Path) -> bool:
     """Whether the folder has a COLMAP model."""
     return find_model(path) is not None
 

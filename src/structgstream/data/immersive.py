@@ -33,7 +33,7 @@ EXPECTED = (
 )
 
 
-def recognises_immersive(path: Path) -> bool:
+def recognizes_immersive(path: Path) -> bool:
     """Whether the folder has this layout."""
     return (path / MODELS).is_file()
 
@@ -45,10 +45,10 @@ def open_immersive(path: Path) -> FrameSource:
         CaptureError: a video cannot be read.
         CalibrationError: a broken file, or videos of other proportions than it says.
     """
-    return open_posed(path, read_models(path / MODELS), target=_published, complete=False)
+    return open_posed(path, read_models(path / MODELS), target=_as_published, complete=False)
 
 
-def _published(filmed: LensCamera) -> Camera:
+def _as_published(filmed: LensCamera) -> Camera:
     shares = torch.tensor([[FOCAL_SHARE, 1, 1], [1, FOCAL_SHARE, 1], [1, 1, 1]], dtype=torch.float64)
     return replace(filmed.camera, K=filmed.camera.K * shares)
 

@@ -25,7 +25,7 @@ from structgstream.errors import CalibrationError, CaptureError
 FILE = "cameras.json"
 
 
-def recognises_json_videos(path: Path) -> bool:
+def recognizes_json_videos(path: Path) -> bool:
     """Whether the folder has this layout."""
     return (path / FILE).is_file()
 

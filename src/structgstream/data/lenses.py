@@ -165,14 +165,14 @@ class LensCamera:
         viewmat = self.camera.viewmat.numpy()
         local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
         depths = np.where(local[..., 2:] > 0, local[..., 2:], np.nan)
-        return self.placed(local[..., :2] / depths)
+        return self.to_pixels(local[..., :2] / depths)
 
-    def placed(self, normalised: Floats) -> Floats:
+    def to_pixels(self, normalised: Floats) -> Floats:
         """Distorted pixels ``[..., 2]`` of normalised points."""
         K = self.camera.K.numpy()
         return self.lens.distort(normalised) @ K[:2, :2].T + K[:2, 2]
 
-    def normalised(self, pixels: Floats) -> Floats:
+    def to_normalized(self, pixels: Floats) -> Floats:
         """Undistorted normalised points ``[..., 2]`` of pixels."""
         K = self.camera.K.numpy()
         return self.lens.undistort((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)

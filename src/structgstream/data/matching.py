@@ -122,7 +122,7 @@ def level_normal(cameras: Mapping[str, Camera]) -> Floats:
     return normal / max(float(np.linalg.norm(normal)), 1e-12)
 
 
-def neighbour_views(cameras: Mapping[str, Camera], *, count: int, distance: float) -> dict[str, tuple[str, ...]]:
+def neighbor_views(cameras: Mapping[str, Camera], *, count: int, distance: float) -> dict[str, tuple[str, ...]]:
     """For each camera the ``count`` others that see most of its volume under a useful parallax, best first.
 
     The volume is sampled around ``distance`` (see :func:`viewing_distance`). Too small a parallax gives no depth, too

@@ -28,7 +28,7 @@ HELD_OUT = ("cam00", "cam_0")
 MODELS = ("", "colmap", "colmap_0")
 
 
-def recognises_n3dv(path: Path) -> bool:
+def recognizes_n3dv(path: Path) -> bool:
     """Whether the folder has this layout."""
     return (path / POSES).is_file()
 

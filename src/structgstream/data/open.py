@@ -3,15 +3,15 @@
 
 from pathlib import Path
 
-from structgstream.data.calibrated_capture import open_calibrated, recognises_calibrated
+from structgstream.data.calibrated_capture import open_calibrated, recognizes_calibrated
 from structgstream.data.calibration import with_near
-from structgstream.data.colmap_capture import open_colmap, recognises_colmap
-from structgstream.data.immersive import open_immersive, recognises_immersive
-from structgstream.data.json_videos import open_json_videos, recognises_json_videos
-from structgstream.data.n3dv import open_n3dv, recognises_n3dv
-from structgstream.data.panoptic import open_panoptic, recognises_panoptic
+from structgstream.data.colmap_capture import open_colmap, recognizes_colmap
+from structgstream.data.immersive import open_immersive, recognizes_immersive
+from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
+from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
+from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
 from structgstream.data.source import FrameSource
-from structgstream.data.transforms_capture import open_transforms, recognises_transforms
+from structgstream.data.transforms_capture import open_transforms, recognizes_transforms
 from structgstream.data.wrappers import WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError
 
@@ -27,13 +27,13 @@ LAYOUTS = """Supported layouts:
                    OpenCV, with pictures or videos as COLMAP"""
 
 FORMATS = (
-    (recognises_panoptic, open_panoptic),
-    (recognises_json_videos, open_json_videos),
-    (recognises_n3dv, open_n3dv),
-    (recognises_immersive, open_immersive),
-    (recognises_colmap, open_colmap),
-    (recognises_transforms, open_transforms),
-    (recognises_calibrated, open_calibrated),
+    (recognizes_panoptic, open_panoptic),
+    (recognizes_json_videos, open_json_videos),
+    (recognizes_n3dv, open_n3dv),
+    (recognizes_immersive, open_immersive),
+    (recognizes_colmap, open_colmap),
+    (recognizes_transforms, open_transforms),
+    (recognizes_calibrated, open_calibrated),
 )
 
 
@@ -60,7 +60,7 @@ def open_capture(
         CaptureError: the folder is missing, empty or of an unknown layout, or its content is broken.
         ConfigError: an argument is invalid.
     """
-    source = _recognised(Path(path))
+    source = _recognized(Path(path))
     rig = source.rig
     if held_out is not None:
         rig = rig.with_held_out(frozenset(held_out))
@@ -76,7 +76,7 @@ def open_capture(
     return section(sized, start=start, frames=frames)
 
 
-def _recognised(path: Path) -> FrameSource:
+def _recognized(path: Path) -> FrameSource:
     if not path.exists():
         raise CaptureError(f"The capture {path} does not exist; give the folder that holds it.")
     if not path.is_dir():

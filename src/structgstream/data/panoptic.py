@@ -21,7 +21,7 @@ PANOPTIC_FPS = 30000 / 1001
 TRAIN, TEST = "train_meta.json", "test_meta.json"
 
 
-def recognises_panoptic(path: Path) -> bool:
+def recognizes_panoptic(path: Path) -> bool:
     """Whether the folder has this layout."""
     return (path / TRAIN).is_file()
 

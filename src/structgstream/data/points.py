@@ -22,7 +22,7 @@ from structgstream.data.matching import (
     guided_matches,
     inside,
     level_normal,
-    neighbour_views,
+    neighbor_views,
     project,
     sift_features,
     triangulate,
@@ -105,7 +105,7 @@ def initial_points(
     cameras = {name: rig[name] for name in rig.training}
     images = {name: frame.images[name] for name in rig.training}
     distance = viewing_distance(cameras)
-    neighbours = neighbour_views(cameras, count=config.neighbours, distance=distance)
+    neighbours = neighbor_views(cameras, count=config.neighbours, distance=distance)
     workers = max(1, min(len(cameras), os.cpu_count() or 1))
     positions, colors = _sift_points(cameras, images, neighbours, distance=distance, workers=workers, config=config)
     sources = np.zeros(len(positions), np.uint8)
@@ -116,8 +116,8 @@ def initial_points(
         )
         positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
         sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
-    kept = np.flatnonzero(_has_company(positions, cell=config.isolation_share * distance))
-    kept = kept[_thinned(positions[kept], cell=config.cell_share * distance, count=config.max_points)]
+    kept = np.flatnonzero(_has_neighbors(positions, cell=config.isolation_share * distance))
+    kept = kept[_thin_out(positions[kept], cell=config.cell_share * distance, count=config.max_points)]
     if len(kept) < config.min_points:
         _log.warning(
             "Only %d initial points could be triangulated from frame %d (too little texture or overlap); "
@@ -161,7 +161,7 @@ def _sift_points(
             )
 
         matches = dict(zip(pairs, pool.map(match, pairs), strict=True))
-    positions, names, pixels = _confirmed(cameras, features, matches, tolerance=config.confirm_pixels)
+    positions, names, pixels = _confirm_points(cameras, features, matches, tolerance=config.confirm_pixels)
     colors = np.empty((len(positions), 3), np.uint8)
     for index, name in enumerate(cameras):
         own = names == index
@@ -170,7 +170,7 @@ def _sift_points(
     return positions, colors
 
 
-def _confirmed(
+def _confirm_points(
     cameras: Mapping[str, Camera],
     features: Mapping[str, Features],
     matches: Mapping[tuple[str, str], NDArray[np.intp]],
@@ -237,7 +237,7 @@ def _depth_range(camera: Camera, points: Floats, distance: float, config: Points
     return max(near, 0.6 * float(low)), max(1.3 * float(high), 2 * near)
 
 
-def _has_company(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.bool_]:
+def _has_neighbors(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.bool_]:
     """Mask ``[P]`` of the points with at least ``least`` others in the 27 cells around them."""
     if len(points) == 0:
         return np.zeros(0, bool)
@@ -250,7 +250,7 @@ def _has_company(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.b
     return total > least
 
 
-def _thinned(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:
+def _thin_out(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:
     """Indices of one point per cell, of cells grown until at most ``count`` points remain.
 
     Unlike a random subset, cells keep points in sparse, textureless regions. The first point of a cell is kept, so

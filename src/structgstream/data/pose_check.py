@@ -24,7 +24,7 @@ from structgstream.data.matching import (
     epipolar_errors,
     fundamental_matrix,
     load_cv2,
-    neighbour_views,
+    neighbor_views,
     rays,
     sift_features,
     triangulate,
@@ -99,7 +99,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
     if check.conclusive and check.share_violating <= config.max_share:
         return check
     # Pairs chosen by wrong poses hardly match, so pairs chosen after undoing each common mistake are tested too.
-    readings = {name: _reread(given, change) for name, change in _MISTAKES.items()}
+    readings = {name: _reinterpret(given, change) for name, change in _MISTAKES.items()}
     pairs = dict.fromkeys(pair for cameras in (given, *readings.values()) for pair in _pairs(cameras, config))
     matches = matcher.matches(list(pairs))
     check = _judge(given, matches, config)
@@ -140,13 +140,13 @@ _MISTAKES: Mapping[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def _reread(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -> dict[str, Camera]:
+def _reinterpret(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -> dict[str, Camera]:
     return {name: replace(camera, viewmat=change(camera.viewmat)) for name, camera in cameras.items()}
 
 
 def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[tuple[str, str]]:
     """Pairs of neighbours, spread over the rig."""
-    pairs = unique_pairs(neighbour_views(cameras, count=2, distance=viewing_distance(cameras)))
+    pairs = unique_pairs(neighbor_views(cameras, count=2, distance=viewing_distance(cameras)))
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), config.pairs)).round().astype(int)
     return [pairs[index] for index in chosen]
 

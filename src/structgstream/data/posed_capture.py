@@ -29,7 +29,7 @@ from structgstream.data.picture_size import picture_size
 from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
-from structgstream.data.undistortion import rectilinear, undistorted
+from structgstream.data.undistortion import rectilinear, undistort
 from structgstream.data.video import VIDEO_SUFFIXES, VideoSource, scan_videos, synchronised
 from structgstream.errors import CalibrationError, CaptureError
 
@@ -68,15 +68,15 @@ def open_posed(
     for root in (path / name for name in ROOTS):
         if videos := _videos(root):
             videos = videos if complete else _posed(videos, calibration, root)
-            return undistorted(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
+            return undistort(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := _folders(root):
             files, poses = _layout(folders, calibration, root)
-            return undistorted(*of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
+            return undistort(*of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
     for root in (path / name for name in ("images", *REDUCED, "")):
         if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
             stills = _posed(stills, calibration, root)  # structure from motion often leaves out some photos
             poses = _poses(calibration, stills)
-            return undistorted(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
+            return undistort(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."

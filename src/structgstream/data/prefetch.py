@@ -6,13 +6,13 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from structgstream.data.wrappers import Wrapped
+from structgstream.data.wrappers import SourceWrapper
 from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
 
 
 @dataclass(frozen=True)
-class Prefetch(Wrapped):
+class Prefetch(SourceWrapper):
     """The same frames, decoded ahead in a background thread; results are unchanged.
 
     Args:

@@ -14,7 +14,7 @@ from structgstream.data.calibration_files.transforms import WHOLE, Shot, find, r
 from structgstream.data.posed import Calibration
 from structgstream.data.posed_capture import of_pictures, open_posed
 from structgstream.data.source import FrameSource
-from structgstream.data.undistortion import undistorted
+from structgstream.data.undistortion import undistort
 from structgstream.errors import CalibrationError
 
 SAME = 6  # digits in which poses of one camera agree
@@ -22,7 +22,7 @@ SAME = 6  # digits in which poses of one camera agree
 Cameras = Mapping[str, Sequence[Shot]]
 
 
-def recognises_transforms(path: Path) -> bool:
+def recognizes_transforms(path: Path) -> bool:
     """Whether the folder has this layout."""
     return bool(find(path))
 
@@ -46,7 +46,7 @@ def open_transforms(path: Path) -> FrameSource:
     source, filmed = of_pictures(path, pictures, poses, root=path, calibration=calibration)
     if (fps := json.loads(files[0].read_text()).get("fps")) is not None:
         source = replace(source, fps=float(fps))
-    return undistorted(source, filmed)
+    return undistort(source, filmed)
 
 
 def _by_pose(shots: Sequence[Shot], where: Path) -> Cameras:

@@ -74,7 +74,7 @@ def _filled(filmed: LensCamera) -> tuple[Floats, Floats]:
     for axis, along, edge in ((0, down, width), (1, across, height)):
         for at, worst in ((0.5, np.nanmax), (edge - 0.5, np.nanmin)):
             pixels = np.stack([np.full_like(along, at), along] if axis == 0 else [along, np.full_like(along, at)], -1)
-            seen = filmed.normalised(pixels)[:, axis]  # NaN where the lens sees no such thing: no bound
+            seen = filmed.to_normalized(pixels)[:, axis]  # NaN where the lens sees no such thing: no bound
             bounds.append(worst(seen) if np.isfinite(seen).any() else math.copysign(math.inf, at - 1))
     most = min(filmed.lens.reach, math.tan(math.radians(WIDEST_DEGREES) / 2))
     low, high = np.maximum(bounds[0::2], -most), np.minimum(bounds[1::2], most)
@@ -100,7 +100,7 @@ def _border(low: Floats, high: Floats) -> Floats:
 
 
 def _shows(filmed: LensCamera, normalised: Floats) -> bool:
-    return bool(_inside(filmed.placed(normalised), filmed.camera).all())
+    return bool(_inside(filmed.to_pixels(normalised), filmed.camera).all())
 
 
 def _inside(pixels: Floats, camera: Camera) -> NDArray[np.bool_]:
@@ -161,7 +161,7 @@ class Undistortion:
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
         """Mask ``[H, W]`` of the pinhole's pixels that the lens shows; None if all."""
-        shown = _inside(self.filmed.placed(_rays(self.target)), self.filmed.camera)
+        shown = _inside(self.filmed.to_pixels(_rays(self.target)), self.filmed.camera)
         if not shown.any():
             raise CalibrationError("The lens shows nothing of the requested field of view; give another.")
         return None if shown.all() else shown
@@ -169,7 +169,7 @@ class Undistortion:
     @cached_property
     def _levels(self) -> tuple[Level, ...]:
         """The first covers the whole picture; halved ones those parts where they are needed."""
-        pixels = self.filmed.placed(_rays(self.target))
+        pixels = self.filmed.to_pixels(_rays(self.target))
         halvings = _halvings(pixels, self.filmed.camera, self._size(0))
         most = max(math.ceil(float(halvings.max()) - 0.5), 0)
         shares = [np.ones_like(halvings), *(np.clip(halvings - number, 0, 1) for number in range(most))]
@@ -201,8 +201,8 @@ class Undistortion:
         pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
         straight = LensCamera(self.target, Pinhole())
         steps = [
-            self.filmed.placed(straight.normalised(pixels + axis))
-            - self.filmed.placed(straight.normalised(pixels - axis))
+            self.filmed.to_pixels(straight.to_normalized(pixels + axis))
+            - self.filmed.to_pixels(straight.to_normalized(pixels - axis))
             for axis in np.eye(2) / 2
         ]
         jacobians = np.stack(steps, -1)
@@ -223,11 +223,11 @@ def _halvings(pixels: Floats, camera: Camera, size: tuple[int, int]) -> Floats:
 def _rays(camera: Camera) -> Floats:
     """Normalised points ``[H, W, 2]`` of a pinhole's pixel centres."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
-    return LensCamera(camera, Pinhole()).normalised(pixels.astype(np.float64))
+    return LensCamera(camera, Pinhole()).to_normalized(pixels.astype(np.float64))
 
 
 @dataclass(frozen=True)
-class Undistorted(WithRig):
+class UndistortedSource(WithRig):
     """The frames of ``source``, taken with the lenses of ``filmed``, undistorted to the pinholes of the rig ``other``.
 
     Pictures of cameras without distortion whose size stays are passed through.
@@ -252,22 +252,22 @@ class Undistorted(WithRig):
         plan = self._plan(name)
         return None if plan is None else plan.shown
 
-    def resized(self, rig: CameraRig) -> "Undistorted":
+    def resized(self, rig: CameraRig) -> "UndistortedSource":
         """The same frames at the sizes of ``rig``, resampled once."""
         return replace(self, other=rig)
 
-    def passes(self, name: str) -> bool:
+    def is_unchanged(self, name: str) -> bool:
         """Whether the pictures of a camera are passed through."""
         filmed = self.filmed[name]
         return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
 
     def _plan(self, name: str) -> Undistortion | None:
         if name not in self._plans:
-            self._plans[name] = None if self.passes(name) else Undistortion(self.filmed[name], self.rig[name])
+            self._plans[name] = None if self.is_unchanged(name) else Undistortion(self.filmed[name], self.rig[name])
         return self._plans[name]
 
 
-def undistorted(
+def undistort(
     source: FrameSource, filmed: Mapping[str, LensCamera], *, target: Callable[[LensCamera], Camera] = rectilinear
 ) -> FrameSource:
     """A capture whose cameras have lenses, as one of pinholes; the source itself when none distorts.
@@ -286,5 +286,5 @@ def undistorted(
             cameras[name] = replace(target(filmed[name]), near=source.rig[name].near)
         except CalibrationError as error:
             raise CalibrationError(f"Camera {name!r} of {source.name}: {error}") from None
-    made = Undistorted(source, source.rig.mapped(cameras), filmed)
-    return source if all(made.passes(name) for name in made.rig) else made
+    made = UndistortedSource(source, source.rig.mapped(cameras), filmed)
+    return source if all(made.is_unchanged(name) for name in made.rig) else made

@@ -18,7 +18,7 @@ from structgstream.frames import MultiViewFrame
 
 
 @dataclass(frozen=True)
-class Wrapped:
+class SourceWrapper:
     """A source that passes everything through; base class of the wrappers."""
 
     source: FrameSource
@@ -47,7 +47,7 @@ class Wrapped:
 
 
 @dataclass(frozen=True)
-class WithRig(Wrapped):
+class WithRig(SourceWrapper):
     """The same frames under another rig of the same cameras: another held-out set, another near plane."""
 
     other: CameraRig
@@ -82,7 +82,7 @@ class Resizable(Protocol):
 
 
 @dataclass(frozen=True)
-class Section(Wrapped):
+class Section(SourceWrapper):
     """The frames ``first`` to ``first + length - 1`` of a capture, counted and timed from 0 again."""
 
     first: int
@@ -133,7 +133,7 @@ def section(source: FrameSource, *, start: int = 0, frames: int | None = None) -
     return source if (start, length) == (0, len(source)) else Section(source, start, length)
 
 
-def of_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
+def select_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
     """The capture restricted to these cameras, so that other pictures are not decoded.
 
     A rig needs two cameras, so with a single name another camera is kept. Sources of an unknown type are returned
@@ -144,12 +144,12 @@ def of_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
     if isinstance(source, ImageSource | VideoSource):
         return replace(source, rig=rig)
     if isinstance(source, WithRig):
-        return replace(source, source=of_cameras(source.source, names), other=rig)
-    return replace(source, source=of_cameras(source.source, names)) if isinstance(source, Wrapped) else source
+        return replace(source, source=select_cameras(source.source, names), other=rig)
+    return replace(source, source=select_cameras(source.source, names)) if isinstance(source, SourceWrapper) else source
 
 
 @dataclass(frozen=True)
-class Thinned(Wrapped):
+class EveryNthFrame(SourceWrapper):
     """Every ``step``-th frame, counted and timed from 0 as if they followed each other."""
 
     step: int
@@ -164,7 +164,7 @@ class Thinned(Wrapped):
             yield MultiViewFrame(index, index / self.fps, images)
 
 
-def thinned(source: FrameSource, step: int) -> FrameSource:
+def every_nth_frame(source: FrameSource, step: int) -> FrameSource:
     """Every ``step``-th frame of the capture, from the first.
 
     Raises:
@@ -172,4 +172,4 @@ def thinned(source: FrameSource, step: int) -> FrameSource:
     """
     if step < 1:
         raise ConfigError(f"The step between frames must be at least 1, got {step}.")
-    return source if step == 1 else Thinned(source, step)
+    return source if step == 1 else EveryNthFrame(source, step)

@@ -31,13 +31,13 @@ def affine_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[
     Both pictures are ``[H, W, 3]`` uint8. If the solution is not unique, as for a uniform picture, the least-norm one
     is returned.
     """
-    return _fitted(_planes(picture, truth))
+    return _fit_matrix(_planes(picture, truth))
 
 
-def corrected(picture: NDArray[np.uint8], matrix: NDArray[np.float64]) -> NDArray[np.float32]:
+def apply_color_matrix(picture: NDArray[np.uint8], matrix: NDArray[np.float64]) -> NDArray[np.float32]:
     """``picture`` ``[H, W, 3]`` through a 3x4 colour matrix, 0 to 255, clamped and not rounded."""
     height, width, _ = picture.shape
-    through = _through(_planes(picture), matrix)
+    through = _apply_matrix(_planes(picture), matrix)
     return through[:, : height * width].T.reshape(height, width, 3).numpy()
 
 
@@ -45,7 +45,7 @@ def psnr_affine(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     """PSNR of ``picture`` after its best affine change of colour towards ``truth``, dB."""
     planes = _planes(picture, truth)
     pixels = truth.size // 3
-    difference = _through(planes[:4], _fitted(planes))[:, :pixels] - planes[4:].flatten(1)[:, :pixels]
+    difference = _apply_matrix(planes[:4], _fit_matrix(planes))[:, :pixels] - planes[4:].flatten(1)[:, :pixels]
     return decibels(float(difference.square_().sum(dtype=torch.float64)) / (255.0**2 * truth.size))
 
 
@@ -67,12 +67,12 @@ def channel_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Channel
 
     Both are ``[H, W, 3]`` uint8. A constant channel gets gain 1, because it does not determine one.
     """
-    pairs = [_line(picture[..., channel], truth[..., channel]) for channel in range(3)]
+    pairs = [_fit_line(picture[..., channel], truth[..., channel]) for channel in range(3)]
     (r, g, b), biases = zip(*pairs, strict=True)
     return ChannelFit((r, g, b), biases)
 
 
-def _line(values: NDArray[np.uint8], targets: NDArray[np.uint8]) -> tuple[float, float]:
+def _fit_line(values: NDArray[np.uint8], targets: NDArray[np.uint8]) -> tuple[float, float]:
     x, y = values.astype(np.float64), targets.astype(np.float64)
     mean_x, mean_y = float(x.mean()), float(y.mean())
     x -= mean_x
@@ -106,7 +106,7 @@ def _planes(*pictures: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(planes).reshape(len(planes), -1, CHUNK)
 
 
-def _fitted(planes: Tensor) -> NDArray[np.float64]:
+def _fit_matrix(planes: Tensor) -> NDArray[np.float64]:
     # The normal equations are 4x4, so the fit costs a pass over the pixels.
     products = (planes.transpose(0, 1) @ planes.permute(1, 2, 0)).sum(0, dtype=torch.float64)  # [7, 7]
     scale = torch.tensor([1.0] + 6 * [255.0], dtype=torch.float64)
@@ -115,7 +115,7 @@ def _fitted(planes: Tensor) -> NDArray[np.float64]:
     return np.roll(solution, -1, axis=1).astype(np.float64)  # the ones come last in the matrix
 
 
-def _through(planes: Tensor, matrix: NDArray[np.float64]) -> Tensor:
+def _apply_matrix(planes: Tensor, matrix: NDArray[np.float64]) -> Tensor:
     """The first four planes through a 3x4 matrix, ``[3, pixels]``, 0 to 255, clamped."""
     scaled = torch.from_numpy(np.roll(matrix * [1.0, 1.0, 1.0, 255.0], 1, axis=1)).float()
     return (scaled @ planes.flatten(1)).clamp_(0.0, 255.0)

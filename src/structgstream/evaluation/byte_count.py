@@ -36,7 +36,7 @@ class Group:
     sizes: Mapping[str, float]
 
 
-def rows_of(reader: StreamReader) -> list[Row]:
+def packet_rows(reader: StreamReader) -> list[Row]:
     """The packet of every frame that can be decoded."""
     infos = (reader.packets.at(index) for run in reader.runs for index in run)
     return [
@@ -57,7 +57,7 @@ def with_rest(sizes: Mapping[str, int], whole: int) -> dict[str, int]:
     return {**sizes, REST: whole - sum(sizes.values())}
 
 
-def fields_of(sizes: Iterable[Mapping[str, float]]) -> list[str]:
+def occurring_fields(sizes: Iterable[Mapping[str, float]]) -> list[str]:
     """The fields that occur, largest sum first, :data:`REST` last."""
     sums: dict[str, float] = {}
     for one in sizes:
@@ -81,7 +81,7 @@ def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
 
 def mean_of(rows: Sequence[Row]) -> Group:
     """The mean of at least one packet."""
-    names = fields_of(row.sizes for row in rows)
+    names = occurring_fields(row.sizes for row in rows)
     sizes = {name: sum(row.sizes.get(name, 0) for row in rows) / len(rows) for name in names}
     return Group(len(rows), sum(row.bytes for row in rows) / len(rows), sizes)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.evaluation.byte_count import REST, Parts, Row
-from structgstream.evaluation.figure import COLOURS, INK, OTHER, figure_of, save_figure, without_frame
+from structgstream.evaluation.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -35,7 +35,7 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
         MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
-    colours = colours_of(parts)
+    colours = field_colors(parts)
     across = 0.34 * len(parts) + 0.3
     figure = figure_of(10.0, 4.4 + across)
     top, bottom = figure.subplots(2, 1, height_ratios=(3.6, across))
@@ -46,14 +46,14 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
     save_figure(figure, path)
 
 
-def colours_of(parts: Parts) -> dict[str, str]:
+def field_colors(parts: Parts) -> dict[str, str]:
     """A colour for each field above :data:`SMALL`: by parts from the last on, in a part by size."""
     colours: dict[str, str] = {}
     for sizes in reversed(parts.values()):
         whole = sum(sizes.values())
         for field, size in sorted(sizes.items(), key=lambda item: -item[1]):
-            if field != REST and size >= SMALL * whole and field not in colours and len(colours) < len(COLOURS):
-                colours[field] = COLOURS[len(colours)]
+            if field != REST and size >= SMALL * whole and field not in colours and len(colours) < len(COLORS):
+                colours[field] = COLORS[len(colours)]
     return {**colours, REST: OTHER}
 
 

@@ -15,7 +15,7 @@ from structgstream.cameras import Camera
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import PacketInfo
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import of_cameras
+from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.affine import ChannelFit, channel_fit, psnr_affine, psnr_camera_color
 from structgstream.evaluation.environment import environment
@@ -27,15 +27,20 @@ from structgstream.evaluation.facts import (
     training_facts,
 )
 from structgstream.evaluation.flow import Flow
-from structgstream.evaluation.instruments import Seen, Selection, instruments, measured
 from structgstream.evaluation.masks import changed_pixels
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors, ssim
-from structgstream.evaluation.recording import Drawable, Recording, placed
-from structgstream.evaluation.report import FrameScores, Report, Scores, course, drawing_facts, mean_scores
+from structgstream.evaluation.optional_metrics import (
+    ComparedFrame,
+    MetricSelection,
+    load_optional_metrics,
+    optional_scores,
+)
+from structgstream.evaluation.recording import Drawable, Recording, to_device
+from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
 from structgstream.frame_report import counts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
-from structgstream.scene.render import quantised, render
+from structgstream.scene.render import render, to_8bit_image
 
 Picture = NDArray[np.uint8]
 
@@ -64,7 +69,7 @@ def evaluate(
     cameras: tuple[str, ...] | None = None,
     log: Mapping[int, Mapping[str, Any]] | None = None,
     observer: Observer | None = None,
-    metrics: Selection = "all",
+    metrics: MetricSelection = "all",
     flow: Flow | None = None,
     lpips_weights: Path | None = None,
 ) -> Report:
@@ -91,17 +96,19 @@ def evaluate(
     check_same_rig(recording.header, source, names)
     check_same_frames(recording, source)
     views = {name: recording.header.camera(name) for name in names}
-    tools = None
+    optional_metrics = None
     if metrics == "all":
         size = len(recording.packets)
-        tools = instruments(views.items(), frames=size, device=backend.device, flow=flow, lpips_weights=lpips_weights)
+        optional_metrics = load_optional_metrics(
+            views.items(), frames=size, device=backend.device, flow=flow, lpips_weights=lpips_weights
+        )
     first: dict[str, Picture] = {}
     colors: dict[str, ChannelFit] = {}
-    before: dict[str, Seen] = {}
+    before: dict[str, ComparedFrame] = {}
     frames = []
     peaks = PeakMeter(backend.device)
     for frame, (info, scene, decode_seconds) in zip(
-        of_cameras(source, names).frames(), decoded(recording, backend.device)
+        select_cameras(source, names).frames(), decoded(recording, backend.device)
     ):
         compared = []
         for name in names:
@@ -111,9 +118,14 @@ def evaluate(
             if name not in colors:
                 colors[name] = channel_fit(picture, truth)
             scores = score(picture, truth, first[name], backend=backend, seconds=seconds, color=colors[name])
-            if tools is not None:
-                further, before[name] = measured(
-                    tools, truth=truth, picture=picture, before=before.get(name), camera=name, index=info.index
+            if optional_metrics is not None:
+                further, before[name] = optional_scores(
+                    optional_metrics,
+                    truth=truth,
+                    picture=picture,
+                    before=before.get(name),
+                    camera=name,
+                    index=info.index,
                 )
                 scores = replace(scores, **further)
             compared.append(Compared(name, truth, picture, scores))
@@ -122,11 +134,11 @@ def evaluate(
         frames.append(_frame_scores(info, scene, compared, decode_seconds, dict((log or {}).get(info.index, {}))))
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in names}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
-    facts = stream_facts(recording, names) | course([frame.mean.psnr for frame in frames])
+    facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames])
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
     facts |= {"camera_colors": {name: vars(fit) for name, fit in colors.items()}}
-    facts |= {"metrics": metrics, "not_available": dict(tools.not_available) if tools else {}}
-    facts |= {"lpips_weights": dict(tools.weights) if tools else {}}
+    facts |= {"metrics": metrics, "not_available": dict(optional_metrics.not_available) if optional_metrics else {}}
+    facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
     peaks.end(EVALUATION)
     machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
     return Report(frames, by_camera, mean, facts, machine)
@@ -136,7 +148,7 @@ def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[Packet
     """Every frame on ``device``, with the seconds of reading, decoding and copying it."""
     began = time.perf_counter()
     for info, drawable in recording.scenes(0):
-        drawable = placed(drawable, device)
+        drawable = to_device(drawable, device)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         yield info, drawable, time.perf_counter() - began
@@ -191,7 +203,7 @@ def score(
 def rendered(scene: Drawable, camera: Camera, backend: Backend) -> tuple[Picture, float]:
     """The 8-bit picture of ``camera`` (scene units), and the seconds until it was in main memory."""
     began = time.perf_counter()
-    picture = quantised(render(scene, camera, backend).image)
+    picture = to_8bit_image(render(scene, camera, backend).image)
     return picture, time.perf_counter() - began
 
 
@@ -205,8 +217,8 @@ def compared_frames(
     """
     check_same_rig(recording.header, source, (camera,))
     view = recording.header.camera(camera)
-    for frame, (_, scene) in zip(of_cameras(source, (camera,)).frames(), recording.scenes(0)):
-        yield frame.images[camera], rendered(placed(scene, backend.device), view, backend)[0]
+    for frame, (_, scene) in zip(select_cameras(source, (camera,)).frames(), recording.scenes(0)):
+        yield frame.images[camera], rendered(to_device(scene, backend.device), view, backend)[0]
 
 
 def _frame_scores(

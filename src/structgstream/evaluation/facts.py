@@ -11,7 +11,7 @@ from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.source import FrameSource
 from structgstream.data.video import VideoSource
-from structgstream.data.wrappers import Section, Wrapped
+from structgstream.data.wrappers import Section, SourceWrapper
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.recording import Recording
 
@@ -84,7 +84,7 @@ def start_of(source: FrameSource) -> int | None:
     if isinstance(source, Section):
         inner = start_of(source.source)
         return None if inner is None else inner + source.first
-    if isinstance(source, Wrapped):
+    if isinstance(source, SourceWrapper):
         return start_of(source.source)
     return 0 if isinstance(source, ImageSource | VideoSource) else None
 

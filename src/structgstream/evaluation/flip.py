@@ -175,11 +175,11 @@ def _length(x: Plane, y: Plane) -> Plane:
 
 def _largest_color_difference() -> float:
     """Of pure green and pure blue, the furthest apart that a display has, to the exponent."""
-    green, blue = (_hunted(color) for color in (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])))
+    green, blue = (_hunt_adjusted(color) for color in (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])))
     return float((abs(green[0] - blue[0]) + np.hypot(*(green - blue)[1:])) ** COLOR_EXPONENT)
 
 
-def _hunted(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hunt_adjusted(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     xyz = TO_XYZ @ linear
     root = np.where(xyz > DELTA**3, np.cbrt(xyz), xyz / (3 * DELTA**2) + 4 / 29)
     light, red, yellow = TO_LAB[:, :3] @ root + TO_LAB[:, 3]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.flow import agreeing, dis_search
+from structgstream.flow import consistency_mask, dis_search
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ Flow = Callable[[NDArray[np.uint8], NDArray[np.uint8], str, int], FlowField]
 
 
 def dis_flow() -> Flow:
-    """Flow by dense inverse search in both directions; consistent pixels (``flow.agreeing``) count as seen.
+    """Flow by dense inverse search in both directions; consistent pixels (``flow.consistency_mask``) count as seen.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -40,6 +40,6 @@ def dis_flow() -> Flow:
 
     def field(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: str, index: int) -> FlowField:
         backward = search(now, before)
-        return FlowField(backward, agreeing(backward, search(before, now)))
+        return FlowField(backward, consistency_mask(backward, search(before, now)))
 
     return field

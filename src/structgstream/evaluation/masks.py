@@ -26,15 +26,15 @@ def changed_pixels(truth: NDArray[np.uint8], first: NDArray[np.uint8]) -> NDArra
     size = 2 * SMOOTHED + 1
     across = sum((padded[:, x : x + width] for x in range(1, size)), start=padded[:, :width])
     total = sum((across[y : y + height] for y in range(1, size)), start=across[:height])
-    return grown(total > THRESHOLD * (255 * 3 * size**2), GROWN)
+    return dilate(total > THRESHOLD * (255 * 3 * size**2), GROWN)
 
 
-def grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     """``mask`` ``[H, W]`` dilated by a square that reaches ``pixels`` to each side."""
-    return _grown_down(_grown_down(mask, pixels).T, pixels).T
+    return _dilate_down(_dilate_down(mask, pixels).T, pixels).T
 
 
-def _grown_down(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def _dilate_down(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     result = mask.copy()
     for step in range(1, pixels + 1):
         result[step:] |= mask[:-step]

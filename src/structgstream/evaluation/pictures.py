@@ -36,7 +36,7 @@ def thumbnail(picture: Picture, largest: int = LARGEST_TILE) -> Picture:
     return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
 
-def sampled(count: int, columns: int) -> list[int]:
+def spread_indices(count: int, columns: int) -> list[int]:
     """At most ``columns`` frame numbers below ``count``, evenly spread, the first and the last among them."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(columns, count))})
 

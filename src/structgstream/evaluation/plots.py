@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from structgstream.evaluation.figure import COLOURS, INK, OTHER, figure_of, save_figure, without_frame
+from structgstream.evaluation.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.evaluation.report import FrameScores, Report
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _quality(axis: "Axes", report: Report) -> None:
         axis.plot(
             index,
             values,
-            color=COLOURS[number % len(COLOURS)],
+            color=COLORS[number % len(COLORS)],
             linewidth=1,
             alpha=0.75,
             label=f"camera {name}",
@@ -78,7 +78,7 @@ def _flicker(axis: "Axes", report: Report) -> None:
 
 def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> None:
     """Plots the mean over cameras of metrics whose best value is 0, each always in the same colour."""
-    for colour, (key, label) in zip(COLOURS, keys):
+    for colour, (key, label) in zip(COLORS, keys):
         if points := _known(report, key):
             axis.plot(*zip(*points), color=colour, linewidth=1.5, label=label)
     axis.set_ylim(bottom=0)
@@ -114,11 +114,11 @@ def _seconds(axis: "Axes", report: Report) -> None:
 
 def _counts(axis: "Axes", report: Report) -> None:
     index = [frame.index for frame in report.frames]
-    axis.plot(index, [frame.anchors for frame in report.frames], color=COLOURS[0], linewidth=1.5, label="anchors")
+    axis.plot(index, [frame.anchors for frame in report.frames], color=COLORS[0], linewidth=1.5, label="anchors")
     axis.plot(
         index,
         [frame.free for frame in report.frames],
-        color=COLOURS[3],
+        color=COLORS[3],
         linewidth=1.5,
         label="free Gaussians",
     )
@@ -131,7 +131,7 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
     whole = sum(array.sum() for array in values.values())
     shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
-    colours = cycle(COLOURS)
+    colours = cycle(COLORS)
     for name in shown:
         colour = OTHER if name == "other" else next(colours)
         axis.bar(index, values[name], bottom=base, width=0.85, color=colour, label=name.replace("_", " "))

@@ -47,7 +47,7 @@ class Recording(Protocol):
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Drawable]]: ...
 
 
-def placed(drawable: Drawable, device: torch.device) -> Drawable:
+def to_device(drawable: Drawable, device: torch.device) -> Drawable:
     """The drawable with its tensors on ``device``.
 
     Raises:

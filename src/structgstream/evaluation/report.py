@@ -123,7 +123,7 @@ def slope(values: Sequence[float]) -> float:
     return float(np.polyfit(np.arange(len(values)), values, 1)[0]) if len(values) > 1 else 0.0
 
 
-def course(psnrs: Sequence[float]) -> dict[str, float]:
+def psnr_trend(psnrs: Sequence[float]) -> dict[str, float]:
     """PSNR over the frames: first, last, worst, slope and the largest drop from the first, in dB."""
     return {
         "psnr_first": psnrs[0],

@@ -7,7 +7,7 @@ The MLPs give a structured Gaussian's opacity, shape and colour for one camera; 
 Gaussian has one opacity and one shape. They are averages over the training cameras, matched by id; the colour is a
 least-squares fit of spherical harmonics to the colours for these cameras. A ridge term shrinks all but the constant
 coefficient, because a dozen cameras on one side hardly constrain the other directions. ``docs/export.md`` has the
-measurements behind the defaults of :class:`Baking`.
+measurements behind the defaults of :class:`BakingConfig`.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from structgstream.cameras import Camera
 from structgstream.errors import StreamError
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import Backend
@@ -32,7 +32,7 @@ LEAST_OPACITY = 1.0 / 255.0
 
 
 @dataclass(frozen=True)
-class Baking:
+class BakingConfig:
     """Configuration of baking.
 
     Args:
@@ -52,7 +52,9 @@ class Baking:
     weight: Literal["opacity", "blend"] = "opacity"
 
 
-def baked(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: Baking | None = None) -> BakedGaussians:
+def bake(
+    scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: BakingConfig | None = None
+) -> BakedGaussians:
     """Plain Gaussians that look from ``cameras``, and between them, like ``scene`` (Note [Baking]).
 
     Args:
@@ -67,7 +69,7 @@ def baked(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: 
     Raises:
         StreamError: no camera draws any Gaussian.
     """
-    baking = baking or Baking()
+    baking = baking or BakingConfig()
     anchors = scene.anchors
     sums = _Sums(anchors.offsets.shape[0] * anchors.offsets_per_anchor + len(scene.free), anchors.positions, baking)
     with torch.no_grad():
@@ -76,7 +78,7 @@ def baked(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: 
             slots = generated.anchors[:, None] * anchors.offsets_per_anchor
             slots = (slots + torch.arange(anchors.offsets_per_anchor, device=slots.device)).flatten()
             free = torch.arange(sums.seen.shape[0] - len(scene.free), sums.seen.shape[0], device=slots.device)
-            sums.add(scene.dressed(generated), camera, backend, seen=torch.cat([slots, free]))
+            sums.add(scene.with_free_gaussians(generated), camera, backend, seen=torch.cat([slots, free]))
         return sums.result()
 
 
@@ -93,7 +95,7 @@ def blend_weights(gaussians: Gaussians, camera: Camera, backend: Backend) -> Ten
 class _Sums:
     """Sums over cameras, one row for each id."""
 
-    def __init__(self, count: int, like: Tensor, baking: Baking) -> None:
+    def __init__(self, count: int, like: Tensor, baking: BakingConfig) -> None:
         terms = (baking.degree + 1) ** 2
         self.baking = baking
         self.means, self.weight = like.new_zeros(count, 3), like.new_zeros(count)

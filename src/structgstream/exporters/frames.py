@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from structgstream.codec.reader import StreamReader
-from structgstream.exporters.bake import Baking, baked
+from structgstream.exporters.bake import BakingConfig, bake
 from structgstream.exporters.formats import Format
 from structgstream.exporters.request import is_one_file
 from structgstream.exporters.write import write_gaussians
@@ -47,11 +47,11 @@ def write_frames(
         StorageError: a file cannot be written.
     """
     single = is_one_file(output)
-    baking = Baking() if degree is None else replace(Baking(), degree=degree)
+    baking = BakingConfig() if degree is None else replace(BakingConfig(), degree=degree)
     header = reader.header
     cameras = [header.camera(name) for name in header.rig.training]
     for number in numbers:
-        plain = baked(on_device(reader.scene(number), backend.device), cameras, backend, baking=baking)
+        plain = bake(on_device(reader.scene(number), backend.device), cameras, backend, baking=baking)
         path = output if single else output / f"frame_{number:06d}.{format}"
         size_bytes = write_gaussians(path, plain.in_capture_units(header.similarity), format=format)
         yield WrittenFrame(path, size_bytes, len(plain))

@@ -9,7 +9,7 @@ opacity, logarithms of the scales, and a quaternion wxyz.
 import numpy as np
 import torch
 
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 
 LEAST_OPACITY = 1e-6  # A logit of 0 or 1 is not finite.
 

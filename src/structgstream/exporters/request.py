@@ -62,7 +62,7 @@ def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: 
         raise ConfigError("a page holds the whole stream; --frame, --frames and --sh-degree are for other formats.")
 
 
-def checked_degree(degree: int | None, format: Format) -> int | None:
+def check_degree(degree: int | None, format: Format) -> int | None:
     """The degree to bake, or None for the default.
 
     Raises:
@@ -79,7 +79,7 @@ def checked_degree(degree: int | None, format: Format) -> int | None:
     return degree
 
 
-def chosen_frames(
+def choose_frames(
     runs: Sequence[range], output: Path, *, frame: int | None, frames: tuple[int, int] | None
 ) -> list[int]:
     """Numbers of the frames to write.

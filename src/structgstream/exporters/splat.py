@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.scene.harmonics import Y0
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

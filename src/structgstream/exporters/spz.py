@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 
 MAGIC, VERSION = 0x5053474E, 2
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved

@@ -4,7 +4,7 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.formats import Format
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.splat import splat_bytes

@@ -12,8 +12,8 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.cuda_tiles import PairBudget, tile_lists
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection, tiles_of
-from structgstream.kernels.reference_raster import in_tiles, reaching, trained_alone
+from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection, tile_grid
+from structgstream.kernels.reference_raster import boxes_reaching_tiles, detach_untrained, restrict_to_tiles
 
 
 def cuda_reason() -> str | None:
@@ -45,7 +45,7 @@ def rasterize(
     """
     from gsplat.cuda._wrapper import rasterize_to_pixels  # pyright: ignore[reportMissingImports]
 
-    gaussians, screen_offsets = trained_alone(gaussians, screen_offsets, trained)
+    gaussians, screen_offsets = detach_untrained(gaussians, screen_offsets, trained)
     radii, means2d, depths, conics = _projected(gaussians, viewport)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[None]
@@ -67,8 +67,8 @@ def rasterize(
     drawn = radii[0].amax(-1).float()
     if tiles is not None:
         center = means2d[0].detach()
-        drawn = torch.where(reaching(center - radii[0], center + radii[0], tiles), drawn, 0.0)
-    return in_tiles(image[0], alpha[0, :, :, 0], drawn, tiles, onto)
+        drawn = torch.where(boxes_reaching_tiles(center - radii[0], center + radii[0], tiles), drawn, 0.0)
+    return restrict_to_tiles(image[0], alpha[0, :, :, 0], drawn, tiles, onto)
 
 
 def _projected(gaussians: Gaussians, viewport: Viewport) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -114,7 +114,7 @@ def _pair_lists(
         return lists.starts[None], lists.ids, masks
     from gsplat.cuda._wrapper import isect_offset_encode, isect_tiles  # pyright: ignore[reportMissingImports]
 
-    rows, columns = tiles_of(viewport.width, viewport.height)
+    rows, columns = tile_grid(viewport.width, viewport.height)
     _, pairs, ids = isect_tiles(means2d, radii, depths, TILE_PIXELS, columns, rows, packed=False, n_images=1)
     starts = isect_offset_encode(pairs, 1, columns, rows).reshape(1, rows, columns)
     return starts, ids, None if masks is None else masks[None]

@@ -16,7 +16,7 @@ from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
 from structgstream.kernels.raster_types import TileSelection
-from structgstream.kernels.reference_anchors import seen_anchors
+from structgstream.kernels.reference_anchors import visible_anchor_mask
 
 
 def generate_structured(
@@ -35,7 +35,7 @@ def generate_structured(
     """
     positions, log_offset_scales, log_base_scales, offsets, features = anchors
     count, k = offsets.shape[:2]
-    seen = seen_anchors(anchors, viewport, tiles)
+    seen = visible_anchor_mask(anchors, viewport, tiles)
     to_anchor = positions - (viewport.center if seen_from is None else seen_from)
     distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)
     parts = [features, to_anchor / distance]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels.prototypes import CUDA_PROTOTYPES, addresses, declare
-from structgstream.kernels.raster_types import TileSelection, tiles_of
+from structgstream.kernels.raster_types import TileSelection, tile_grid
 from structgstream.kernels.ssim_arguments import Comparison
 
 
@@ -55,7 +55,7 @@ def cuda_stream(device: torch.device) -> int:
 class _L1SSIM(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, library: LossLibrary, image: Tensor, comparison: Comparison) -> tuple[Tensor, Tensor]:
-        rows, columns = tiles_of(image.shape[1], image.shape[0])
+        rows, columns = tile_grid(image.shape[1], image.shape[0])
         adjoints = image.new_empty(3, *image.shape) if ctx.needs_input_grad[1] else None
         sums, means = image.new_empty(2, rows * columns), image.new_empty(2)
         library.call(

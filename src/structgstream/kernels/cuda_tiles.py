@@ -18,7 +18,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from structgstream.kernels.raster_types import TILE_PIXELS, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, tile_grid
 
 _log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class PairBudget:
 Result = TypeVar("Result")
 
 
-def with_enough_room(work: Callable[[PairBudget], Result], *, capacity: int, device: torch.device) -> Result:
+def run_with_pair_budget(work: Callable[[PairBudget], Result], *, capacity: int, device: torch.device) -> Result:
     """The result of ``work``, repeated with a larger budget until the capacity suffices."""
     while True:
         budget = PairBudget.of(capacity, device)
@@ -85,7 +85,7 @@ def tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, *, width: int, he
         height: of the picture, pixels.
         capacity: pairs, see Note [Pairs without waiting].
     """
-    rows, columns = tiles_of(width, height)
+    rows, columns = tile_grid(width, height)
     with torch.no_grad():
         drawn = (radii > 0).all(1)
         order = torch.where(drawn, depths, torch.inf).argsort(stable=True)

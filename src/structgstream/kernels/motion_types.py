@@ -25,7 +25,7 @@ class ViewFlows(NamedTuple):
     near: Tensor
 
 
-class Neighbours(NamedTuple):
+class Neighbors(NamedTuple):
     """The movers whose flow determines each of ``T`` targets.
 
     Args:

@@ -26,7 +26,7 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
-from structgstream.kernels.motion_types import Lifted, Neighbours, SweepView, Swept, ViewFlows
+from structgstream.kernels.motion_types import Lifted, Neighbors, SweepView, Swept, ViewFlows
 from structgstream.kernels.raster_types import RasterOutput, TileSelection
 
 
@@ -142,7 +142,7 @@ class Lift(Protocol):
     """
 
     def __call__(
-        self, centers: Tensor, seen: ViewFlows, neighbours: Neighbours, priors: Tensor, *, share: float
+        self, centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor, *, share: float
     ) -> Lifted: ...
 
 

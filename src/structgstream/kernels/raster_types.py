@@ -10,7 +10,7 @@ TILE_PIXELS = 16
 """Side of a tile, pixels; parts of a picture are selected by tile."""
 
 
-def tiles_of(width: int, height: int) -> tuple[int, int]:
+def tile_grid(width: int, height: int) -> tuple[int, int]:
     """Number of rows and columns of tiles of a picture; the last ones may be partial."""
     return -(-height // TILE_PIXELS), -(-width // TILE_PIXELS)
 
@@ -31,7 +31,7 @@ class TileSelection:
 
     def __post_init__(self) -> None:
         assert self.mask.dtype == torch.bool, self.mask.dtype
-        assert self.mask.shape == tiles_of(self.width, self.height), (self.mask.shape, self.width, self.height)
+        assert self.mask.shape == tile_grid(self.width, self.height), (self.mask.shape, self.width, self.height)
 
     def pixels(self) -> Tensor:
         """Mask ``[H, W]`` of the pixels in the selected tiles."""

@@ -15,7 +15,7 @@ BOX_MARGIN_PIXELS = 2.0
 """Margin for the rasteriser's low-pass filter, which widens the smallest Gaussian to this."""
 
 
-def seen_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
+def visible_anchor_mask(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
     """Mask ``[M]`` bool of the anchors whose ball of Gaussians reaches the picture, or one of the ``tiles``."""
     size = (viewport.width, viewport.height)
     with torch.no_grad():
@@ -56,8 +56,8 @@ def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) ->
 
 
 def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
-    """Indices ``[m]`` int64, ascending, of the anchors that :func:`seen_anchors` marks."""
-    return seen_anchors(anchors, viewport, tiles).nonzero()[:, 0]
+    """Indices ``[m]`` int64, ascending, of the anchors that :func:`visible_anchor_mask` marks."""
+    return visible_anchor_mask(anchors, viewport, tiles).nonzero()[:, 0]
 
 
 def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:

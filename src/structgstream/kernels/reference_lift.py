@@ -4,7 +4,7 @@
 import torch
 from torch import Tensor
 
-from structgstream.kernels.motion_types import Lifted, Neighbours, ViewFlows
+from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 
 ROBUST_PIXELS = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
 """Scale of the Geman-McClure weights in each round after the first, which has none."""
@@ -24,12 +24,12 @@ def projection_jacobians(centers: Tensor, viewmats: Tensor, Ks: Tensor, near: Te
     return (local @ viewmats[:, None, :3, :3]) * front[..., None, None]
 
 
-def lift(centers: Tensor, seen: ViewFlows, neighbours: Neighbours, priors: Tensor, *, share: float) -> Lifted:
+def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor, *, share: float) -> Lifted:
     """See ``kernels.operations.Lift``."""
     jacobians = projection_jacobians(centers, seen.viewmats, seen.Ks, seen.near)
     usable = seen.weights * (jacobians.abs().sum((-1, -2)) > 0)
-    w = neighbours.affinities[None] * usable[:, neighbours.rows]  # [V, T, N]
-    J, f = jacobians[:, neighbours.rows], seen.flows[:, neighbours.rows]
+    w = neighbors.affinities[None] * usable[:, neighbors.rows]  # [V, T, N]
+    J, f = jacobians[:, neighbors.rows], seen.flows[:, neighbors.rows]
     total = w.sum((0, 2))
     stiffness = (w * J.square().sum((-1, -2))).sum((0, 2)) / (2.0 * total.clamp(min=1e-12))
     eye = torch.eye(3, dtype=centers.dtype, device=centers.device)

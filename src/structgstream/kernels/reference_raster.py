@@ -99,7 +99,7 @@ def rasterize(
     trained: int | None = None,
 ) -> RasterOutput:
     """See ``kernels.operations.Rasterize``."""
-    gaussians, screen_offsets = trained_alone(gaussians, screen_offsets, trained)
+    gaussians, screen_offsets = detach_untrained(gaussians, screen_offsets, trained)
     projected = _project(gaussians, viewport, screen_offsets)
     radii = gaussians.means.new_zeros(len(gaussians), dtype=torch.float32)
     radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
@@ -107,7 +107,7 @@ def rasterize(
     low = projected.means2d.detach() - projected.extents
     high = projected.means2d.detach() + projected.extents
     if tiles is not None:
-        radii[projected.rows[~reaching(low, high, tiles)]] = 0.0
+        radii[projected.rows[~boxes_reaching_tiles(low, high, tiles)]] = 0.0
     bands, bands_alpha = [], []
     for top in range(0, viewport.height, TILE_PIXELS):
         bottom = min(top + TILE_PIXELS, viewport.height)
@@ -121,10 +121,10 @@ def rasterize(
             row_alpha.append(alpha)
         bands.append(torch.cat(row, dim=1))
         bands_alpha.append(torch.cat(row_alpha, dim=1))
-    return in_tiles(torch.cat(bands), torch.cat(bands_alpha), radii, tiles, onto)
+    return restrict_to_tiles(torch.cat(bands), torch.cat(bands_alpha), radii, tiles, onto)
 
 
-def trained_alone(
+def detach_untrained(
     gaussians: Gaussians, screen_offsets: Tensor | None, trained: int | None
 ) -> tuple[Gaussians, Tensor | None]:
     """The arguments with rows from ``trained`` on detached."""
@@ -139,7 +139,7 @@ def trained_alone(
     return Gaussians(**values), screen_offsets
 
 
-def in_tiles(
+def restrict_to_tiles(
     image: Tensor, alpha: Tensor, radii: Tensor, tiles: TileSelection | None, onto: Tensor | None
 ) -> RasterOutput:
     """Restricts a full rendering to ``tiles``; other tiles keep ``onto``, or are zero."""
@@ -176,7 +176,7 @@ def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewp
     return torch.cat(found, dim=1)
 
 
-def reaching(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:
+def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:
     """Mask ``[n]`` of the boxes (pixels) that contain a pixel centre of ``tiles``, or no pixel centre at all."""
     width, height = tiles.width, tiles.height
     first, last = (low - 0.5 - BOX_SLACK_PIXELS).ceil().long(), (high + 0.5 + BOX_SLACK_PIXELS).floor().long()

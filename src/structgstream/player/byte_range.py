@@ -10,7 +10,7 @@ class UnsatisfiableRange(Exception):
     """The range starts after the last byte."""
 
 
-def asked_bytes(header: str | None, size_bytes: int) -> range | None:
+def requested_range(header: str | None, size_bytes: int) -> range | None:
     """The bytes of ``size_bytes`` that a ``Range`` header requests.
 
     Multiple ranges, other units and malformed headers count as no range; a server may always answer with all bytes.

@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from structgstream.codec.container.stored import Stored
+from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import PlayerError
 
 MOST_PAGE_STREAM_BYTES: Final = 256 * 10**6
@@ -58,7 +58,7 @@ def linked_page(title: str, *, stream: str, attributes: Mapping[str, str] | None
     return _page(title, '<script type="module" src="player.js"></script>', element, policy(**SERVED_POLICY))
 
 
-def single_page(title: str, *, module: str, stream: Stored) -> bytes:
+def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
     """A page that holds player and stream, and opens from a disk without a server.
 
     Args:

@@ -18,10 +18,10 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from structgstream.codec.container.stored import StoredFile
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.errors import CaptureError, StreamError
 from structgstream.player.bundle import bundle
-from structgstream.player.byte_range import UnsatisfiableRange, asked_bytes
+from structgstream.player.byte_range import UnsatisfiableRange, requested_range
 from structgstream.player.page import SERVED_POLICY, linked_page, policy
 from structgstream.player.stream_file import StreamFile, pieces
 from structgstream.player.truth import Truth
@@ -105,7 +105,7 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
     # If-Range refers to a validator, and no response has one.
     header = None if "if-range" in request.headers else request.headers.get("range")
     try:
-        asked = asked_bytes(header, size)
+        asked = requested_range(header, size)
     except UnsatisfiableRange:
         data.close()
         return Response(status_code=416, headers={**headers, "Content-Range": f"bytes */{size}"})
@@ -120,7 +120,7 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
     return StreamingResponse(_closing(data, wanted), status, headers, "application/octet-stream")
 
 
-def _closing(data: StoredFile, wanted: range) -> Iterator[bytes | memoryview]:
+def _closing(data: FileBytes, wanted: range) -> Iterator[bytes | memoryview]:
     with data, suppress(StreamError):  # If the file becomes shorter meanwhile, the response ends early.
         yield from pieces(data, wanted)
 

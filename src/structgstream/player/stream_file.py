@@ -5,8 +5,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, footer_offset, head_at, why_stopped
-from structgstream.codec.container.stored import Stored, StoredFile
+from structgstream.codec.container.byte_source import ByteSource, FileBytes
+from structgstream.codec.container.records import (
+    PREFIX,
+    RecordType,
+    check_prefix,
+    footer_offset,
+    incomplete_reason,
+    read_head,
+)
 from structgstream.errors import StreamError
 
 PIECE_BYTES = 256 * 1024
@@ -18,13 +25,13 @@ class StreamFile:
 
     path: Path
 
-    def opened(self) -> StoredFile:
+    def opened(self) -> FileBytes:
         """The open file at its present length.
 
         Raises:
             StreamError: it cannot be read.
         """
-        return StoredFile(self.path)
+        return FileBytes(self.path)
 
     def state(self) -> tuple[int, bool]:
         """Length of the file in bytes, and whether it is complete (has its index).
@@ -36,11 +43,11 @@ class StreamFile:
             return len(data), footer_offset(data) is not None
 
     def check(self) -> None:
-        """Check that the file has a whole header, see :func:`check_begun`."""
+        """Check that the file has a whole header, see :func:`check_has_header`."""
         with self.opened() as data:
-            check_begun(data, str(self.path))
+            check_has_header(data, str(self.path))
 
-    def has_begun(self) -> bool:
+    def has_header(self) -> bool:
         """Whether the file exists and has a whole header.
 
         Raises:
@@ -52,10 +59,10 @@ class StreamFile:
             if len(data) < PREFIX.size:
                 return False
             check_prefix(data, str(self.path))
-            return head_at(data, PREFIX.size) is not None
+            return read_head(data, PREFIX.size) is not None
 
 
-def check_begun(data: Stored, name: str) -> None:
+def check_has_header(data: ByteSource, name: str) -> None:
     """Check that a stream has a whole header.
 
     Raises:
@@ -64,12 +71,12 @@ def check_begun(data: Stored, name: str) -> None:
     if not len(data):
         raise StreamError(f"{name} is empty; expected a stream made by structgstream reconstruct.")
     check_prefix(data, name)
-    head = head_at(data, PREFIX.size)
+    head = read_head(data, PREFIX.size)
     if head is None or head[0] != RecordType.INIT:
-        raise StreamError(f"No frame of {name} can be decoded: {why_stopped(data, PREFIX.size)}.")
+        raise StreamError(f"No frame of {name} can be decoded: {incomplete_reason(data, PREFIX.size)}.")
 
 
-def pieces(data: Stored, wanted: range) -> Iterator[bytes | memoryview]:
+def pieces(data: ByteSource, wanted: range) -> Iterator[bytes | memoryview]:
     """The bytes ``wanted`` of ``data``, in pieces."""
     for start in range(wanted.start, wanted.stop, PIECE_BYTES):
         yield data[start : min(start + PIECE_BYTES, wanted.stop)]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from structgstream.data.images import opencv
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import of_cameras
+from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
 
 JPEG_QUALITY = 95
@@ -79,7 +79,7 @@ class Truth:
         if standing is not None and standing[0] == camera and 0 <= frame - standing[1] <= MOST_SKIPPED:
             frames = standing[2]
         else:
-            frames = of_cameras(self._source, (camera,)).frames(frame)
+            frames = select_cameras(self._source, (camera,)).frames(frame)
         found = next(frames)
         while found.index < frame:
             found = next(frames)

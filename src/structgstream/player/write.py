@@ -7,7 +7,7 @@ from structgstream.errors import StorageError
 from structgstream.exporters.whole_file import write_whole
 from structgstream.player.bundle import bundle
 from structgstream.player.page import linked_page, single_page
-from structgstream.player.stream_file import StreamFile, check_begun, pieces
+from structgstream.player.stream_file import StreamFile, check_has_header, pieces
 
 
 def write_page(path: Path, stream: StreamFile) -> int:
@@ -22,7 +22,7 @@ def write_page(path: Path, stream: StreamFile) -> int:
         StorageError: the page cannot be written.
     """
     with stream.opened() as data:
-        check_begun(data, str(stream.path))
+        check_has_header(data, str(stream.path))
         page = single_page(stream.path.stem, module=bundle(), stream=data)
     write_whole(path, [page])
     return len(page)

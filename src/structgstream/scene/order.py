@@ -30,7 +30,7 @@ def morton_cells(keys: Tensor) -> Tensor:
     return cells
 
 
-def space_order(positions: Tensor, *, step: float | None = None) -> Tensor:
+def morton_order(positions: Tensor, *, step: float | None = None) -> Tensor:
     """Row indices ``[M]`` that sort ``positions`` ``[M, 3]`` along a Z-order curve; stable within a cell.
 
     Args:
@@ -50,8 +50,8 @@ def space_order(positions: Tensor, *, step: float | None = None) -> Tensor:
     return morton_keys(cells).argsort(stable=True)
 
 
-def in_space_order(scene: Scene, *, step: float | None = None) -> Scene:
-    """``scene`` with its anchors in :func:`space_order`. It must have no free Gaussians, whose ids would change."""
+def in_morton_order(scene: Scene, *, step: float | None = None) -> Scene:
+    """``scene`` with its anchors in :func:`morton_order`. It must have no free Gaussians, whose ids would change."""
     assert not len(scene.free), "ids of free Gaussians follow those of anchors"
-    order = space_order(scene.anchors.positions, step=step)
+    order = morton_order(scene.anchors.positions, step=step)
     return replace(scene, anchors=scene.anchors.select(order))

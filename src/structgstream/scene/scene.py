@@ -48,7 +48,7 @@ class Scene:
             return anchors.features
         return anchors.features + anchors.appearance @ self.appearance_basis
 
-    def baked(self) -> "Scene":
+    def with_folded_appearance(self) -> "Scene":
         """An equivalent scene with the appearance folded into the features: faster when it is rendered repeatedly."""
         if self.appearance_basis is None:
             return self
@@ -92,9 +92,9 @@ class Scene:
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
         """The Gaussians to draw for ``camera``: structured ones in view, then all free ones."""
-        return self.dressed(self.structured(camera, backend))
+        return self.with_free_gaussians(self.structured(camera, backend))
 
-    def dressed(self, generated: StructuredGaussians) -> Gaussians:
+    def with_free_gaussians(self, generated: StructuredGaussians) -> Gaussians:
         """``generated`` and the free Gaussians as one drawable set."""
         structured = generated.gaussians
         return concatenate(structured, self.free_gaussians()) if len(self.free) else structured

@@ -139,7 +139,7 @@ class StateField:
         return self.parts or (Parameter(self.name, self.path, 0, self.step, self.online_rate, self.first_rate),)
 
     @property
-    def rounded(self) -> bool:
+    def quantized(self) -> bool:
         """Whether packets of a compact stream can carry the field (as bins)."""
         return all(parameter.step for parameter in self.parameters)
 

@@ -60,21 +60,21 @@ class BirthConfig:
 
 
 @dataclass(frozen=True)
-class Missing:
+class ViewResidual:
     """Wrong and missing pixels of a view.
 
     Args:
         view: the picture, reduced.
         wrong: ``[h, w]`` bool, pixels whose residual exceeds the threshold.
-        share: ``[h, w]`` share of the 5 x 5 pixels around whose residual exceeds frame 0's by the threshold.
+        missing_share: ``[h, w]`` share of the 5 x 5 pixels around whose residual exceeds frame 0's by the threshold.
     """
 
     view: View
     wrong: Tensor
-    share: Tensor
+    missing_share: Tensor
 
 
-def missing_in(picture: Tensor, view: View, *, floor: ResidualFloor | None, config: BirthConfig) -> Missing:
+def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, config: BirthConfig) -> ViewResidual:
     """Compare a colour-corrected rendering, ``[H, W, 3]`` in 0 ... 1, with the picture of ``view``."""
     scale = min(1.0, config.picture_width / view.camera.width)
     small = view.reduced(scale)
@@ -84,25 +84,25 @@ def missing_in(picture: Tensor, view: View, *, floor: ResidualFloor | None, conf
     limit = off.new_full((), config.residual_threshold)
     if floor is not None:
         limit = limit + interpolate(floor.maps[view.index][None, None], size=size, mode="bilinear")[0, 0]
-    return Missing(small, off > config.residual_threshold, box_mean((off > limit).float(), MASK_PIXELS))
+    return ViewResidual(small, off > config.residual_threshold, box_mean((off > limit).float(), MASK_PIXELS))
 
 
-def blamed(cover: Tensor, wrong: Tensor, *, least_pixels: float, config: BirthConfig) -> Tensor:
+def blamed_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, config: BirthConfig) -> Tensor:
     """Mask ``[F]`` of the free Gaussians to remove, as outliers in several views.
 
     Args:
-        cover: ``[V, F]`` pixels that each covers, by blending weight.
+        coverage: ``[V, F]`` pixels that each covers, by blending weight.
         wrong: ``[V, F]`` wrong pixels among them.
         least_pixels: views where a Gaussian covers fewer pixels do not count.
         config: the rule.
     """
-    seen = cover > least_pixels
-    bad = (seen & (wrong > config.blame_share * cover)).sum(0)
+    seen = coverage > least_pixels
+    bad = (seen & (wrong > config.blame_share * coverage)).sum(0)
     return (bad >= config.blame_views) & (2 * bad >= seen.sum(0))
 
 
-def born(
-    missing: Sequence[Missing],
+def sweep_births(
+    missing: Sequence[ViewResidual],
     depths: Mapping[int, Tensor],
     color: CameraColor,
     *,
@@ -126,8 +126,8 @@ def born(
     views = [_sweep_view(entry, depths[entry.view.index], color) for entry in missing]
     points, colors, spacings = [], [], []
     for index, (entry, view) in enumerate(zip(missing, views)):
-        lacking = entry.share > 0.5
-        rows, columns = (lacking & _every(config.pixel_step, lacking)).nonzero().unbind(1)
+        lacking = entry.missing_share > 0.5
+        rows, columns = (lacking & _strided_mask(config.pixel_step, lacking)).nonzero().unbind(1)
         if not len(rows):
             continue
         reachable = view.depths[view.depths.isfinite()]
@@ -151,24 +151,26 @@ def born(
         spacings.append(config.pixel_step * z / K[0, 0])
     if not points or not sum(len(group) for group in points):
         return FreeGaussians.empty(views[0].colors)
-    return _merged(torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, config=config)
+    return _merge_points(
+        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, config=config
+    )
 
 
-def _sweep_view(entry: Missing, depths: Tensor, color: CameraColor) -> SweepView:
+def _sweep_view(entry: ViewResidual, depths: Tensor, color: CameraColor) -> SweepView:
     camera, index = entry.view.camera, entry.view.index
     colors = (entry.view.colors - color.biases[index]) / color.gains[index].clamp(min=1e-3)
     viewport = camera.viewport(colors)
-    return SweepView(colors, entry.share, depths, viewport.viewmat, viewport.K, camera.near)
+    return SweepView(colors, entry.missing_share, depths, viewport.viewmat, viewport.K, camera.near)
 
 
-def _every(step: int, like: Tensor) -> Tensor:
+def _strided_mask(step: int, like: Tensor) -> Tensor:
     """Mask of every ``step``-th pixel across and down."""
     mask = torch.zeros_like(like)
     mask[::step, ::step] = True
     return mask
 
 
-def _merged(
+def _merge_points(
     points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, config: BirthConfig
 ) -> FreeGaussians:
     """One free Gaussian per voxel of the points, if at least ``least_hits`` points lie around it."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
-from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable
+from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable_mask
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import ANCHOR_ROWS, values_of_rows
 from structgstream.training.statistics import GradientStatistics
@@ -45,7 +45,7 @@ class Densifier:
         """Whether statistics are collected at this iteration."""
         return self.config.collect_from < iteration <= self.config.last(self.iterations)
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether anchors change after this iteration."""
         c = self.config
         return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
@@ -67,7 +67,7 @@ class Densifier:
         eligible = self.gradients.count > self.config.eligible_count
         self.gradients.total[eligible] = 0.0
         self.gradients.count[eligible] = 0.0
-        remove = prunable(self.opacities, self.config)
+        remove = prunable_mask(self.opacities, self.config)
         judged = self.opacities.visits > self.config.prune_visits
         self.opacities.opacity[judged] = 0.0
         self.opacities.visits[judged] = 0.0
@@ -80,11 +80,11 @@ class Densifier:
         adam.values["base_scales"].detach().clamp_(max=0.05)
         return len(new), int(remove.sum())
 
-    def judges(self, iteration: int) -> bool:
+    def prunes_by_contribution(self, iteration: int) -> bool:
         """Whether anchors are pruned by contribution after this iteration."""
         return self.config.least_contribution > 0.0 and iteration in self.config.contribution_at
 
-    def judge(self, contributions: Tensor, adam: Adam[ParameterName]) -> int:
+    def prune_by_contribution(self, contributions: Tensor, adam: Adam[ParameterName]) -> int:
         """Remove the anchors whose ``contributions`` ``[M]`` (relative to the mean) are too small; returns how many."""
         keep = contributions >= self.config.least_contribution
         self._replace(adam, keep=keep, added={}, count=0)

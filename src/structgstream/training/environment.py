@@ -42,7 +42,7 @@ class EnvironmentConfig:
     """Quantization step of the coefficients with the codec ``compact``, full scale 1."""
 
 
-def fitted_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
+def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
     """Coefficients ``[(degree + 1)^2, 3]`` of the colours in the pictures' directions, by least squares.
 
     Args:

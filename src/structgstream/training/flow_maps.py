@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from structgstream.flow import agreeing, dis_search
+from structgstream.flow import consistency_mask, dis_search
 from structgstream.training.views import area_mean
 
 CONTEXT_PIXELS = 16
@@ -15,7 +15,8 @@ CONTEXT_PIXELS = 16
 def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, int]) -> Tensor:
     """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
 
-    c is the share of consistent pixels (``flow.agreeing``), zero outside a box around ``changed``.
+    c is the share of consistent pixels (``flow.consistency_mask``), zero outside a box around
+    ``changed``.
 
     Args:
         first: ``[H, W, 3]`` uint8.
@@ -31,8 +32,8 @@ def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, in
         search = dis_search("capture", refined=False)
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
         forward, backward = search(earlier, later), search(later, earlier)
-        believed = agreeing(forward, backward).astype(np.float32)[..., None]
-        maps[rows, columns] = torch.from_numpy(np.concatenate([believed, believed * forward], axis=-1))
+        confidence = consistency_mask(forward, backward).astype(np.float32)[..., None]
+        maps[rows, columns] = torch.from_numpy(np.concatenate([confidence, confidence * forward], axis=-1))
     small = area_mean(maps.permute(2, 0, 1)[None], size)
     return small[0].permute(1, 2, 0).to(first.device)
 

@@ -143,9 +143,9 @@ def grow(
     for level in range(config.levels):
         if level > 0 and not added:
             break
-        thinned = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
+        every_nth_frame = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
         threshold = config.grad_threshold * 2**level
-        chosen = (eligible & (mean_gradient >= threshold) & thinned).nonzero()[:, 0]
+        chosen = (eligible & (mean_gradient >= threshold) & every_nth_frame).nonzero()[:, 0]
         if chosen.numel() == 0:
             continue
         cell = voxel_size * 16 / 4**level
@@ -183,7 +183,7 @@ def grow(
     ).strongest(most - len(anchors))
 
 
-def prunable(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
+def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
     """Mask ``[M]`` of the anchors that were in view often enough and are nearly transparent."""
     judged = statistics.visits > config.prune_visits
     return judged & (statistics.opacity < config.prune_opacity * statistics.visits)

@@ -13,13 +13,13 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
-from structgstream.training.disturbance import DisturbanceConfig, disturbance_at, disturbed_center
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
-from structgstream.training.optim import Adam, Rate, constant
+from structgstream.training.optim import Adam, LearningRate, constant
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
+from structgstream.training.perturbation import PerturbationConfig, perturbation_at, perturbed_center
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import seeded_scene
 from structgstream.training.solidity import SolidityConfig, depth_spread
@@ -27,24 +27,24 @@ from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
 
-_JUDGED_SCALE = 0.5  # Contributions are sums over many pixels, so half the resolution suffices.
+_CONTRIBUTION_SCALE = 0.5  # Contributions are sums over many pixels, so half the resolution suffices.
 
 
 @dataclass(frozen=True)
 class InitialRates:
     """Learning rates of frame 0 (Scaffold-GS), scheduled over ``schedule_iterations``."""
 
-    positions: Rate = constant(0.0)
+    positions: LearningRate = constant(0.0)
     """Of x_v: positions are fixed in frame 0."""
-    offsets: Rate = Rate(0.01, 1e-4)
+    offsets: LearningRate = LearningRate(0.01, 1e-4)
     """Of O_v, times 1.1 rig radii, as in Scaffold-GS."""
-    features: Rate = constant(0.0075)
-    scales: Rate = constant(0.007)
+    features: LearningRate = constant(0.0075)
+    scales: LearningRate = constant(0.007)
     """Of both scales of an anchor, in log space."""
-    opacity_mlp: Rate = Rate(0.002, 2e-5)
-    covariance_mlp: Rate = constant(0.004)
-    color_mlp: Rate = Rate(0.008, 5e-5)
-    camera_color: Rate = Rate(0.002, 1e-4)
+    opacity_mlp: LearningRate = LearningRate(0.002, 2e-5)
+    covariance_mlp: LearningRate = constant(0.004)
+    color_mlp: LearningRate = LearningRate(0.008, 5e-5)
+    camera_color: LearningRate = LearningRate(0.002, 1e-4)
     """Of gains and biases; unused without ``camera_color``."""
 
 
@@ -82,7 +82,7 @@ class InitialConfig:
     all_drawn: bool = False
     """Initialise F_alpha so that all of an anchor's Gaussians are drawn (``training/seeding.py``, Note [Dead outputs];
     Scaffold-GS: no, about half are)."""
-    disturbance: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
     solidity: SolidityConfig = field(default_factory=SolidityConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
@@ -107,7 +107,7 @@ def rig_extent(rig: CameraRig) -> float:
 
 
 @dataclass
-class _FirstFrame(Hooks[View, SceneLoss]):
+class _FirstFrameHooks(Hooks[View, SceneLoss]):
     """Iterations of frame 0: perturbation of the drawn Gaussians, growing and pruning of anchors."""
 
     config: InitialConfig
@@ -139,9 +139,9 @@ class _FirstFrame(Hooks[View, SceneLoss]):
             voxel_size=config.voxel_size,
             track_screen=self.densifier.collects(iteration),
             watch=self.watch,
-            disturbed=disturbance_at(iteration, config.iterations, config.disturbance, generator),
+            perturbation=perturbation_at(iteration, config.iterations, config.disturbance, generator),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
-            seen_from=disturbed_center(
+            seen_from=perturbed_center(
                 sample.camera.viewport(scene.anchors.positions).center,
                 self.extent / 1.1,
                 iteration,
@@ -152,7 +152,9 @@ class _FirstFrame(Hooks[View, SceneLoss]):
         )
         if weight := config.solidity.weight_at(iteration, config.iterations):
             with self.watch.stage("rasterise"):
-                spread = depth_spread(loss.calm, sample.camera, scale=config.solidity.scale, backend=self.backend)
+                spread = depth_spread(
+                    loss.unperturbed, sample.camera, scale=config.solidity.scale, backend=self.backend
+                )
                 loss = with_term(loss, "depth_spread", spread, weight=weight)
         self.last_pass.add(iteration, loss, sample)
         return loss
@@ -163,13 +165,13 @@ class _FirstFrame(Hooks[View, SceneLoss]):
             with self.watch.stage("densify"), torch.no_grad():
                 densifier.gradients.add(loss.rendering, screen_gradient)
                 densifier.opacities.add(loss.structured)
-                if densifier.due(iteration):
+                if densifier.is_due(iteration):
                     densifier.apply(self.scene, self.adam, self.generator, iteration=iteration)
-        if densifier.judges(iteration):
+        if densifier.prunes_by_contribution(iteration):
             with self.watch.stage("densify"), torch.no_grad():
                 cameras = [view.camera for view in self.views]
-                shares = contributions(self.scene, cameras, scale=_JUDGED_SCALE, backend=self.backend)
-                densifier.judge(shares, self.adam)
+                shares = contributions(self.scene, cameras, scale=_CONTRIBUTION_SCALE, backend=self.backend)
+                densifier.prune_by_contribution(shares, self.adam)
 
     def counts(self) -> tuple[int, int]:
         return len(self.adam.values["anchor_positions"]), 0
@@ -203,7 +205,7 @@ def fit_first_frame(
     adam = Adam(backend, parameters.values)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
     last_pass = LastPass(config.iterations - len(views))
-    hooks = _FirstFrame(
+    hooks = _FirstFrameHooks(
         config, backend, template, parameters, adam, densifier, views, extent, generator, watch, last_pass
     )
     samples = coarse_to_fine(

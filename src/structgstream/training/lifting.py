@@ -10,7 +10,7 @@ from torch import Tensor
 
 from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.motion_types import Neighbours, ViewFlows
+from structgstream.kernels.motion_types import Neighbors, ViewFlows
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View
 
@@ -33,7 +33,7 @@ class LiftConfig:
 
 
 @dataclass(frozen=True)
-class MotionStart:
+class LiftedMotion:
     """Initial displacements of ``T`` movers in a frame.
 
     Args:
@@ -45,7 +45,7 @@ class MotionStart:
     lifted: Tensor
 
 
-def lifted_motion(
+def lift_motion(
     evidence: MotionEvidence,
     centers: Tensor,
     priors: Tensor,
@@ -53,7 +53,7 @@ def lifted_motion(
     *,
     config: LiftConfig,
     backend: Backend,
-) -> MotionStart:
+) -> LiftedMotion:
     """A displacement for each of ``T`` movers.
 
     Args:
@@ -69,7 +69,7 @@ def lifted_motion(
     """
     informed = (evidence.weights.amax(0) > 0).nonzero()[:, 0]
     if not len(informed):
-        return MotionStart(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
+        return LiftedMotion(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
     near, distances = _nearest(centers, centers[informed], config.neighbours)
     spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
     affinities = torch.exp(-0.5 * (distances / spread).square())
@@ -85,10 +85,10 @@ def lifted_motion(
         torch.stack([viewport.K for viewport in viewports]),
         centers.new_tensor([viewport.near for viewport in viewports]),
     )
-    found = backend.lift(centers, seen, Neighbours(neighbours, affinities), priors, share=config.inlier_share)
+    found = backend.lift(centers, seen, Neighbors(neighbours, affinities), priors, share=config.inlier_share)
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
-    return MotionStart(displacements, lifted)
+    return LiftedMotion(displacements, lifted)
 
 
 def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -17,10 +17,10 @@ from torch.nn.functional import max_pool2d
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, Granularity, fields_of, parameters_of
-from structgstream.training.observation import MotionEvidence, by_mover, flow_evidence, gathered, mover_centers
-from structgstream.training.picture_change import PictureChange, picture_changes
-from structgstream.training.residuals import ResidualFloor, residual_of
-from structgstream.training.trust import ViewChange, believed, jumped
+from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
+from structgstream.training.picture_change import PictureChange, detect_picture_changes
+from structgstream.training.residuals import ResidualFloor, rendering_residual
+from structgstream.training.trust import ViewChange, is_scene_cut, trusted_views
 from structgstream.training.views import View, area_mean
 
 
@@ -67,29 +67,29 @@ FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS = 0.3, 20.0
 
 
 @dataclass(frozen=True)
-class Moving:
+class MotionSegmentation:
     """The motion segmentation of a frame.
 
     Args:
         anchors: mask ``[M]`` of moving anchors.
         free: mask ``[F]`` of moving free Gaussians.
         unseen: mask ``[F]`` of free Gaussians, not in ``free``, that no view shows.
-        shown: by index of each trusted view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
+        visible: by index of each trusted view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
         trusted: positions of the views that are no outliers (``trust``); only their votes count.
-        jumped: whether most pictures changed everywhere, so that motion cannot be segmented.
+        scene_cut: whether most pictures changed everywhere, so that motion cannot be segmented.
         evidence: optical flow of all movers, if it was estimated.
-        told: indices of the views with flow.
+        views_with_flow: indices of the views with flow.
         centers: ``[M + F, 3]`` visible centres of all movers, if flow was estimated.
     """
 
     anchors: Tensor
     free: Tensor
     unseen: Tensor
-    shown: dict[int, Tensor]
+    visible: dict[int, Tensor]
     trusted: tuple[int, ...] = ()
-    jumped: bool = False
+    scene_cut: bool = False
     evidence: MotionEvidence | None = None
-    told: tuple[int, ...] = ()
+    views_with_flow: tuple[int, ...] = ()
     centers: Tensor | None = None
 
     @property
@@ -98,24 +98,24 @@ class Moving:
         return torch.cat([self.anchors, self.free]).nonzero()[:, 0]
 
 
-def changed_since(older: Scene, scene: Scene) -> Tensor:
+def changed_movers(older: Scene, scene: Scene) -> Tensor:
     """Mask ``[M + F]``, anchors before free Gaussians, of the movers that ``older`` lacks or has changed."""
 
-    def differs(granularity: Granularity, now: object, then: object) -> Tensor:
+    def changed_rows(granularity: Granularity, now: object, then: object) -> Tensor:
         names = [p.attribute for p in parameters_of(fields_of(granularity)) if p.step]
         pairs = [(getattr(now, name), getattr(then, name)) for name in names]
         changes = [one != other for one, other in pairs if one is not None and other is not None]
         return torch.stack([change if change.dim() == 1 else change.any(1) for change in changes]).any(0)
 
-    anchors = differs("anchor", scene.anchors, older.anchors)
+    anchors = changed_rows("anchor", scene.anchors, older.anchors)
     free = torch.ones_like(scene.free.births, dtype=torch.bool)
     was = torch.isin(scene.free.births, older.free.births)
     now, then = scene.free.select(was), older.free.select(torch.isin(older.free.births, scene.free.births))
-    free[was] = differs("free", now, then)
+    free[was] = changed_rows("free", now, then)
     return torch.cat([anchors, free])
 
 
-def changes_between(
+def detect_changes(
     views: Sequence[View],
     before: Sequence[View],
     *,
@@ -123,8 +123,8 @@ def changes_between(
     backend: Backend,
     flow_from: Collection[int] = (),
 ) -> list[PictureChange]:
-    """:func:`~structgstream.training.picture_change.picture_changes` with the values of ``config``."""
-    return picture_changes(
+    """:func:`~structgstream.training.picture_change.detect_picture_changes` with the values of ``config``."""
+    return detect_picture_changes(
         views,
         before,
         threshold=config.change_threshold,
@@ -135,7 +135,7 @@ def changes_between(
     )
 
 
-def moving_parts(
+def segment_motion(
     scene: Scene,
     views: Sequence[View],
     changes: Sequence[PictureChange],
@@ -144,13 +144,13 @@ def moving_parts(
     backend: Backend,
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
-) -> Moving:
+) -> MotionSegmentation:
     """Segments the movers of ``scene`` by the changes of the pictures since the previous frame.
 
     Args:
         scene: of the previous frame.
         views: of this frame.
-        changes: of each view since the previous frame (:func:`changes_between`).
+        changes: of each view since the previous frame (:func:`detect_changes`).
         config: thresholds.
         backend: the compute back-end.
         older: the scene two frames before, for ``moved_ease``; None for none.
@@ -159,48 +159,52 @@ def moving_parts(
     anchors, free = len(scene.anchors), len(scene.free)
     ease = torch.ones(anchors + free, device=scene.anchors.positions.device)
     if older is not None:
-        ease[changed_since(older, scene)] = config.moved_ease
-    looks: list[_Look] = []
+        ease[changed_movers(older, scene)] = config.moved_ease
+    view_evidence: list[_ViewEvidence] = []
     with torch.no_grad():
-        baked = scene.baked()
+        folded = scene.with_folded_appearance()
         for view, change in zip(views, changes, strict=True):
-            looks.append(_look(baked, view, change, config=config, backend=backend, ease=ease, floor=floor))
-    view_changes = [look.change for look in looks]
-    trusted = [number for number, good in enumerate(believed(view_changes)) if good]
-    seen, votes = (torch.stack([getattr(looks[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))
-    cover = torch.stack([looks[n].cover for n in trusted])
+            view_evidence.append(
+                _view_evidence(folded, view, change, config=config, backend=backend, ease=ease, floor=floor)
+            )
+    view_changes = [of_view.change for of_view in view_evidence]
+    trusted = [number for number, good in enumerate(trusted_views(view_changes)) if good]
+    seen, votes = (torch.stack([getattr(view_evidence[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))
+    coverage = torch.stack([view_evidence[n].coverage for n in trusted])
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
-    unseen = cover[:, cover.shape[1] - free :].amax(0) < config.unseen_pixels
-    found = Moving(
+    unseen = coverage[:, coverage.shape[1] - free :].amax(0) < config.unseen_pixels
+    found = MotionSegmentation(
         enough[:anchors],
         enough[anchors:] & ~unseen,
         unseen,
-        shown={views[n].index: looks[n].cover > config.least_pixels for n in trusted},
+        visible={views[n].index: view_evidence[n].coverage > config.least_pixels for n in trusted},
         trusted=tuple(trusted),
-        jumped=jumped(view_changes),
+        scene_cut=is_scene_cut(view_changes),
     )
-    told = [n for n in trusted if changes[n].flow is not None]
-    if not told or found.jumped:
+    views_with_flow = [n for n in trusted if changes[n].flow is not None]
+    if not views_with_flow or found.scene_cut:
         return found
     evidence = flow_evidence(
-        [looks[n].flows for n in told], least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS
+        [view_evidence[n].flows for n in views_with_flow], least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS
     )
-    centers = mover_centers(scene, cover.sum(0))
-    return replace(found, evidence=evidence, told=tuple(views[n].index for n in told), centers=centers)
+    centers = mover_centers(scene, coverage.sum(0))
+    return replace(
+        found, evidence=evidence, views_with_flow=tuple(views[n].index for n in views_with_flow), centers=centers
+    )
 
 
 @dataclass(frozen=True)
-class _Look:
+class _ViewEvidence:
     """One view's measurements: masks ``[E]`` of visible movers and of votes, coverage by id, and flow sums."""
 
     seen: Tensor
     votes: Tensor
-    cover: Tensor
+    coverage: Tensor
     flows: Tensor
     change: ViewChange
 
 
-def _look(
+def _view_evidence(
     scene: Scene,
     view: View,
     change: PictureChange,
@@ -209,7 +213,7 @@ def _look(
     backend: Backend,
     ease: Tensor,
     floor: ResidualFloor | None,
-) -> _Look:
+) -> _ViewEvidence:
     small = view.reduced(config.picture_scale)
     gaussians = scene.gaussians(small.camera, backend)
     size = (small.camera.height, small.camera.width)
@@ -217,20 +221,20 @@ def _look(
     difference = float(part.mean())
     wrong_share = 0.0
     if floor is not None and config.residual_threshold > 0.0:
-        missing = residual_of(gaussians, small, scene, backend)
+        missing = rendering_residual(gaussians, small, scene, backend)
         wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
         wrong_share = float(wrong.mean())
         part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
     maps = [torch.ones_like(part[0, 0, :, :, None]), part[0, 0, :, :, None]]
     if change.flow is not None:
         maps.append(change.flow)
-    sums = gathered(gaussians, scene, small.camera, torch.cat(maps, dim=-1), backend)
+    sums = gather_maps(gaussians, scene, small.camera, torch.cat(maps, dim=-1), backend)
     sums *= view.camera.height * view.camera.width / part.numel()
-    total, inside = by_mover(sums[:, :2], scene).unbind(1)
-    return _Look(
+    total, inside = sum_by_mover(sums[:, :2], scene).unbind(1)
+    return _ViewEvidence(
         seen=total > config.least_pixels,
         votes=(inside > config.least_pixels * ease) & (inside > config.least_share * ease * total),
-        cover=sums[:, 0],
-        flows=by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if change.flow is not None else total,
-        change=ViewChange(difference, wrong_share, same=change.same),
+        coverage=sums[:, 0],
+        flows=sum_by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if change.flow is not None else total,
+        change=ViewChange(difference, wrong_share, identical=change.identical),
     )

@@ -17,11 +17,11 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 from structgstream.training.flow_maps import flow_map
-from structgstream.training.lifting import LiftConfig, MotionStart, lifted_motion
+from structgstream.training.lifting import LiftConfig, LiftedMotion, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
-from structgstream.training.observation import by_mover, flow_evidence, gathered, mover_centers
-from structgstream.training.partition import Partition, focuses
-from structgstream.training.residuals import as_recorded
+from structgstream.training.observation import flow_evidence, gather_maps, mover_centers, sum_by_mover
+from structgstream.training.partition import Partition, focus_views
+from structgstream.training.residuals import apply_camera_color
 from structgstream.training.views import View
 
 
@@ -47,23 +47,23 @@ def flow_views(views: Sequence[View], frame_index: int, config: MotionStartConfi
 
 
 @dataclass(frozen=True)
-class Started:
+class InitialMotion:
     """The motion start of the moving part of a scene.
 
     Args:
         displacements: ``[M + F, 3]`` of its movers (Note [Movers]) from their last positions.
-        places: by view index, the focus on the moving part.
-        lifted: number of movers displaced by flow between pictures.
-        corrected: number of movers displaced by flow from the rendering.
+        focuses: by view index, the focus on the moving part.
+        lifted_count: number of movers displaced by flow between pictures.
+        corrected_count: number of movers displaced by flow from the rendering.
     """
 
     displacements: Tensor
-    places: Mapping[int, Focus]
-    lifted: int = 0
-    corrected: int = 0
+    focuses: Mapping[int, Focus]
+    lifted_count: int = 0
+    corrected_count: int = 0
 
 
-def started(
+def estimate_initial_motion(
     partition: Partition,
     views: Sequence[View],
     priors: Tensor,
@@ -71,7 +71,7 @@ def started(
     config: MotionStartConfig,
     motion: MotionConfig,
     backend: Backend,
-) -> Started:
+) -> InitialMotion:
     """The motion start of the moving part of ``partition``.
 
     Args:
@@ -82,23 +82,25 @@ def started(
         motion: of the motion segmentation.
         backend: the compute back-end.
     """
-    which = partition.which
-    if not config.enabled or which.evidence is None or which.centers is None or not len(priors):
-        return Started(priors, focuses(partition, views, config=motion, backend=backend))
-    movers = which.movers
-    evidence, centers = which.evidence.select(movers), which.centers[movers]
-    told = [view for view in views if view.index in which.told]
-    first = lifted_motion(evidence, centers, priors, told, config=config.lift, backend=backend)
+    segmentation = partition.segmentation
+    if not config.enabled or segmentation.evidence is None or segmentation.centers is None or not len(priors):
+        return InitialMotion(priors, focus_views(partition, views, config=motion, backend=backend))
+    movers = segmentation.movers
+    evidence, centers = segmentation.evidence.select(movers), segmentation.centers[movers]
+    views_with_flow = [view for view in views if view.index in segmentation.views_with_flow]
+    first = lift_motion(evidence, centers, priors, views_with_flow, config=config.lift, backend=backend)
     displacements, lifted, corrections = first.displacements, int(first.lifted.sum()), 0
-    moved = replace(partition, moving=displaced(partition.moving, displacements))
-    places = focuses(moved, views, config=motion, backend=backend)
+    moved = replace(partition, moving=with_displacements(partition.moving, displacements))
+    focuses = focus_views(moved, views, config=motion, backend=backend)
     if config.rounds > 1:
-        second = corrected(moved.moving, told, places, scale=motion.picture_scale, config=config.lift, backend=backend)
+        second = residual_motion(
+            moved.moving, views_with_flow, focuses, scale=motion.picture_scale, config=config.lift, backend=backend
+        )
         displacements, corrections = displacements + second.displacements, int(second.lifted.sum())
-    return Started(displacements, places, lifted, corrections)
+    return InitialMotion(displacements, focuses, lifted, corrections)
 
 
-def displaced(scene: Scene, displacements: Tensor) -> Scene:
+def with_displacements(scene: Scene, displacements: Tensor) -> Scene:
     """``scene``, its movers (Note [Movers]) shifted by ``[M + F, 3]``."""
     m = len(scene.anchors)
     return replace(
@@ -108,7 +110,7 @@ def displaced(scene: Scene, displacements: Tensor) -> Scene:
     )
 
 
-def corrected(
+def residual_motion(
     moving: Scene,
     views: Sequence[View],
     focuses: Mapping[int, Focus],
@@ -116,7 +118,7 @@ def corrected(
     scale: float,
     config: LiftConfig,
     backend: Backend,
-) -> MotionStart:
+) -> LiftedMotion:
     """Remaining displacements of the movers of ``moving``, from the flow of its rendering to the pictures.
 
     Args:
@@ -128,25 +130,25 @@ def corrected(
         backend: the compute back-end.
     """
     seen = [view for view in views if view.index in focuses]
-    baked = moving.baked()
-    sums, cover = [], moving.anchors.positions.new_zeros(())
+    folded = moving.with_folded_appearance()
+    sums, coverage = [], moving.anchors.positions.new_zeros(())
     with torch.no_grad():
         for view in seen:
             focus, small = focuses[view.index], view.reduced(scale)
-            gaussians = baked.gaussians(view.camera, backend)
-            image = as_recorded(focus.picture, moving.camera_color, view.index)
+            gaussians = folded.gaussians(view.camera, backend)
+            image = apply_camera_color(focus.picture, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
             inside = focus.tiles.pixels()
             # Outside the tiles nothing was drawn: there the picture replaces the rendering.
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)
             maps = [flow_map(picture, view.image, inside, size), torch.ones(*size, 1).to(image), small.colors]
-            found = gathered(gaussians, baked, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
+            found = gather_maps(gaussians, folded, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
             found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
-            sums.append(by_mover(found, baked))
-            cover = cover + found[:, 3]
+            sums.append(sum_by_mover(found, folded))
+            coverage = coverage + found[:, 3]
     nothing = torch.zeros(len(moving.anchors) + len(moving.free), 3).to(moving.anchors.positions)
     if not seen:
-        return MotionStart(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
+        return LiftedMotion(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
     evidence = flow_evidence(sums, least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS)
-    return lifted_motion(evidence, mover_centers(moving, cover), nothing, seen, config=config, backend=backend)
+    return lift_motion(evidence, mover_centers(moving, coverage), nothing, seen, config=config, backend=backend)

@@ -11,56 +11,56 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
+from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
 from structgstream.training.optimize import Hooks
 from structgstream.training.parameters import Parameters
 from structgstream.training.partition import Partition
 from structgstream.training.population import Population
-from structgstream.training.price import Rate
-from structgstream.training.settling import Settling
+from structgstream.training.price import BitPrice
 from structgstream.training.step import SceneLoss, view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
-class Start:
+class StartingPoint:
     """Initial state of a frame's optimisation.
 
     Args:
         scene: the whole scene, or the moving part of ``partition``.
         views: the pictures.
-        ahead: ``[M + F, 3]`` initial displacements of its movers (Note [Movers]).
+        displacements: ``[M + F, 3]`` initial displacements of its movers (Note [Movers]).
         partition: of which the scene is the moving part; None for a whole scene.
-        places: by view index, the focus on the scene; None for whole pictures of all views.
-        born: free Gaussians to add.
+        focuses: by view index, the focus on the scene; None for whole pictures of all views.
+        new_free: free Gaussians to add.
     """
 
     scene: Scene
     views: list[View]
-    ahead: Tensor
+    displacements: Tensor
     partition: Partition | None = None
-    places: Mapping[int, Focus] | None = None
-    born: FreeGaussians | None = None
+    focuses: Mapping[int, Focus] | None = None
+    new_free: FreeGaussians | None = None
 
     @property
     def seen(self) -> list[View]:
         """The views in which the scene is visible."""
-        return self.views if self.places is None else [view for view in self.views if view.index in self.places]
+        return self.views if self.focuses is None else [view for view in self.views if view.index in self.focuses]
 
 
 @dataclass
-class NextFrame(Hooks[View, SceneLoss]):
+class NextFrameHooks(Hooks[View, SceneLoss]):
     """Hooks of a later frame: the loss with the price of bits, patching once, and early stopping.
 
     Args:
         start: the initial state.
         parameters: of the scene.
         losses: weights of the terms.
-        rate: the price of changing bins; None for none.
+        bit_price: the price of changing bins; None for none.
         population: of the free Gaussians.
-        settling: early stopping.
+        early_stopping: early stopping.
         patch_at: the iteration after which free Gaussians are pruned and spawned, unless the frame stops before.
         patches: whether they are.
         last_pass: gets the result of each view.
@@ -68,12 +68,12 @@ class NextFrame(Hooks[View, SceneLoss]):
         watch: seconds by stage.
     """
 
-    start: Start
+    start: StartingPoint
     parameters: Parameters
     losses: LossWeights
-    rate: Rate | None
+    bit_price: BitPrice | None
     population: Population
-    settling: Settling
+    early_stopping: EarlyStopping
     patch_at: int
     patches: bool
     last_pass: LastPass
@@ -81,7 +81,7 @@ class NextFrame(Hooks[View, SceneLoss]):
     watch: Stopwatch
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
-        patching, places = self.population.config, self.start.places
+        patching, focuses = self.population.config, self.start.focuses
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
@@ -90,13 +90,17 @@ class NextFrame(Hooks[View, SceneLoss]):
             voxel_size=0.0,
             track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
             watch=self.watch,
-            focus=None if places is None else places[sample.index],
+            focus=None if focuses is None else focuses[sample.index],
         )
-        self.settling.add(sample.index, loss.total)
-        if iteration < self.patch_at and self.settling.settled:
+        self.early_stopping.add(sample.index, loss.total)
+        if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
         self.last_pass.add(iteration, loss, sample)
-        return loss if self.rate is None else replace(loss, total=loss.total + self.rate.price(self.parameters.values))
+        return (
+            loss
+            if self.bit_price is None
+            else replace(loss, total=loss.total + self.bit_price.price(self.parameters.values))
+        )
 
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
         if screen_gradient is not None:
@@ -104,11 +108,11 @@ class NextFrame(Hooks[View, SceneLoss]):
         if iteration == self.patch_at and self.patches:
             with self.watch.stage("patch"), torch.no_grad():
                 survivors = self.population.patch(sample)
-                self.rate = None if self.rate is None else self.rate.kept(survivors)
-            self.settling.begin_again()
+                self.bit_price = None if self.bit_price is None else self.bit_price.after_pruning(survivors)
+            self.early_stopping.reset()
 
     def finished(self, iteration: int) -> bool:
-        return iteration > self.patch_at and self.settling.settled
+        return iteration > self.patch_at and self.early_stopping.should_stop
 
     def counts(self) -> tuple[int, int]:
         partition = self.start.partition

@@ -39,7 +39,7 @@ class MotionEvidence:
         return MotionEvidence(self.weights[:, movers], self.flows[:, movers], self.colors[movers])
 
 
-def gathered(
+def gather_maps(
     gaussians: Gaussians,
     scene: Scene,
     camera: Camera,
@@ -60,17 +60,17 @@ def gathered(
     """
     drawn = gaussians if still is None else concatenate(gaussians, still)
     found = backend.blending_weights(drawn, camera.viewport(drawn.means), maps)
-    sums = found.new_zeros(slots_of(scene), maps.shape[-1])
+    sums = found.new_zeros(slot_count(scene), maps.shape[-1])
     sums[gaussians.ids] = found[: len(gaussians)]
     return sums
 
 
-def slots_of(scene: Scene) -> int:
+def slot_count(scene: Scene) -> int:
     """Number of ids in a scene (Note [Ids])."""
     return len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
 
 
-def by_mover(sums: Tensor, scene: Scene) -> Tensor:
+def sum_by_mover(sums: Tensor, scene: Scene) -> Tensor:
     """Sums by id ``[M * K + F, C]`` as sums by mover ``[M + F, C]``."""
     m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
     return torch.cat([sums[: m * k].reshape(m, k, -1).sum(1), sums[m * k :]])
@@ -84,22 +84,22 @@ def flow_evidence(sums: Sequence[Tensor], *, least_pixels: float, most_pixels: f
         least_pixels: fewer pixels of flow get weight 0.
         most_pixels: upper bound of a weight.
     """
-    together = torch.stack(list(sums))
-    weights, moved, cover, colors = together[..., 0], together[..., 1:3], together[..., 3], together[..., 4:]
+    stacked = torch.stack(list(sums))
+    weights, moved, coverage, colors = stacked[..., 0], stacked[..., 1:3], stacked[..., 3], stacked[..., 4:]
     flows = moved / weights.clamp(min=1e-6)[..., None]
     weights = torch.where(weights < least_pixels, 0.0, weights.clamp(max=most_pixels))
-    return MotionEvidence(weights, flows, colors.sum(0) / cover.sum(0).clamp(min=1e-6)[:, None])
+    return MotionEvidence(weights, flows, colors.sum(0) / coverage.sum(0).clamp(min=1e-6)[:, None])
 
 
-def mover_centers(scene: Scene, cover: Tensor) -> Tensor:
+def mover_centers(scene: Scene, coverage: Tensor) -> Tensor:
     """Visible centre of each mover, ``[M + F, 3]``: the mean of its Gaussians' means, weighted with their coverage.
 
     Args:
         scene: with the movers.
-        cover: ``[M * K + F]`` pixels, by id.
+        coverage: ``[M * K + F]`` pixels, by id.
     """
     anchors, m = scene.anchors, len(scene.anchors) * scene.anchors.offsets_per_anchor
     reach = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
-    weights = cover[:m].reshape(len(anchors), -1, 1)
+    weights = coverage[:m].reshape(len(anchors), -1, 1)
     mean = (reach * weights).sum(1) / weights.sum(1).clamp(min=1e-6)
     return torch.cat([anchors.positions + mean, scene.free.means])

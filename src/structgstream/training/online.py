@@ -18,16 +18,17 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
-from structgstream.kernels.cuda_tiles import with_enough_room
+from structgstream.kernels.cuda_tiles import run_with_pair_budget
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.births import BirthConfig
+from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
-from structgstream.training.motion import SHARED_FIELDS, MotionConfig, moving_parts
-from structgstream.training.motion_start import MotionStartConfig, displaced, started
-from structgstream.training.next_frame import NextFrame, Start
-from structgstream.training.observation import slots_of
+from structgstream.training.motion import SHARED_FIELDS, MotionConfig, segment_motion
+from structgstream.training.motion_start import MotionStartConfig, estimate_initial_motion, with_displacements
+from structgstream.training.next_frame import NextFrameHooks, StartingPoint
+from structgstream.training.observation import slot_count
 from structgstream.training.optim import Adam
 from structgstream.training.optimize import Schedule, optimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields, values_of_rows
@@ -36,12 +37,11 @@ from structgstream.training.patching import PatchingConfig
 from structgstream.training.picture_change import PictureChange
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.population import Population
-from structgstream.training.price import Rate
-from structgstream.training.renewal import renewal
+from structgstream.training.price import BitPrice
+from structgstream.training.renewal import renew_free_gaussians
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.rounding import RoundingConfig
-from structgstream.training.settling import Settling
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, shuffled_views
@@ -132,7 +132,7 @@ def fit_next_frame(
         backend: the compute back-end.
         seed: of all random numbers, so that a frame can be repeated alone.
         steps: quantization steps (Note [Bins]); the parameters it names are drawn and returned quantized.
-        older: the decoded scene two frames before, if :func:`remembers`; None for none.
+        older: the decoded scene two frames before, if :func:`needs_older`; None for none.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for births; None for none.
         before: the previous frame, for motion segmentation (``config.motion``); without it everything is trained.
         pictures: of ``frame`` and their changes since ``before``
@@ -144,42 +144,44 @@ def fit_next_frame(
     if pictures is None:
         pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
 
-    def fitted(stepping: Backend) -> FitResult[Scene]:
+    def fit_with(iteration_backend: Backend) -> FitResult[Scene]:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
-        fit = _Fit(config, backend, stepping, frame.index, generator, watch, steps or {}, on_step)
+        fit = _FrameFit(config, backend, iteration_backend, frame.index, generator, watch, steps or {}, on_step)
         if pictures.changes is None:
-            return fit.optimized(Start(scene, pictures.views, _ahead(scene, older, config.motion_prior)))
-        return _moved(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
+            return fit.optimize(
+                StartingPoint(scene, pictures.views, _prior_displacements(scene, older, config.motion_prior))
+            )
+        return _fit_moving_part(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
 
     if backend.device.type != "cuda":
-        return fitted(backend)
+        return fit_with(backend)
     # The host can run ahead of a GPU because no iteration synchronises.
-    return with_enough_room(
-        lambda budget: fitted(nonblocking(backend, budget)),
-        capacity=max(1 << 18, 8 * slots_of(scene)),
+    return run_with_pair_budget(
+        lambda budget: fit_with(nonblocking(backend, budget)),
+        capacity=max(1 << 18, 8 * slot_count(scene)),
         device=backend.device,
     )
 
 
-def remembers(config: OnlineConfig) -> bool:
+def needs_older(config: OnlineConfig) -> bool:
     """Whether a frame depends on the two decoded frames before it, instead of one."""
     return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """The optimisation of one frame; ``stepping`` is the back-end of the iterations."""
+class _FrameFit:
+    """The optimisation of one frame; ``iteration_backend`` is the back-end of the iterations."""
 
     config: OnlineConfig
     backend: Backend
-    stepping: Backend
+    iteration_backend: Backend
     frame_index: int
     generator: torch.Generator
     watch: Stopwatch
     steps: Mapping[str, float]
     on_step: StepListener | None
 
-    def optimized(self, start: Start) -> FitResult[Scene]:
+    def optimize(self, start: StartingPoint) -> FitResult[Scene]:
         """Fit the scene of ``start`` to the pictures."""
         config, seen = self.config, start.seen
         # Each view is used as often as in a full frame.
@@ -200,11 +202,11 @@ class _Fit:
             losses=last_pass.terms,
         )
 
-    def _hooks(self, start: Start, iterations: int) -> NextFrame:
+    def _hooks(self, start: StartingPoint, iterations: int) -> NextFrameHooks:
         config, patching, scene, seen = self.config, self.config.patching, start.scene, start.seen
-        parameters, rate = self._parameters(start)
+        parameters, bit_price = self._parameters(start)
         adam = Adam(self.backend, parameters.values)
-        _move(parameters, adam, start)
+        _displace_parameters(parameters, adam, start)
         still_free = 0 if start.partition is None else len(start.partition.still.free)
         population = Population(
             config=patching,
@@ -212,7 +214,7 @@ class _Fit:
             parameters=parameters,
             adam=adam,
             statistics=GradientStatistics(
-                slots_of(scene) + (0 if start.born is None else len(start.born)), self.backend.device
+                slot_count(scene) + (0 if start.new_free is None else len(start.new_free)), self.backend.device
             ),
             views=seen,
             frame_index=self.frame_index,
@@ -220,21 +222,21 @@ class _Fit:
             backend=self.backend,
             generator=self.generator,
         )
-        return NextFrame(
+        return NextFrameHooks(
             start=start,
             parameters=parameters,
             losses=config.losses,
-            rate=rate,
+            bit_price=bit_price,
             population=population,
-            settling=Settling(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
+            early_stopping=EarlyStopping(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
             patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),
             patches="free" in config.dynamic,
             last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
-            backend=self.stepping,
+            backend=self.iteration_backend,
             watch=self.watch,
         )
 
-    def _parameters(self, start: Start) -> tuple[Parameters, Rate | None]:
+    def _parameters(self, start: StartingPoint) -> tuple[Parameters, BitPrice | None]:
         """The leaves of the scene as in the previous frame, and the price of changing their bins."""
         config = self.config
         dynamic = config.dynamic if start.partition is None else config.dynamic.difference(SHARED_FIELDS)
@@ -242,33 +244,33 @@ class _Fit:
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(start.scene, trained=trained, steps=steps)
         rounding = config.rounding.resolved()
-        return parameters, Rate.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
+        return parameters, BitPrice.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
 
 
-def _move(parameters: Parameters, adam: Adam[ParameterName], start: Start) -> None:
+def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], start: StartingPoint) -> None:
     """Set the leaves to the frame's initial state, with the births."""
     values, anchors = parameters.values, len(start.scene.anchors)
     if values["anchor_positions"].requires_grad:
-        values["anchor_positions"].data += start.ahead[:anchors]
+        values["anchor_positions"].data += start.displacements[:anchors]
     if not values["free_means"].requires_grad:
         return
-    values["free_means"].data += start.ahead[anchors:]
-    if start.born is not None:
-        keep = torch.ones(len(start.scene.free), dtype=torch.bool, device=start.born.means.device)
-        parameters.births = torch.cat([parameters.births, start.born.births])
-        adam.replace_rows(values_of_rows(start.born, FREE_ROWS), keep=keep)
+    values["free_means"].data += start.displacements[anchors:]
+    if start.new_free is not None:
+        keep = torch.ones(len(start.scene.free), dtype=torch.bool, device=start.new_free.means.device)
+        parameters.births = torch.cat([parameters.births, start.new_free.births])
+        adam.replace_rows(values_of_rows(start.new_free, FREE_ROWS), keep=keep)
 
 
-def _ahead(scene: Scene, older: Scene | None, motion_prior: float) -> Tensor:
+def _prior_displacements(scene: Scene, older: Scene | None, motion_prior: float) -> Tensor:
     """Initial displacements ``[M + F, 3]`` of the movers: a share of the anchors' last displacement."""
-    ahead = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
+    displacements = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
     if older is not None and motion_prior:
-        ahead[: len(scene.anchors)] = motion_prior * (scene.anchors.positions - older.anchors.positions)
-    return ahead
+        displacements[: len(scene.anchors)] = motion_prior * (scene.anchors.positions - older.anchors.positions)
+    return displacements
 
 
-def _moved(
-    fit: _Fit,
+def _fit_moving_part(
+    fit: _FrameFit,
     scene: Scene,
     views: list[View],
     changes: list[PictureChange],
@@ -278,18 +280,22 @@ def _moved(
 ) -> FitResult[Scene]:
     """Fit the moving part of ``scene``, after the motion start, and keep the still part."""
     config, backend, watch = fit.config, fit.backend, fit.watch
-    ahead = _ahead(scene, older, config.motion_prior)
+    displacements = _prior_displacements(scene, older, config.motion_prior)
     with watch.stage("find motion"):
-        which = moving_parts(scene, views, changes, config=config.motion, backend=backend, older=older, floor=floor)
-        partition, ahead = Partition.of(scene, which), ahead[which.movers]
-        trusted = [views[number] for number in which.trusted]
+        segmentation = segment_motion(
+            scene, views, changes, config=config.motion, backend=backend, older=older, floor=floor
+        )
+        partition, displacements = Partition.of(scene, segmentation), displacements[segmentation.movers]
+        trusted = [views[number] for number in segmentation.trusted]
     with watch.stage("start motion"):
-        start = started(partition, trusted, ahead, config=config.start, motion=config.motion, backend=backend)
+        start = estimate_initial_motion(
+            partition, trusted, displacements, config=config.start, motion=config.motion, backend=backend
+        )
     with watch.stage("renew"):
-        new = renewal(
-            replace(partition, moving=displaced(partition.moving, start.displacements)),
+        new = renew_free_gaussians(
+            replace(partition, moving=with_displacements(partition.moving, start.displacements)),
             trusted,
-            start.places,
+            start.focuses,
             frame_index=fit.frame_index,
             floor=floor,
             room=config.patching.max_free - len(partition.still.free),
@@ -299,21 +305,23 @@ def _moved(
         )
         alive = torch.cat([torch.ones(len(partition.moving.anchors), dtype=torch.bool).to(new.kept), new.kept])
         moving = replace(partition.moving, free=partition.moving.free.select(new.kept))
-    result = fit.optimized(Start(moving, trusted, start.displacements[alive], partition, start.places, new.born))
+    result = fit.optimize(
+        StartingPoint(moving, trusted, start.displacements[alive], partition, start.focuses, new.new_free)
+    )
     died = int((~new.kept).sum())
     return replace(
         result,
-        scene=partition.together(result.scene),
-        pruned=result.pruned + int(which.unseen.sum()) + died,
-        spawned=result.spawned + len(new.born),
+        scene=partition.merge(result.scene),
+        pruned=result.pruned + int(segmentation.unseen.sum()) + died,
+        spawned=result.spawned + len(new.new_free),
         counts={
-            "lifted": start.lifted,
-            "corrected": start.corrected,
-            "born": len(new.born),
+            "lifted": start.lifted_count,
+            "corrected": start.corrected_count,
+            "born": len(new.new_free),
             "blamed": died,
             "births refused": int(new.refused),
             "views left out": len(views) - len(trusted),
-            "jumps": int(which.jumped),
+            "jumps": int(segmentation.scene_cut),
         },
     )
 

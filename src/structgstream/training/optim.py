@@ -16,7 +16,7 @@ EPS = 1e-15  # As in 3D Gaussian splatting: gradients of a mean over pixels are 
 
 
 @dataclass(frozen=True)
-class Rate:
+class LearningRate:
     """A learning-rate schedule, log-linear from ``initial`` to ``final``."""
 
     initial: float
@@ -30,9 +30,9 @@ class Rate:
         return math.exp(math.log(self.initial) * (1.0 - share) + math.log(self.final) * share)
 
 
-def constant(rate: float) -> Rate:
+def constant(rate: float) -> LearningRate:
     """A constant learning rate."""
-    return Rate(rate, rate)
+    return LearningRate(rate, rate)
 
 
 Name = TypeVar("Name", bound=str)

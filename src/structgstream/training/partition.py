@@ -13,11 +13,11 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tiles_of
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, Moving
+from structgstream.training.motion import MotionConfig, MotionSegmentation
 from structgstream.training.views import View
 
 REACH_SCALE = 0.25
@@ -29,27 +29,27 @@ class Partition:
 
     Args:
         whole: the scene.
-        which: the motion segmentation.
+        segmentation: the motion segmentation.
         moving: the moving part.
         still: the still part, without free Gaussians that no view shows.
     """
 
     whole: Scene
-    which: Moving
+    segmentation: MotionSegmentation
     moving: Scene
     still: Scene
 
     @classmethod
-    def of(cls, scene: Scene, which: Moving) -> "Partition":
+    def of(cls, scene: Scene, segmentation: MotionSegmentation) -> "Partition":
         """Partition ``scene``."""
 
         def part(anchors: Tensor, free: Tensor) -> Scene:
             return replace(scene, anchors=scene.anchors.select(anchors), free=scene.free.select(free))
 
-        moving = part(which.anchors, which.free)
-        return cls(scene, which, moving, part(~which.anchors, ~(which.free | which.unseen)))
+        moving = part(segmentation.anchors, segmentation.free)
+        return cls(scene, segmentation, moving, part(~segmentation.anchors, ~(segmentation.free | segmentation.unseen)))
 
-    def together(self, moved: Scene) -> Scene:
+    def merge(self, moved: Scene) -> Scene:
         """The whole scene with its moving part replaced by ``moved``; the still part keeps its bits.
 
         ``moved`` has the anchors of ``moving``; free Gaussians may have been added and removed.
@@ -57,33 +57,39 @@ class Partition:
         free = self.still.free.append(moved.free)
         return replace(
             self.whole,
-            anchors=self.whole.anchors.with_rows(self.which.anchors, moved.anchors),
+            anchors=self.whole.anchors.with_rows(self.segmentation.anchors, moved.anchors),
             free=free.select(free.births.argsort()),  # Births ascend and are unique.
         )
 
 
-def focuses(partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend) -> dict[int, Focus]:
+def focus_views(
+    partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend
+) -> dict[int, Focus]:
     """By view index, the focus on the moving part; views without it have none."""
-    which, moving, still = partition.which, partition.moving.baked(), partition.still.baked()
+    segmentation, moving, still = (
+        partition.segmentation,
+        partition.moving.with_folded_appearance(),
+        partition.still.with_folded_appearance(),
+    )
     k = moving.anchors.offsets_per_anchor
-    rows = torch.cat([which.anchors.repeat_interleave(k), which.free])  # of the whole scene's Gaussians
+    rows = torch.cat([segmentation.anchors.repeat_interleave(k), segmentation.free])  # of the whole scene's Gaussians
     with torch.no_grad():
         found = {
-            view.index: _focus(still, moving, which.shown[view.index][rows], view.camera, config, backend)
+            view.index: _focus(still, moving, segmentation.visible[view.index][rows], view.camera, config, backend)
             for view in views
         }
     return {index: focus for index, focus in found.items() if focus is not None}
 
 
 def _focus(
-    still: Scene, moving: Scene, shown: Tensor, camera: Camera, config: MotionConfig, backend: Backend
+    still: Scene, moving: Scene, visible: Tensor, camera: Camera, config: MotionConfig, backend: Backend
 ) -> Focus | None:
     in_motion = moving.gaussians(camera, backend)
     # Extents of Gaussians are measured on a reduced picture, which costs a sixteenth.
     small = camera.resized(*(max(1, round(size * REACH_SCALE)) for size in (camera.width, camera.height)))
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
-    tiles = reached_tiles(reach, shown[in_motion.ids], camera, config.margin_pixels)
+    tiles = reached_tiles(reach, visible[in_motion.ids], camera, config.margin_pixels)
     if not tiles.mask.any():
         return None
     if not config.tiles:
@@ -91,7 +97,7 @@ def _focus(
     # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
     around = torch.nn.functional.max_pool2d(tiles.mask[None].float(), 3, stride=1, padding=1)[0] > 0
     ring = replace(tiles, mask=around)
-    at_rest = still.dressed(still.structured(camera, backend, tiles=ring))
+    at_rest = still.with_free_gaussians(still.structured(camera, backend, tiles=ring))
     nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=around.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
     drawn, behind = concatenate(in_motion, at_rest), still.background(camera)
@@ -100,13 +106,13 @@ def _focus(
     return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
 
 
-def reached_tiles(rendering: Rendering, shown: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
-    """The tiles within ``margin_pixels`` of the drawn Gaussians of the mask ``shown``.
+def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
+    """The tiles within ``margin_pixels`` of the drawn Gaussians of the mask ``visible``.
 
     Gaussians are truncated at two standard deviations.
     """
-    rows, columns = tiles_of(camera.width, camera.height)
-    drawn = shown & (rendering.radii > 0)
+    rows, columns = tile_grid(camera.width, camera.height)
+    drawn = visible & (rendering.radii > 0)
     means = rendering.gaussians.means[drawn]
     viewmat, K = camera.viewport(means)[:2]
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]

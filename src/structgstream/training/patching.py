@@ -43,14 +43,14 @@ class PatchingConfig:
     """Largest number of free Gaussians; parents with the largest gradients are taken first (paper: no bound)."""
 
 
-def surviving(free: FreeGaussians, config: PatchingConfig) -> Tensor:
+def survivor_mask(free: FreeGaussians, config: PatchingConfig) -> Tensor:
     """Mask ``[F]`` of the free Gaussians that are not pruned."""
     if config.prune_opacity is None:
         return torch.ones(len(free), dtype=torch.bool, device=free.means.device)
     return free.logit_opacities.sigmoid() >= config.prune_opacity
 
 
-def parents_of(
+def choose_parents(
     mean_gradient: Tensor, count: Tensor, *, room: int, config: PatchingConfig, generator: torch.Generator
 ) -> Tensor:
     """Ids ``[P]`` that get a child, ascending.
@@ -111,7 +111,7 @@ def _empty_like(scene: Scene) -> Gaussians:
     return Gaussians(none, none.new_zeros(0, 4), none, none.new_zeros(0), none, ids)
 
 
-def children_of(
+def spawn_children(
     parents: Gaussians, *, first_birth: int, config: PatchingConfig, generator: torch.Generator
 ) -> FreeGaussians:
     """One free Gaussian per parent, with its mean drawn from N(mu, factor * Sigma).

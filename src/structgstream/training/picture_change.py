@@ -21,17 +21,17 @@ class PictureChange:
 
     Args:
         changed: ``[H, W]`` bool, dilated mask of the changed pixels.
-        same: whether the two are equal bit for bit.
+        identical: whether the two are equal bit for bit.
         flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the previous picture to this one, and the previous
             picture in 0 ... 1; None if flow was not estimated.
     """
 
     changed: Tensor
-    same: bool
+    identical: bool
     flow: Tensor | None = None
 
 
-def picture_changes(
+def detect_picture_changes(
     views: Sequence[View],
     before: Sequence[View],
     *,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.training.motion import MotionConfig, changes_between
+from structgstream.training.motion import MotionConfig, detect_changes
 from structgstream.training.motion_start import MotionStartConfig, flow_views
 from structgstream.training.picture_change import PictureChange
 from structgstream.training.views import View, training_views
@@ -45,4 +45,4 @@ def pictures_of(
         return FramePictures(views, None)
     flow_from = flow_views(views, frame.index, start)
     earlier = training_views(before, rig, backend.device)
-    return FramePictures(views, changes_between(views, earlier, config=motion, backend=backend, flow_from=flow_from))
+    return FramePictures(views, detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from))

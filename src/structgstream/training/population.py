@@ -14,10 +14,10 @@ from structgstream.training.parameters import FREE_ROWS, Parameters, values_of_r
 from structgstream.training.patching import (
     BIRTHS_PER_FRAME,
     PatchingConfig,
-    children_of,
+    choose_parents,
     gaussians_by_id,
-    parents_of,
-    surviving,
+    spawn_children,
+    survivor_mask,
 )
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.views import View
@@ -64,10 +64,10 @@ class Population:
         A child copies its parent's appearance in ``view``, if that draws it, else in the first other view that does.
         """
         current = self.parameters.scene(self.template)
-        keep = surviving(current.free, self.config)
+        keep = survivor_mask(current.free, self.config)
         others = [other for other in self.views if other.index != view.index]
         parents = gaussians_by_id(current, [view, *others], self._parents(keep), self.backend)
-        children = children_of(parents, first_birth=self._next_birth(), config=self.config, generator=self.generator)
+        children = spawn_children(parents, first_birth=self._next_birth(), config=self.config, generator=self.generator)
         self.parameters.births = torch.cat([self.parameters.births[keep], children.births])
         self.adam.replace_rows(values_of_rows(children, FREE_ROWS), keep=keep)
         self.spawned, self.pruned = self.spawned + len(children), self.pruned + int((~keep).sum())
@@ -77,7 +77,7 @@ class Population:
         """Ids ``[P]`` that get a child when only those of the mask ``keep`` survive."""
         drawn = self.statistics.count.clone()
         drawn[len(drawn) - len(keep) :][~keep] = 0.0  # Pruned ones have no children.
-        return parents_of(
+        return choose_parents(
             self.statistics.mean(),
             drawn,
             room=self.room - int(keep.sum()),

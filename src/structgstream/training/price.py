@@ -12,7 +12,7 @@ from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 
 
 @dataclass(frozen=True)
-class Rate:
+class BitPrice:
     """An estimate of the bits of changes, as a loss term.
 
     Args:
@@ -30,7 +30,7 @@ class Rate:
     @classmethod
     def of(
         cls, parameters: Parameters, steps: Mapping[ParameterName, float], *, weight: float, free: bool
-    ) -> "Rate | None":
+    ) -> "BitPrice | None":
         """The price of changing ``parameters`` from their present values; None for none.
 
         With ``free``, bits of free Gaussians are priced like those of anchors, else not at all.
@@ -44,7 +44,7 @@ class Rate:
         rows = len(parameters.values["anchor_positions"])
         return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
 
-    def kept(self, keep: Tensor) -> "Rate":
+    def after_pruning(self, keep: Tensor) -> "BitPrice":
         """The price after free Gaussians outside the mask ``keep`` were pruned; ones born since are not priced."""
         before = {
             name: value[keep[: len(value)]] if name in FREE_ROWS else value for name, value in self.before.items()

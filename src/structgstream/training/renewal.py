@@ -14,11 +14,11 @@ from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.births import BirthConfig, Missing, blamed, born, missing_in
-from structgstream.training.observation import gathered
+from structgstream.training.births import BirthConfig, ViewResidual, blamed_mask, sweep_births, view_residual
+from structgstream.training.observation import gather_maps
 from structgstream.training.partition import Partition
 from structgstream.training.patching import BIRTHS_PER_FRAME
-from structgstream.training.residuals import ResidualFloor, as_recorded
+from structgstream.training.residuals import ResidualFloor, apply_camera_color
 from structgstream.training.views import View
 
 LEAST_COVERAGE = 0.5
@@ -31,21 +31,21 @@ class Renewal:
 
     Args:
         kept: mask ``[F]`` of those that are kept.
-        born: new ones.
+        new_free: those that are born.
         missing_share: share of missing pixels in all training views.
         refused: whether too much is missing for births.
     """
 
     kept: Tensor
-    born: FreeGaussians
+    new_free: FreeGaussians
     missing_share: float = 0.0
     refused: bool = False
 
 
-def renewal(
+def renew_free_gaussians(
     partition: Partition,
     views: Sequence[View],
-    places: Mapping[int, Focus],
+    focuses: Mapping[int, Focus],
     *,
     frame_index: int,
     floor: ResidualFloor | None,
@@ -59,7 +59,7 @@ def renewal(
     Args:
         partition: with its moving part after the motion start.
         views: of the frame.
-        places: by view index, the focus on the moving part.
+        focuses: by view index, the focus on the moving part.
         frame_index: for the identities of births.
         floor: residuals of frame 0; None for none.
         room: largest number of births.
@@ -67,35 +67,35 @@ def renewal(
         config: the rules.
         backend: the compute back-end.
     """
-    moving = partition.moving.baked()
+    moving = partition.moving.with_folded_appearance()
     everything = torch.ones(len(moving.free), dtype=torch.bool, device=moving.free.means.device)
     none = Renewal(everything, FreeGaussians.empty(moving.free.means))
-    if not config.enabled or not places:
+    if not config.enabled or not focuses:
         return none
     with torch.no_grad():
         # ``places`` are from before the second round: a view without missing pixels then is assumed to have none now.
-        missing = [_missing_of(moving, view, places, None, floor=floor, config=config) for view in views]
-        if not len(moving.free) and not _several(missing, config):
+        missing = [_view_residual(moving, view, focuses, None, floor=floor, config=config) for view in views]
+        if not len(moving.free) and not _enough_views_miss(missing, config):
             return none
-        again = [len(moving.free) > 0 or _lacks(entry) for entry in missing]
+        again = [len(moving.free) > 0 or _has_missing_pixels(entry) for entry in missing]
         missing = [
-            _missing_of(moving, view, places, backend, floor=floor, config=config) if drawn else entry
+            _view_residual(moving, view, focuses, backend, floor=floor, config=config) if drawn else entry
             for entry, view, drawn in zip(missing, views, again, strict=True)
         ]
-        share = float(torch.stack([(entry.share > 0.5).float().mean() for entry in missing]).mean())
+        share = float(torch.stack([(entry.missing_share > 0.5).float().mean() for entry in missing]).mean())
         if share > config.most_missing_share:
             return replace(none, missing_share=share, refused=True)
         kept = everything
         if len(moving.free):
-            kept = ~_blamed(moving, missing, places, least_pixels=least_pixels, config=config, backend=backend)
+            kept = ~_blamed_mask(moving, missing, focuses, least_pixels=least_pixels, config=config, backend=backend)
         if not kept.all():
             moving = replace(moving, free=moving.free.select(kept))
-            missing = [_missing_of(moving, view, places, backend, floor=floor, config=config) for view in views]
-        if not _several(missing, config):
+            missing = [_view_residual(moving, view, focuses, backend, floor=floor, config=config) for view in views]
+        if not _enough_views_miss(missing, config):
             return replace(none, kept=kept, missing_share=share)
-        still = partition.still.baked()
-        depths = {entry.view.index: _depths([moving, still], entry.view.camera, backend) for entry in missing}
-        new = born(
+        still = partition.still.with_folded_appearance()
+        depths = {entry.view.index: _depth_map([moving, still], entry.view.camera, backend) for entry in missing}
+        new = sweep_births(
             missing,
             depths,
             moving.camera_color,
@@ -106,29 +106,29 @@ def renewal(
     return Renewal(kept, new, share)
 
 
-def _lacks(entry: Missing) -> bool:
-    return bool((entry.share > 0.5).any())
+def _has_missing_pixels(entry: ViewResidual) -> bool:
+    return bool((entry.missing_share > 0.5).any())
 
 
-def _several(missing: Sequence[Missing], config: BirthConfig) -> bool:
+def _enough_views_miss(missing: Sequence[ViewResidual], config: BirthConfig) -> bool:
     """Whether enough views have missing pixels for a birth."""
-    return sum(map(_lacks, missing)) > config.least_supports
+    return sum(map(_has_missing_pixels, missing)) > config.least_supports
 
 
-def _missing_of(
+def _view_residual(
     moving: Scene,
     view: View,
-    places: Mapping[int, Focus],
+    focuses: Mapping[int, Focus],
     backend: Backend | None,
     *,
     floor: ResidualFloor | None,
     config: BirthConfig,
-) -> Missing:
+) -> ViewResidual:
     """Missing pixels of a view, none outside the focus.
 
-    The rendering is drawn by ``backend``, or without one taken from ``places``.
+    The rendering is drawn by ``backend``, or without one taken from ``focuses``.
     """
-    focus, picture = places.get(view.index), view.colors
+    focus, picture = focuses.get(view.index), view.colors
     if focus is not None:
         image = focus.picture
         if backend is not None:
@@ -136,33 +136,33 @@ def _missing_of(
             gaussians, behind = moving.gaussians(view.camera, backend), moving.background(view.camera)
             image = draw(gaussians, view.camera, backend, focus=onto, background=behind).image
         inside = focus.tiles.pixels()[..., None]
-        picture = torch.where(inside, as_recorded(image, moving.camera_color, view.index), picture)
-    return missing_in(picture.clamp(0.0, 1.0), view, floor=floor, config=config)
+        picture = torch.where(inside, apply_camera_color(image, moving.camera_color, view.index), picture)
+    return view_residual(picture.clamp(0.0, 1.0), view, floor=floor, config=config)
 
 
-def _blamed(
+def _blamed_mask(
     moving: Scene,
-    missing: Sequence[Missing],
-    places: Mapping[int, Focus],
+    missing: Sequence[ViewResidual],
+    focuses: Mapping[int, Focus],
     *,
     least_pixels: float,
     config: BirthConfig,
     backend: Backend,
 ) -> Tensor:
-    cover, wrong = [], []
+    coverage, wrong = [], []
     for entry in missing:
-        focus, camera = places.get(entry.view.index), entry.view.camera
+        focus, camera = focuses.get(entry.view.index), entry.view.camera
         if focus is None:
             continue
-        maps = torch.stack([torch.ones_like(entry.share), entry.wrong.to(entry.share)], dim=-1)
-        sums = gathered(moving.gaussians(camera, backend), moving, camera, maps, backend, still=focus.still)
+        maps = torch.stack([torch.ones_like(entry.missing_share), entry.wrong.to(entry.missing_share)], dim=-1)
+        sums = gather_maps(moving.gaussians(camera, backend), moving, camera, maps, backend, still=focus.still)
         of_free = sums[len(sums) - len(moving.free) :]
-        cover.append(of_free[:, 0])
+        coverage.append(of_free[:, 0])
         wrong.append(of_free[:, 1])
-    return blamed(torch.stack(cover), torch.stack(wrong), least_pixels=least_pixels, config=config)
+    return blamed_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, config=config)
 
 
-def _depths(parts: Sequence[Scene], camera: Camera, backend: Backend) -> Tensor:
+def _depth_map(parts: Sequence[Scene], camera: Camera, backend: Backend) -> Tensor:
     """Mean depth along z ``[h, w]`` of scenes drawn together; infinite where coverage is low."""
     first, second = (part.gaussians(camera, backend) for part in parts)
     gaussians = concatenate(first, second)

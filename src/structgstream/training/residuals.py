@@ -36,7 +36,7 @@ class ResidualFloor:
     maps: dict[int, Tensor]
 
 
-def as_recorded(image: Tensor, color: CameraColor, view_index: int) -> Tensor:
+def apply_camera_color(image: Tensor, color: CameraColor, view_index: int) -> Tensor:
     """A rendering ``[H, W, 3]`` with the training camera's colour correction."""
     return image * color.gains[view_index] + color.biases[view_index]
 
@@ -52,19 +52,19 @@ def residual(picture: Tensor, image: Tensor) -> Tensor:
     return box_mean((picture - image.to(picture) / 255.0).abs().mean(-1), SMOOTHED_PIXELS)
 
 
-def residual_of(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
+def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
     """The :func:`residual` of drawing ``gaussians``, those of ``scene``, for ``view``."""
     rendering = draw(gaussians, view.camera, backend, background=scene.background(view.camera))
-    return residual(as_recorded(rendering.image, scene.camera_color, view.index), view.image)
+    return residual(apply_camera_color(rendering.image, scene.camera_color, view.index), view.image)
 
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
     """Residuals of ``scene``, the decoded frame 0, at ``scale`` of the pictures' size."""
-    scene = scene.baked()
+    scene = scene.with_folded_appearance()
     maps = {}
     with torch.no_grad():
         for view in views:
             small = view.reduced(scale)
-            found = residual_of(scene.gaussians(small.camera, backend), small, scene, backend)
+            found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
             maps[view.index] = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
     return ResidualFloor(scale, maps)

@@ -18,7 +18,7 @@ from structgstream.cameras import CameraRig
 from structgstream.scene.state import PARAMETERS, ParameterName
 
 
-class _Rounded(torch.autograd.Function):
+class _RoundStraightThrough(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, value: Tensor, step: float) -> Tensor:
         return (value / step).round() * step
@@ -28,9 +28,9 @@ class _Rounded(torch.autograd.Function):
         return grads[0], None
 
 
-def rounded(value: Tensor, step: float) -> Tensor:
+def round_straight_through(value: Tensor, step: float) -> Tensor:
     """``value`` on the grid of ``step``; the gradient is that of ``value``."""
-    return _Rounded.apply(value, step)
+    return _RoundStraightThrough.apply(value, step)
 
 
 # The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. For frame 0 it

@@ -28,7 +28,7 @@ def voxel_centers(points: Tensor, voxel_size: float) -> Tensor:
     return (points / voxel_size).round().to(torch.int64).unique(dim=0).to(points) * voxel_size
 
 
-def neighbour_distances(points: Tensor) -> Tensor:
+def neighbor_distances(points: Tensor) -> Tensor:
     """Root of the mean squared distance of each point to its three nearest neighbours, ``[M]``."""
     try:
         from scipy.spatial import KDTree
@@ -79,7 +79,7 @@ def seeded_scene(
             f"Only {m} initial points remain at a voxel size of {voxel_size:g}; at least 4 are needed. "
             "Check the poses, or give a capture with more overlap between cameras."
         )
-    log_scales = neighbour_distances(positions).log()[:, None].expand(m, 3).contiguous().to(device)
+    log_scales = neighbor_distances(positions).log()[:, None].expand(m, 3).contiguous().to(device)
     positions = positions.to(device)
     inputs = feature_width + 3 + int(distance_input)
     heads = [random_head(inputs, hidden_width, width * k, generator) for width in (1, 3, 7)]

@@ -80,11 +80,11 @@ class SceneLoss(ViewLoss):
 
     Args:
         structured: the Gaussians of its anchors.
-        calm: all its Gaussians before perturbation.
+        unperturbed: all its Gaussians before perturbation.
     """
 
     structured: StructuredGaussians
-    calm: Gaussians
+    unperturbed: Gaussians
 
 
 def picture_loss(
@@ -136,20 +136,20 @@ def view_loss(
     track_screen: bool,
     watch: Stopwatch,
     focus: Focus | None = None,
-    disturbed: Callable[[Gaussians], Gaussians] | None = None,
+    perturbation: Callable[[Gaussians], Gaussians] | None = None,
     background: Tensor | None = None,
     seen_from: Tensor | None = None,
 ) -> SceneLoss:
     """Render ``view`` and compare it with its picture, or the tiles of ``focus`` (paper, equations for L and L_init).
 
-    Optionally the Gaussians are perturbed by ``disturbed``, view directions start at ``seen_from`` ``[3]``, and
+    Optionally the Gaussians are perturbed by ``perturbation``, view directions start at ``seen_from`` ``[3]``, and
     ``background`` ``[3]`` replaces the scene's environment.
     """
     with watch.stage("generate"):
         tiles = None if focus is None else focus.tiles
         structured = scene.structured(view.camera, backend, tiles=tiles, seen_from=seen_from)
-        calm = scene.dressed(structured)
-        gaussians = calm if disturbed is None else disturbed(calm)
+        unperturbed = scene.with_free_gaussians(structured)
+        gaussians = unperturbed if perturbation is None else perturbation(unperturbed)
     loss = picture_loss(
         gaussians,
         view,
@@ -169,4 +169,4 @@ def view_loss(
         if weights.offset_distance:
             value = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights, backend=backend)
             loss = with_term(loss, "offset_distance", value, weight=weights.offset_distance)
-    return SceneLoss(**vars(loss), structured=structured, calm=calm)
+    return SceneLoss(**vars(loss), structured=structured, unperturbed=unperturbed)

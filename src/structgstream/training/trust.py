@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-EVERYWHERE = 0.5
+WHOLE_PICTURE_SHARE = 0.5
 """Share of changed, or wrong, pixels above which a picture counts as changed, or wrong, everywhere."""
-USUAL = 0.25
+MEDIAN_SHARE = 0.25
 """An outlier requires that the median view's share is below this."""
 FROZEN_SHARE = 0.005
 """Least share of changed pixels in the median view for an identical picture to count as frozen; at most one view in
@@ -24,31 +24,31 @@ class ViewChange:
     """Change of one view's picture.
 
     Args:
-        changed: share of its pixels that changed since the last frame.
-        wrong: share of its pixels with a residual above frame 0's.
-        same: whether it equals the last picture bit for bit.
+        changed_share: share of its pixels that changed since the last frame.
+        wrong_share: share of its pixels with a residual above frame 0's.
+        identical: whether it equals the last picture bit for bit.
     """
 
-    changed: float
-    wrong: float
-    same: bool
+    changed_share: float
+    wrong_share: float
+    identical: bool
 
 
-def believed(changes: Sequence[ViewChange]) -> list[bool]:
+def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
     """For each view whether it is no outlier. If fewer than two views are left, none counts as an outlier."""
-    usual_change, usual_wrong = median(c.changed for c in changes), median(c.wrong for c in changes)
-    few_same = 4 * sum(c.same for c in changes) <= len(changes)
+    usual_change, usual_wrong = median(c.changed_share for c in changes), median(c.wrong_share for c in changes)
+    few_same = 4 * sum(c.identical for c in changes) <= len(changes)
     found = [
         not (
-            (c.changed > EVERYWHERE and usual_change < USUAL)
-            or (c.wrong > EVERYWHERE and usual_wrong < USUAL)
-            or (c.same and few_same and usual_change > FROZEN_SHARE)
+            (c.changed_share > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
+            or (c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE)
+            or (c.identical and few_same and usual_change > FROZEN_SHARE)
         )
         for c in changes
     ]
     return found if sum(found) >= 2 else [True] * len(found)
 
 
-def jumped(changes: Sequence[ViewChange]) -> bool:
+def is_scene_cut(changes: Sequence[ViewChange]) -> bool:
     """Whether most pictures changed everywhere, so that motion cannot be segmented."""
-    return median(c.changed for c in changes) > EVERYWHERE
+    return median(c.changed_share for c in changes) > WHOLE_PICTURE_SHARE

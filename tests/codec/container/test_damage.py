@@ -10,8 +10,8 @@ import pytest
 
 from streams import compact_header, moved, same, small_scene, small_stream, write_stream
 from structgstream.codec.container import damage as damage_module
-from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, Search
-from structgstream.codec.container.records import RECORD, RecordType, scanned
+from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, PacketSearch
+from structgstream.codec.container.records import RECORD, RecordType, scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StreamError
@@ -27,7 +27,7 @@ def whole() -> tuple[bytes, list[Scene], list[int]]:
     first = small_scene(3)
     sink = MemorySink()
     seen = write_stream(sink, [moved(first, i) for i in range(FRAMES)], header=compact_header(first))
-    return sink.data, seen, [record.offset for record in scanned(sink.data)]
+    return sink.data, seen, [record.offset for record in scan_records(sink.data)]
 
 
 def group(frame: int) -> range:
@@ -118,7 +118,7 @@ def test_damage_of_what_is_no_packet_costs_no_frame() -> None:
 
 def test_raw_packets_stand_alone() -> None:
     data = small_stream(5)
-    clean, offsets = StreamReader(data), [record.offset for record in scanned(data)]
+    clean, offsets = StreamReader(data), [record.offset for record in scan_records(data)]
     reader = StreamReader(flipped(data, 8 * offsets[2] + 45))
     assert reader.runs == [range(1), range(2, 5)]
     assert all(same(reader.scene(i), clean.scene(i)) for i in (4, 0, 2, 3))
@@ -154,8 +154,8 @@ def test_a_file_full_of_heads_does_not_keep_a_reader_busy(monkeypatch: pytest.Mo
     rows = 20_000
     head = struct.pack("<BBHIId", RecordType.KEY, 0, 0, 10_000, 1, 9.0)
     hostile = data[: offsets[2]] + head * rows + bytes(10_000)
-    read, record_at = [], damage_module.record_at
-    monkeypatch.setattr(damage_module, "record_at", lambda *given: read.append(1) or record_at(*given))
+    read, read_record = [], damage_module.read_record
+    monkeypatch.setattr(damage_module, "record_at", lambda *given: read.append(1) or read_record(*given))
     assert len(StreamReader(hostile)) == 1
     assert 0 < 10_000 * len(read) <= 4 * len(hostile)
 
@@ -164,7 +164,7 @@ def test_heads_across_pieces_of_a_search(monkeypatch: pytest.MonkeyPatch) -> Non
     data, _, offsets = whole()
     for size in (8, 9, 64, 1000):
         monkeypatch.setattr(damage_module, "_CHUNK_BYTES", size)
-        found = Search(data).next(offsets[1], expected=0, after_seconds=0.0)
+        found = PacketSearch(data).next(offsets[1], expected=0, after_seconds=0.0)
         assert found is not None
         assert found.offset == offsets[2]
 

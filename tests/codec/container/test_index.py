@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from streams import same, small_stream
-from structgstream.codec.container.index import FOOTER, FOOTER_MAGIC, INDEX_ENTRY, indexed_offsets, packed_index
-from structgstream.codec.container.records import Record, RecordType, packed, scanned
+from structgstream.codec.container.index import FOOTER, FOOTER_MAGIC, INDEX_ENTRY, pack_index, read_index_offsets
+from structgstream.codec.container.records import Record, RecordType, packed, scan_records
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StreamError
 
 STREAM = small_stream()
-RECORDS = list(scanned(STREAM))
+RECORDS = list(scan_records(STREAM))
 START = RECORDS[0].end
 ENTRIES = [*INDEX_ENTRY.iter_unpack(RECORDS[-1].payload)]
 
@@ -40,7 +40,7 @@ def raw(record: Record) -> bytes:
 
 
 def with_index(body: bytes, entries: list[tuple[int, int, int]]) -> bytes:
-    return body + packed_index(entries, len(body))
+    return body + pack_index(entries, len(body))
 
 
 def test_by_index_everything_is_the_same() -> None:
@@ -52,7 +52,7 @@ def test_by_index_everything_is_the_same() -> None:
 
 def test_by_index_packets_are_not_read() -> None:
     data = Counted(STREAM)
-    offsets = indexed_offsets(data, START)
+    offsets = read_index_offsets(data, START)
     assert offsets is not None
     assert [*offsets] == [offset for _, _, offset in ENTRIES]
     assert data.read < 200 < min(len(record.payload) for record in RECORDS[1:5])
@@ -62,7 +62,7 @@ def test_records_of_unknown_types_lie_between_packets() -> None:
     body = STREAM[: RECORDS[2].offset] + struct.pack("<BBHI", 77, 0, 0, 3) + b"abc" + b"crc?"
     moved = [*ENTRIES[:1], *((i, kind, offset + 15) for i, kind, offset in ENTRIES[1:])]
     data = with_index(body + STREAM[RECORDS[2].offset : RECORDS[5].offset], moved)
-    assert [*(indexed_offsets(data, START) or ())] == [offset for _, _, offset in moved]
+    assert [*(read_index_offsets(data, START) or ())] == [offset for _, _, offset in moved]
 
 
 BODY = STREAM[: RECORDS[5].offset]
@@ -89,7 +89,7 @@ DISBELIEVED: dict[str, Callable[[], bytes]] = {
 @pytest.mark.parametrize("case", DISBELIEVED)
 def test_an_index_that_cannot_be_believed_is_not_used(case: str) -> None:
     data = DISBELIEVED[case]()
-    assert indexed_offsets(data, START) is None
+    assert read_index_offsets(data, START) is None
     by_index, scan = StreamReader(data, by_index=True), StreamReader(data)
     assert [*by_index.packets] == [*scan.packets]
     assert (by_index.complete, by_index.cut_reason) == (scan.complete, scan.cut_reason)
@@ -109,7 +109,7 @@ def test_an_index_that_cannot_be_believed_is_not_used(case: str) -> None:
 )
 def test_records_that_contradict_each_other_are_left_to_the_scan(records: list[bytes]) -> None:
     body = STREAM[:START] + b"".join(records)
-    assert indexed_offsets(with_index(body, []), START) is None
+    assert read_index_offsets(with_index(body, []), START) is None
     with pytest.raises(StreamError):
         StreamReader(with_index(body, []), by_index=True)
 

@@ -5,48 +5,48 @@ import pytest
 import torch
 import zstandard
 
-from structgstream.codec.container.blocks import packed_block
+from structgstream.codec.container.blocks import pack_raw_block
 from structgstream.codec.container.init_record import (
     MAX_JSON_BYTES,
-    description_of,
-    field_bytes_of,
+    field_sizes,
     first_block,
-    packed_init,
+    pack_init,
+    read_description,
 )
 from structgstream.errors import StreamError
 
-BLOCKS = [packed_block("anchor_positions", torch.zeros(2, 3)), packed_block("anchor_features", torch.ones(2, 4))]
+BLOCKS = [pack_raw_block("anchor_positions", torch.zeros(2, 3)), pack_raw_block("anchor_features", torch.ones(2, 4))]
 
 
 def test_description_and_blocks_come_back() -> None:
     description = {"b": [1, 0.5, None], "a": "ä"}
-    payload = packed_init(description, BLOCKS)
-    assert description_of(payload) == description
+    payload = pack_init(description, BLOCKS)
+    assert read_description(payload) == description
     assert payload[first_block(payload) :] == b"".join(BLOCKS)
-    assert field_bytes_of(payload) == {"anchor_positions": len(BLOCKS[0]), "anchor_features": len(BLOCKS[1])}
+    assert field_sizes(payload) == {"anchor_positions": len(BLOCKS[0]), "anchor_features": len(BLOCKS[1])}
 
 
 def test_the_same_description_is_the_same_bytes() -> None:
-    assert packed_init({"a": 1, "b": 2}, []) == packed_init({"b": 2, "a": 1}, [])
+    assert pack_init({"a": 1, "b": 2}, []) == pack_init({"b": 2, "a": 1}, [])
 
 
 def test_a_description_that_unpacks_to_too_much_is_not_unpacked() -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(MAX_JSON_BYTES + 1))
     with pytest.raises(ValueError, match=f"unpacks to {MAX_JSON_BYTES + 1} bytes"):
-        description_of(struct.pack("<I", len(bomb)) + bomb)
+        read_description(struct.pack("<I", len(bomb)) + bomb)
     stream = zstandard.ZstdCompressor().compressobj()
     unstated = stream.compress(b"{}") + stream.flush()
     with pytest.raises(ValueError, match="unpacks to -1 bytes"):
-        description_of(struct.pack("<I", len(unstated)) + unstated)
+        read_description(struct.pack("<I", len(unstated)) + unstated)
 
 
 @pytest.mark.parametrize("data", [b"", b"no frame of zstandard", zstandard.ZstdCompressor().compress(b"{")])
 def test_what_is_no_description(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"\w"):
-        description_of(struct.pack("<I", len(data)) + data)
+        read_description(struct.pack("<I", len(data)) + data)
 
 
 @pytest.mark.parametrize("cut", [0, 3, 4, 12])
 def test_a_payload_that_is_cut(cut: int) -> None:
     with pytest.raises(StreamError, match="The init record"):
-        first_block(packed_init({"a": 1}, BLOCKS)[:cut])
+        first_block(pack_init({"a": 1}, BLOCKS)[:cut])

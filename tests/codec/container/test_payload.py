@@ -5,21 +5,21 @@ import struct
 import pytest
 import torch
 
-from structgstream.codec.container.blocks import packed_block
-from structgstream.codec.container.payload import packet_of, packet_with
+from structgstream.codec.container.blocks import pack_raw_block
+from structgstream.codec.container.payload import packet_from_blocks, parse_packet
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
 BLOCKS: dict[FieldName, bytes] = {
-    "anchor_positions": packed_block("anchor_positions", torch.zeros(2, 3)),
-    "covariance_mlp": packed_block("covariance_mlp", torch.ones(5)),
+    "anchor_positions": pack_raw_block("anchor_positions", torch.zeros(2, 3)),
+    "covariance_mlp": pack_raw_block("covariance_mlp", torch.ones(5)),
 }
 
 
 def test_what_is_packed_comes_back() -> None:
-    packet = packet_with(BLOCKS, index=7, pts_seconds=0.25, kind=PacketKind.DELTA)
-    assert packet_of(packet.payload, PacketKind.DELTA) == packet
+    packet = packet_from_blocks(BLOCKS, index=7, pts_seconds=0.25, kind=PacketKind.DELTA)
+    assert parse_packet(packet.payload, PacketKind.DELTA) == packet
     assert (packet.kind, packet.index, packet.pts_seconds) == (PacketKind.DELTA, 7, 0.25)
     assert packet.field_bytes == {"anchor_positions": 4 + 8 + 24, "covariance_mlp": 4 + 4 + 20}
     assert packet.payload == struct.pack("<Id", 7, 0.25) + b"".join(BLOCKS.values())
@@ -28,12 +28,12 @@ def test_what_is_packed_comes_back() -> None:
 @pytest.mark.parametrize("seconds", [math.nan, math.inf])
 def test_a_time_that_is_none(seconds: float) -> None:
     with pytest.raises(StreamError, match="Packet 3 has the presentation time .*; it is damaged"):
-        packet_of(struct.pack("<Id", 3, seconds), PacketKind.KEY)
+        parse_packet(struct.pack("<Id", 3, seconds), PacketKind.KEY)
 
 
 def test_a_payload_that_is_cut() -> None:
-    payload = packet_with(BLOCKS, index=0, pts_seconds=0.0, kind=PacketKind.KEY).payload
+    payload = packet_from_blocks(BLOCKS, index=0, pts_seconds=0.0, kind=PacketKind.KEY).payload
     with pytest.raises(StreamError, match="too short to hold its index and time"):
-        packet_of(payload[:11], PacketKind.KEY)
+        parse_packet(payload[:11], PacketKind.KEY)
     with pytest.raises(StreamError, match="Packet 0 "):
-        packet_of(payload[:-1], PacketKind.KEY)
+        parse_packet(payload[:-1], PacketKind.KEY)

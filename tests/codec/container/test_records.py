@@ -10,11 +10,11 @@ from structgstream.codec.container import records
 from structgstream.codec.container.records import (
     RecordType,
     check_prefix,
+    incomplete_reason,
     packed,
     prefix,
-    record_at,
-    scanned,
-    why_stopped,
+    read_record,
+    scan_records,
 )
 from structgstream.errors import StreamError
 
@@ -28,7 +28,7 @@ def test_the_layout_of_a_record() -> None:
 @given(st.lists(st.binary(max_size=20), max_size=5))
 def test_records_come_back(payloads: list[bytes]) -> None:
     data = prefix() + b"".join(packed(RecordType.DELTA, payload) for payload in payloads)
-    found = list(scanned(data))
+    found = list(scan_records(data))
     assert [record.payload for record in found] == payloads
     assert [record.offset for record in found] + [len(data)] == [12] + [record.end for record in found]
 
@@ -38,24 +38,24 @@ def test_any_flipped_bit_is_noticed(payload: bytes, choice: st.DataObject) -> No
     record = bytearray(packed(RecordType.KEY, payload))
     bit = choice.draw(st.integers(0, 8 * len(record) - 1))
     record[bit // 8] ^= 1 << bit % 8
-    assert record_at(bytes(record), 0) is None
+    assert read_record(bytes(record), 0) is None
 
 
 @given(st.binary(max_size=64))
 def test_arbitrary_bytes_end_the_scan_without_an_error(data: bytes) -> None:
-    assert all(record.end <= len(data) + 12 for record in scanned(prefix() + data))
+    assert all(record.end <= len(data) + 12 for record in scan_records(prefix() + data))
 
 
 def test_a_length_beyond_the_file_is_not_believed() -> None:
-    assert record_at(struct.pack("<BBHI", 2, 0, 0, 2**32 - 1) + b"abc", 0) is None
+    assert read_record(struct.pack("<BBHI", 2, 0, 0, 2**32 - 1) + b"abc", 0) is None
 
 
 def test_why_reading_stopped() -> None:
     data = packed(RecordType.KEY, b"abc")
-    assert why_stopped(data, len(data)) == "it ends at byte 15 without an index"
-    assert why_stopped(data[:-1], 0) == "it is cut at byte 14, within the record that begins at byte 0"
-    assert why_stopped(data[:5], 0) == "it is cut at byte 5, within the record that begins at byte 0"
-    assert why_stopped(b"\x03" + data[1:], 0) == "the record at byte 0 of 15 is damaged"
+    assert incomplete_reason(data, len(data)) == "it ends at byte 15 without an index"
+    assert incomplete_reason(data[:-1], 0) == "it is cut at byte 14, within the record that begins at byte 0"
+    assert incomplete_reason(data[:5], 0) == "it is cut at byte 5, within the record that begins at byte 0"
+    assert incomplete_reason(b"\x03" + data[1:], 0) == "the record at byte 0 of 15 is damaged"
 
 
 def test_a_payload_must_fit_its_length_field(monkeypatch: pytest.MonkeyPatch) -> None:

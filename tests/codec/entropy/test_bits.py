@@ -9,9 +9,9 @@ from structgstream.codec.entropy.bits import (
     bit_lengths,
     fixed,
     golomb,
-    numbers_of,
-    packed_bits,
+    pack_bits,
     signed_golomb,
+    unpack_numbers,
     unzigzag,
     zigzag,
 )
@@ -22,7 +22,7 @@ WHERE = "It"
 
 @given(st.lists(st.tuples(st.integers(-5000, 5000), st.integers(0, 3))))
 def test_golomb_codes_come_back(pieces: list[tuple[int, int]]) -> None:
-    data = packed_bits(signed_golomb(value, order=order) for value, order in pieces)
+    data = pack_bits(signed_golomb(value, order=order) for value, order in pieces)
     reader = BitReader(data, where=WHERE)
     assert [reader.signed_golomb(order=order, most_zeros=14) for _, order in pieces] == [value for value, _ in pieces]
     reader.end()
@@ -39,7 +39,7 @@ def test_the_codes_of_the_document() -> None:
 
 
 def test_more_zeros_than_allowed_and_a_cut() -> None:
-    data = packed_bits([golomb(12, order=0)])  # 0001101
+    data = pack_bits([golomb(12, order=0)])  # 0001101
     assert BitReader(data, where=WHERE).golomb(order=0, most_zeros=3) == 12
     with pytest.raises(StreamError, match="It holds a number that is cut or out of bounds"):
         BitReader(data, where=WHERE).golomb(order=0, most_zeros=2)
@@ -56,12 +56,12 @@ def test_only_zeros_fill_the_last_byte(data: bytes, fits: bool) -> None:
     widths = np.array([3])
     if fits:
         reader.end()
-        assert numbers_of(data, widths, where=WHERE).tolist() == [7]
+        assert unpack_numbers(data, widths, where=WHERE).tolist() == [7]
         return
     with pytest.raises(StreamError, match="It goes on after its last number"):
         reader.end()
     with pytest.raises(StreamError, match="bytes for 3 bits of numbers"):
-        numbers_of(data, widths, where=WHERE)
+        unpack_numbers(data, widths, where=WHERE)
 
 
 SIZED = st.integers(0, 56).flatmap(lambda width: st.tuples(st.just(width), st.integers(0, 2**width - 1)))
@@ -69,9 +69,9 @@ SIZED = st.integers(0, 56).flatmap(lambda width: st.tuples(st.just(width), st.in
 
 @given(st.lists(SIZED))
 def test_numbers_of_many_widths(pieces: list[tuple[int, int]]) -> None:
-    data = packed_bits(fixed(value, width) for width, value in pieces if width)
+    data = pack_bits(fixed(value, width) for width, value in pieces if width)
     widths = np.array([width for width, _ in pieces], np.int64)
-    assert numbers_of(data, widths, where=WHERE).tolist() == [value for _, value in pieces]
+    assert unpack_numbers(data, widths, where=WHERE).tolist() == [value for _, value in pieces]
 
 
 def test_bit_lengths_are_exact() -> None:

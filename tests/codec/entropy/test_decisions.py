@@ -13,7 +13,7 @@ from structgstream.codec.entropy.models import (
     ACTIVITY_CONTEXTS,
     BLOCK_CONTEXTS,
     NUMBER_NODES,
-    Arithmetic,
+    ArithmeticState,
     Model,
     Models,
     residual_contexts,
@@ -27,7 +27,7 @@ NUMBER = st.one_of(st.integers(-9, 9), st.integers(-(2**31) + 1, 2**31 - 1))
 
 
 def coded_numbers(values: list[int], *, native: bool, flags: bool = False) -> tuple[bytes, Model]:
-    model, code = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES), Arithmetic(None)
+    model, code = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES), ArithmeticState(None)
     given = np.array(values, np.int64)
     assert code_numbers(code, model, contexts=contexts_for(values), values=given, flags=flags, native=native)
     return code.finished(), model
@@ -48,12 +48,12 @@ def test_both_give_the_same_bytes_and_models(values: list[int], flags: bool) -> 
     for name in ("chances", "seen", "weights"):
         assert (getattr(mine, name) == getattr(its, name)).all()
     for native in NATIVE:
-        code, found = Arithmetic(one), np.zeros(len(values), np.int64)
+        code, found = ArithmeticState(one), np.zeros(len(values), np.int64)
         model = Model.new([2, 3, 1], nodes=1 if flags else NUMBER_NODES)
         assert code_numbers(code, model, contexts=contexts_for(values), values=found, flags=flags, native=native)
         assert found.tolist() == values
-        assert code.is_whole() or not values
-        assert not code.is_over()
+        assert code.is_exhausted() or not values
+        assert not code.is_overrun()
 
 
 @pytest.mark.skipif(not has_native(), reason="the native library has no entropy coder")
@@ -68,17 +68,17 @@ def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
     found = []
     for native in NATIVE:
         blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
-        model, code = Model.new(residual_contexts(3), nodes=NUMBER_NODES), Arithmetic(None)
+        model, code = Model.new(residual_contexts(3), nodes=NUMBER_NODES), ArithmeticState(None)
         code_activity(code, (blocks, its_rows), history=history, sizes=sizes, active=active.copy(), native=native)
         assert code_residuals(code, model, last=last, others=sizes, residuals=values.copy(), native=native)
         data = code.finished()
         found.append([data, blocks.chances.tolist(), its_rows.weights.tolist(), model.chances.tolist()])
-        again = Arithmetic(data)
+        again = ArithmeticState(data)
         blocks, its_rows = Model.new(BLOCK_CONTEXTS, nodes=1), Model.new(ACTIVITY_CONTEXTS, nodes=1)
         model, back, residuals = Model.new(residual_contexts(3), nodes=NUMBER_NODES), 0 * active, 0 * values
         code_activity(again, (blocks, its_rows), history=history, sizes=sizes, active=back, native=native)
         assert code_residuals(again, model, last=last, others=sizes, residuals=residuals, native=native)
-        assert again.is_whole() or not rows
+        assert again.is_exhausted() or not rows
         assert (back == active).all()
         assert (residuals == values).all()
     assert found[0] == found[-1]
@@ -86,7 +86,7 @@ def test_rows_are_the_same_in_both(seed: int, rows: int) -> None:
 
 @both
 def test_the_example_of_the_document(native: bool) -> None:
-    model, code = Model.new([2], nodes=NUMBER_NODES), Arithmetic(None)
+    model, code = Model.new([2], nodes=NUMBER_NODES), ArithmeticState(None)
     values, contexts = np.array([0, 3, -1, 20, 0]), np.array([[0], [0], [1], [1], [0]], np.int32)
     code_numbers(code, model, contexts=contexts, values=values, native=native)
     assert code.finished().hex(" ") == "92 a5 ec 05"
@@ -106,7 +106,7 @@ def test_carries_run_through_many_bytes(native: bool) -> None:
         g = np.random.default_rng(seed)
         values = [*([1] * 400), *g.integers(0, 2, 5).tolist(), *([0] * int(g.integers(1, 60)))]
         data, _ = coded_numbers(values, native=native, flags=True)
-        code, found = Arithmetic(data), np.zeros(len(values), np.int64)
+        code, found = ArithmeticState(data), np.zeros(len(values), np.int64)
         model = Model.new([2, 3, 1], nodes=1)
         code_numbers(code, model, contexts=contexts_for(values), values=found, flags=True, native=native)
         assert found.tolist() == values
@@ -117,12 +117,12 @@ def test_a_code_that_is_cut_or_goes_on_is_not_whole(native: bool) -> None:
     values = np.random.default_rng(3).integers(-5, 6, 60).tolist()
     data, _ = coded_numbers(values, native=native)
     for other in (data + b"\0", data[:-2], b""):
-        code, found = Arithmetic(other), np.zeros(60, np.int64)
+        code, found = ArithmeticState(other), np.zeros(60, np.int64)
         model = Model.new([2, 3, 1], nodes=NUMBER_NODES)
         code_numbers(code, model, contexts=contexts_for(values), values=found, native=native)
-        assert not code.is_whole() or found.tolist() != values
-    assert Arithmetic(b"").is_whole()
-    assert not Arithmetic(b"\0").is_whole()
+        assert not code.is_exhausted() or found.tolist() != values
+    assert ArithmeticState(b"").is_exhausted()
+    assert not ArithmeticState(b"\0").is_exhausted()
 
 
 @both
@@ -130,7 +130,7 @@ def test_any_bytes_are_numbers_or_damage(native: bool) -> None:
     """Bits that always say yes make the largest number there is, which is refused."""
     g = np.random.default_rng(4)
     for data in (b"", bytes(40), b"\xff" * 40, *(g.bytes(30) for _ in range(50))):
-        code, found = Arithmetic(data), np.zeros(50, np.int64)
+        code, found = ArithmeticState(data), np.zeros(50, np.int64)
         model = Model.new([2, 3, 1], nodes=NUMBER_NODES)
         if code_numbers(code, model, contexts=contexts_for([0] * 50), values=found, native=native):
             assert (np.abs(found) < 2**31).all()
@@ -159,7 +159,7 @@ def test_a_model_of_others_is_a_copy() -> None:
 def test_a_model_that_does_not_fit_is_refused() -> None:
     with pytest.raises(StreamError, match="do not fit their models"):
         code_numbers(
-            Arithmetic(None),
+            ArithmeticState(None),
             Model.new([1, 1], nodes=NUMBER_NODES),
             contexts=np.zeros((1, 2), np.int32),
             values=np.zeros(1, np.int64),

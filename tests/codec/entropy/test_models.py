@@ -3,7 +3,7 @@
 
 import pytest
 
-from structgstream.codec.entropy.models import AHEAD, HALF, Arithmetic, Model, Models, carry, residual_contexts
+from structgstream.codec.entropy.models import AHEAD, HALF, ArithmeticState, Model, Models, carry, residual_contexts
 
 
 def test_a_new_model_expects_nothing() -> None:
@@ -52,7 +52,7 @@ def test_one_more_runs_through_full_bytes(before: str, end: int, after: str) -> 
 
 
 def test_an_encoder_that_said_nothing_has_no_bytes() -> None:
-    code = Arithmetic(None)
+    code = ArithmeticState(None)
     code.reserve(3)
     assert len(code.buffer) == code.size > 0
     assert code.finished() == b""
@@ -60,7 +60,7 @@ def test_an_encoder_that_said_nothing_has_no_bytes() -> None:
 
 def test_an_encoder_ends_with_the_shortest_number_of_its_interval() -> None:
     """From low on, the next number whose last three bytes are zero, which is rounded up into the bytes before."""
-    code = Arithmetic(None)
+    code = ArithmeticState(None)
     code.started, code.low, code.range = 1, 0x12000001, 1 << 24
     assert code.finished() == b"\x13"
     code.reserve(2)
@@ -69,9 +69,9 @@ def test_an_encoder_ends_with_the_shortest_number_of_its_interval() -> None:
 
 
 def test_a_decoder_is_whole_when_all_bytes_are_taken() -> None:
-    code = Arithmetic(b"\x01\x02")
-    assert (code.encodes, code.size, code.is_whole()) == (False, 2, False), "there are bytes and none is taken"
+    code = ArithmeticState(b"\x01\x02")
+    assert (code.encodes, code.size, code.is_exhausted()) == (False, 2, False), "there are bytes and none is taken"
     code.started = 1
     for place, whole, over in ((1 + AHEAD, False, False), (2 + AHEAD, True, False), (3 + AHEAD, False, True)):
         code.place = place
-        assert (code.is_whole(), code.is_over()) == (whole, over)
+        assert (code.is_exhausted(), code.is_overrun()) == (whole, over)

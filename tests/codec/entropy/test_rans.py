@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from properties import examples
 from structgstream.codec.entropy import rans
 from structgstream.codec.entropy.rans import LANES, decode, encode, has_native, lanes_for, section_bytes
-from structgstream.codec.entropy.tables import FrequencyTables, normalised
+from structgstream.codec.entropy.tables import FrequencyTables, normalize_counts
 from structgstream.errors import StreamError
 
 NATIVE = [False, *([True] if has_native() else [])]
@@ -25,7 +25,11 @@ def drawn(seed: int, *, count: int, contexts: int = 5, alphabet: int = 16, even:
     context = g.integers(0, contexts, count).astype(np.uint16)
     spread = np.linspace(0.3, 3.0, contexts)[context]
     symbol = g.integers(0, alphabet, count) if even else np.minimum(g.geometric(1 / (1 + spread)) - 1, alphabet - 1)
-    return symbol.astype(np.uint8), context, normalised(counted(symbol, context, contexts=contexts, alphabet=alphabet))
+    return (
+        symbol.astype(np.uint8),
+        context,
+        normalize_counts(counted(symbol, context, contexts=contexts, alphabet=alphabet)),
+    )
 
 
 def counted(symbols: np.ndarray, context: np.ndarray, *, contexts: int, alphabet: int) -> np.ndarray:
@@ -61,7 +65,7 @@ def test_symbols_come_back(native, seed, count, contexts, alphabet, lanes, even)
 @given(st.data())
 def test_any_table_codes_what_it_has_a_frequency_for(native, data: st.DataObject) -> None:
     weights = data.draw(st.lists(st.integers(0, 2**20), min_size=1, max_size=32).filter(any))
-    tables = normalised(np.array([weights]))
+    tables = normalize_counts(np.array([weights]))
     possible = np.flatnonzero(tables.rows[0]).tolist()
     symbols = np.array(data.draw(st.lists(st.sampled_from(possible), max_size=80)), np.uint8)
     context = np.zeros(len(symbols), np.uint16)

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from structgstream.codec.entropy.models import HALF, Arithmetic, Model
+from structgstream.codec.entropy.models import HALF, ArithmeticState, Model
 from structgstream.codec.entropy.reference_decisions import (
     FAR,
     LEAST,
@@ -41,7 +41,7 @@ def test_sizes_have_two_classes_an_octave_from_8_on() -> None:
 
 def test_a_chance_moves_half_of_the_way_then_a_third_then_a_quarter() -> None:
     """The rate of a cell is one over how many decisions it has seen, and two."""
-    model, code = Model.new((1,), nodes=1), Arithmetic(None)
+    model, code = Model.new((1,), nodes=1), ArithmeticState(None)
     chance, expected = HALF, []
     for seen, yes in enumerate((1, 1, 0)):
         chance += ((65536 if yes else 0) - chance) * (65536 // (seen + 2)) >> 16

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.entropy.bits import BitReader, fixed, golomb, packed_bits, signed_golomb
-from structgstream.codec.entropy.residual_symbols import residuals_of, symbols_of
+from structgstream.codec.entropy.bits import BitReader, fixed, golomb, pack_bits, signed_golomb
+from structgstream.codec.entropy.residual_symbols import residuals_to_symbols, symbols_to_residuals
 from structgstream.errors import StreamError
 
 INT32 = st.one_of(st.integers(-9, 9), st.integers(-(2**31), 2**31 - 1), st.sampled_from([-(2**31), 2**31 - 1]))
@@ -15,32 +15,32 @@ INT32 = st.one_of(st.integers(-9, 9), st.integers(-(2**31), 2**31 - 1), st.sampl
 
 @given(st.lists(INT32, max_size=60))
 def test_residuals_come_back(values: list[int]) -> None:
-    symbols, escapes = symbols_of(np.array(values, np.int64))
+    symbols, escapes = residuals_to_symbols(np.array(values, np.int64))
     assert symbols.dtype == np.uint8
-    assert residuals_of(symbols, escapes).tolist() == values
-    assert residuals_of(symbols, escapes).dtype == np.int32
+    assert symbols_to_residuals(symbols, escapes).tolist() == values
+    assert symbols_to_residuals(symbols, escapes).dtype == np.int32
 
 
 def test_the_order_of_symbols_is_that_of_the_document() -> None:
-    symbols, escapes = symbols_of(np.array([0, -1, 1, -2, 2, -7, 7, 8, -8, -2, 13], np.int32))
+    symbols, escapes = residuals_to_symbols(np.array([0, -1, 1, -2, 2, -7, 7, 8, -8, -2, 13], np.int32))
     assert symbols.tolist() == [0, 1, 2, 3, 4, 13, 14, 15, 15, 3, 15]
     # 8: 100 0; -8: 100 1; 13 is 5 more than 8: 0 1001 0.
     assert escapes == bytes([0b10001001, 0b01001000])
 
 
 def test_small_residuals_need_no_escapes() -> None:
-    assert symbols_of(np.arange(-7, 8))[1] == b""
-    assert symbols_of(np.empty(0, np.int32))[0].shape == (0,)
+    assert residuals_to_symbols(np.arange(-7, 8))[1] == b""
+    assert residuals_to_symbols(np.empty(0, np.int32))[0].shape == (0,)
 
 
 @pytest.mark.parametrize("value", [2**31, -(2**31) - 1, 2**40])
 def test_a_residual_beyond_32_bits_is_refused(value: int) -> None:
     with pytest.raises(StreamError, match="beyond 32 bits"):
-        symbols_of(np.array([0, value]))
+        residuals_to_symbols(np.array([0, value]))
 
 
 def escaped(magnitude: int, *, negative: bool) -> bytes:
-    return packed_bits([golomb(magnitude - 8, order=2), fixed(negative, 1)])
+    return pack_bits([golomb(magnitude - 8, order=2), fixed(negative, 1)])
 
 
 @pytest.mark.parametrize(
@@ -61,28 +61,28 @@ def escaped(magnitude: int, *, negative: bool) -> bytes:
 )
 def test_damaged_escapes_are_refused(symbols: list[int], escapes: bytes, problem: str) -> None:
     with pytest.raises(StreamError, match=problem):
-        residuals_of(np.array(symbols, np.uint8), escapes)
+        symbols_to_residuals(np.array(symbols, np.uint8), escapes)
 
 
 @given(st.integers(0, 20), st.binary(max_size=40))
 def test_arbitrary_bytes_are_refused_or_are_residuals(count: int, data: bytes) -> None:
     with suppress(StreamError):
-        assert (np.abs(residuals_of(np.full(count, 15, np.uint8), data).astype(np.int64)) >= 8).all()
+        assert (np.abs(symbols_to_residuals(np.full(count, 15, np.uint8), data).astype(np.int64)) >= 8).all()
 
 
 def test_every_damaged_byte_is_refused_or_gives_as_many() -> None:
-    symbols, escapes = symbols_of(np.array([8, -300, 5, 70_000, -9, 10]))
+    symbols, escapes = residuals_to_symbols(np.array([8, -300, 5, 70_000, -9, 10]))
     for place in range(len(escapes)):
         for change in (0x01, 0x10, 0x80, 0xFF):
             damaged = bytearray(escapes)
             damaged[place] ^= change
             with suppress(StreamError):
-                assert residuals_of(symbols, bytes(damaged)).shape == symbols.shape
+                assert symbols_to_residuals(symbols, bytes(damaged)).shape == symbols.shape
 
 
 @given(st.lists(st.tuples(st.integers(-(2**20), 2**20), st.integers(0, 3)), max_size=20))
 def test_bits_come_back(values: list[tuple[int, int]]) -> None:
-    data = packed_bits(signed_golomb(value, order=order) for value, order in values)
+    data = pack_bits(signed_golomb(value, order=order) for value, order in values)
     reader = BitReader(data, where="It")
     assert [reader.signed_golomb(order=order, most_zeros=22) for _, order in values] == [value for value, _ in values]
     reader.end()

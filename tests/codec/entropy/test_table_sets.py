@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from structgstream.codec.entropy.bits import fixed, packed_bits
-from structgstream.codec.entropy.table_sets import decoded_tables, levels_of, top_level, weights_of
+from structgstream.codec.entropy.bits import fixed, pack_bits
+from structgstream.codec.entropy.table_sets import decode_tables, levels_of, top_level, weights_of
 from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, geometric
 from structgstream.errors import StreamError
 
@@ -13,7 +13,7 @@ EVEN = FrequencyTables(np.full((2, 4), TOTAL // 4, np.uint16))
 
 
 def made(*pieces: str) -> list[list[int]]:
-    return decoded_tables(packed_bits([*pieces]), EVEN).rows.tolist()
+    return decode_tables(pack_bits([*pieces]), EVEN).rows.tolist()
 
 
 def test_levels_by_hand() -> None:
@@ -26,7 +26,7 @@ def test_levels_by_hand() -> None:
 
 
 def test_no_bytes_keep_every_row() -> None:
-    assert decoded_tables(b"", EVEN) is EVEN
+    assert decode_tables(b"", EVEN) is EVEN
 
 
 def test_a_row_is_kept_taken_from_the_family_or_told() -> None:
@@ -51,9 +51,9 @@ def test_a_row_is_kept_taken_from_the_family_or_told() -> None:
 )
 def test_sets_that_cannot_be_are_refused(pieces: list[str], words: str) -> None:
     with pytest.raises(StreamError, match=words):
-        decoded_tables(packed_bits(pieces), EVEN)
+        decode_tables(pack_bits(pieces), EVEN)
 
 
 def test_more_bytes_than_rows_can_take_are_refused_before_they_are_read() -> None:
     with pytest.raises(StreamError, match="145 bytes for 2 contexts"):
-        decoded_tables(bytes(145), EVEN)
+        decode_tables(bytes(145), EVEN)

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from properties import examples
-from structgstream.codec.entropy.bits import fixed, packed_bits, signed_golomb
+from structgstream.codec.entropy.bits import fixed, pack_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
-from structgstream.codec.entropy.table_choice import chosen_tables
-from structgstream.codec.entropy.table_sets import decoded_tables, levels_of, top_level, weights_of
-from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, code_costs, geometric, logs, normalised
+from structgstream.codec.entropy.table_choice import choose_tables
+from structgstream.codec.entropy.table_sets import decode_tables, levels_of, top_level, weights_of
+from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, code_costs, geometric, logs, normalize_counts
 from structgstream.errors import StreamError
 
 COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 2**31)), min_size=1, max_size=32)
@@ -40,7 +40,7 @@ def laplace_counts(*, count: int, contexts: int, low: float, high: float, seed: 
 
 @given(COUNTS)
 def test_what_occurs_has_a_frequency_and_a_row_sums_to_4096(counts: list[int]) -> None:
-    row = normalised(np.array([counts])).rows[0]
+    row = normalize_counts(np.array([counts])).rows[0]
     assert row.sum() == TOTAL
     assert ((row > 0) == (np.array(counts) > 0)).all() or not any(counts)
 
@@ -49,7 +49,7 @@ def test_what_occurs_has_a_frequency_and_a_row_sums_to_4096(counts: list[int]) -
 def test_no_other_frequencies_code_noticeably_shorter(counts: list[int]) -> None:
     """The code length is convex in the frequencies: what is best nearby is best."""
     n = np.array(counts)
-    row = normalised(n[None]).rows[0].astype(int)
+    row = normalize_counts(n[None]).rows[0].astype(int)
     step = np.arange(-100, 101)
     first, second = np.meshgrid(row[0] + step, row[1] + step, indexing="ij")
     others = np.stack([first, second, TOTAL - first - second])
@@ -59,15 +59,15 @@ def test_no_other_frequencies_code_noticeably_shorter(counts: list[int]) -> None
 
 
 def test_equals_are_served_from_the_first_on() -> None:
-    assert normalised(np.array([[7, 7, 7]])).rows.tolist() == [[1366, 1365, 1365]]
-    assert normalised(np.array([[0, 0, 0]])).rows.tolist() == [[1366, 1365, 1365]]
-    assert normalised(np.array([[1, 0, 10**9, 1, 10**9]])).rows.tolist() == [[1, 0, 2047, 1, 2047]]
+    assert normalize_counts(np.array([[7, 7, 7]])).rows.tolist() == [[1366, 1365, 1365]]
+    assert normalize_counts(np.array([[0, 0, 0]])).rows.tolist() == [[1366, 1365, 1365]]
+    assert normalize_counts(np.array([[1, 0, 10**9, 1, 10**9]])).rows.tolist() == [[1, 0, 2047, 1, 2047]]
 
 
 def test_counts_and_tables_that_cannot_be_are_refused() -> None:
     for counts in ([[-1, 2]], [[1 << 40, 2]]):
         with pytest.raises(StreamError, match="Counts"):
-            normalised(np.array(counts))
+            normalize_counts(np.array(counts))
     for rows in (np.full((1, 2), 2000, np.uint16), np.full((1, 2), 2048), np.zeros((2, 0), np.uint16)):
         with pytest.raises(StreamError, match="must"):
             FrequencyTables(rows)
@@ -131,9 +131,9 @@ def test_chosen_tables_come_back_and_can_code_what_was_counted(data: st.DataObje
     )
     counts = np.array(data.draw(st.lists(row, min_size=contexts, max_size=contexts)))
     before = np.array(data.draw(st.lists(row, min_size=contexts, max_size=contexts)))
-    previous = normalised(before)
-    tables, bits = chosen_tables(counts, previous)
-    assert (decoded_tables(bits, previous).rows == tables.rows).all()
+    previous = normalize_counts(before)
+    tables, bits = choose_tables(counts, previous)
+    assert (decode_tables(bits, previous).rows == tables.rows).all()
     assert (tables.rows[counts > 0] > 0).all()
 
 
@@ -142,18 +142,18 @@ def test_chosen_tables_come_back_and_can_code_what_was_counted(data: st.DataObje
 def test_a_choice_is_never_longer_than_keeping_what_there_is(seed: int, count: int) -> None:
     counts = laplace_counts(count=count, contexts=8, low=0.2, high=2, seed=seed)
     previous = geometric(np.full(8, 100), alphabet=16)
-    tables, bits = chosen_tables(counts, previous)
+    tables, bits = choose_tables(counts, previous)
     assert bits_for(counts, tables.rows) + 8 * len(bits) <= bits_for(counts, previous.rows) + 8 + 8
 
 
 def test_tables_that_fit_are_kept_in_no_bytes() -> None:
     counts = laplace_counts(count=20_000, contexts=50, low=0.2, high=2)
-    tables, _ = chosen_tables(counts, geometric(np.full(50, 100), alphabet=16))
-    again, bits = chosen_tables(counts, tables)
+    tables, _ = choose_tables(counts, geometric(np.full(50, 100), alphabet=16))
+    again, bits = choose_tables(counts, tables)
     assert bits == b""
     assert (again.rows == tables.rows).all()
-    assert (decoded_tables(bytes(7), tables).rows == tables.rows).all(), "a bit each says the same"
-    nothing, bits = chosen_tables(np.zeros((50, 16), np.int64), tables)
+    assert (decode_tables(bytes(7), tables).rows == tables.rows).all(), "a bit each says the same"
+    nothing, bits = choose_tables(np.zeros((50, 16), np.int64), tables)
     assert bits == b""
     assert (nothing.rows == tables.rows).all()
 
@@ -161,7 +161,7 @@ def test_tables_that_fit_are_kept_in_no_bytes() -> None:
 @pytest.mark.parametrize(("low", "high"), [(0.2, 0.6), (0.3, 1.0), (0.5, 2.0), (1.5, 5.0)])
 def test_fifty_contexts_of_peaked_symbols_with_tables_are_within_a_twentieth(low: float, high: float) -> None:
     counts = laplace_counts(count=30_000, contexts=50, low=low, high=high)
-    tables, bits = chosen_tables(counts, geometric(np.full(50, 100), alphabet=16))
+    tables, bits = choose_tables(counts, geometric(np.full(50, 100), alphabet=16))
     context, symbols = np.divmod(np.repeat(np.arange(counts.size), counts.reshape(-1)), 16)
     section = encode(symbols.astype(np.uint8), context.astype(np.uint16), tables)
     p = counts / counts.sum(1, keepdims=True)
@@ -174,9 +174,9 @@ def test_a_peaked_row_of_no_family_takes_ten_bytes(seed: int) -> None:
     g = np.random.default_rng(seed)
     shape = np.exp(-np.arange(16) / 2) * np.exp(g.normal(0, 0.5, 16))
     counts = np.rint(2000 * shape / shape.sum()).astype(int)[None]
-    tables, bits = chosen_tables(counts, geometric(np.array([100]), alphabet=16))
+    tables, bits = choose_tables(counts, geometric(np.array([100]), alphabet=16))
     assert len(bits) <= 10
-    assert bits_for(counts, tables.rows) <= 1.01 * bits_for(counts, normalised(counts).rows)
+    assert bits_for(counts, tables.rows) <= 1.01 * bits_for(counts, normalize_counts(counts).rows)
 
 
 def test_precision_follows_the_number_of_symbols() -> None:
@@ -184,8 +184,8 @@ def test_precision_follows_the_number_of_symbols() -> None:
     previous = geometric(np.array([100]), alphabet=16)
     excess = []
     for times in (1, 10, 1000):
-        tables, bits = chosen_tables(shape * times, previous)
-        excess.append((len(bits), bits_for(shape, tables.rows) / bits_for(shape, normalised(shape).rows) - 1))
+        tables, bits = choose_tables(shape * times, previous)
+        excess.append((len(bits), bits_for(shape, tables.rows) / bits_for(shape, normalize_counts(shape).rows) - 1))
     (few, rough), (_, better), (many, fine) = excess
     assert few < many <= 16
     assert rough > better > fine
@@ -259,14 +259,14 @@ def test_a_decoder_written_from_the_document_agrees(seed: int, alphabet: int, si
     g = np.random.default_rng(seed)
     shapes = np.exp(-np.arange(alphabet) / g.uniform(0.5, 8) + g.normal(0, 0.6, (4, alphabet)))
     counts = g.poisson(10**size * shapes * (g.random((4, alphabet)) < 0.8))
-    previous = normalised(g.poisson(500 * shapes))
-    tables, data = chosen_tables(counts, previous)
+    previous = normalize_counts(g.poisson(500 * shapes))
+    tables, data = choose_tables(counts, previous)
     assert plain_tables(data, previous.rows.tolist()) == tables.rows.tolist()
 
 
 def row_bits(*, head: str = "110", precision: int = 1, order: int = 0, presence: str, steps: list[int]) -> bytes:
     text = head + fixed(precision, 2) + fixed(order, 1) + presence
-    return packed_bits([text, *(signed_golomb(step, order=order) for step in steps)])
+    return pack_bits([text, *(signed_golomb(step, order=order) for step in steps)])
 
 
 def test_the_rows_of_the_document() -> None:
@@ -274,9 +274,9 @@ def test_the_rows_of_the_document() -> None:
     previous = FrequencyTables(np.array([[3072, 512, 512, 0]], np.uint16))
     data = row_bits(presence="0" + fixed(2, 5), steps=[0, 1, -2])
     assert data.hex() == "c82b20"
-    assert decoded_tables(data, previous).rows.tolist() == [[3072, 768, 256, 0]]
+    assert decode_tables(data, previous).rows.tolist() == [[3072, 768, 256, 0]]
     data = row_bits(presence="1" + "1001", steps=[0, 0])
-    assert decoded_tables(data, previous).rows.tolist() == [[4095, 0, 0, 1]]
+    assert decode_tables(data, previous).rows.tolist() == [[4095, 0, 0, 1]]
 
 
 @pytest.mark.parametrize(
@@ -295,27 +295,27 @@ def test_the_rows_of_the_document() -> None:
 )
 def test_a_damaged_set_is_refused(data: bytes, problem: str) -> None:
     with pytest.raises(StreamError, match=problem):
-        decoded_tables(data, FrequencyTables(np.array([[3072, 512, 512, 0]], np.uint16)))
+        decode_tables(data, FrequencyTables(np.array([[3072, 512, 512, 0]], np.uint16)))
 
 
 @examples(200)
 @given(st.binary(max_size=60))
 def test_arbitrary_bytes_are_refused_or_are_tables(data: bytes) -> None:
     with suppress(StreamError):
-        assert decoded_tables(data, geometric(np.array([3, 100, 250]), alphabet=16)).contexts == 3
+        assert decode_tables(data, geometric(np.array([3, 100, 250]), alphabet=16)).contexts == 3
 
 
 def test_every_damaged_byte_is_refused_or_gives_tables() -> None:
     previous = geometric(np.full(6, 100), alphabet=16)
-    _, bits = chosen_tables(laplace_counts(count=20_000, contexts=6, low=0.2, high=5), previous)
+    _, bits = choose_tables(laplace_counts(count=20_000, contexts=6, low=0.2, high=5), previous)
     assert len(bits) > 20
     for place, change in product(range(len(bits)), (0x01, 0x80, 0xFF, 0x5A)):
         damaged = bytearray(bits)
         damaged[place] ^= change
         with suppress(StreamError):
-            assert decoded_tables(bytes(damaged), previous).rows.shape == previous.rows.shape
+            assert decode_tables(bytes(damaged), previous).rows.shape == previous.rows.shape
 
 
 def test_counts_of_another_shape_are_refused() -> None:
     with pytest.raises(StreamError, match="must be of the tables' shape"):
-        chosen_tables(np.zeros((2, 16), np.int64), geometric(np.array([0]), alphabet=16))
+        choose_tables(np.zeros((2, 16), np.int64), geometric(np.array([0]), alphabet=16))

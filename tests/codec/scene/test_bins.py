@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from properties import examples
 from rigs import random_scene
 from streams import STEPS
-from structgstream.codec.scene.bins import LARGEST, binned, rounded_fields, valued
+from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state, quantized_fields
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
@@ -22,10 +22,10 @@ AWKWARD = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STE
 @pytest.mark.parametrize("dynamic", [CODABLE, PAPER_DYNAMIC, frozenset({"free", "free_births"}), frozenset()])
 def test_bins_of_the_values_of_bins_are_the_same_bins(dynamic: frozenset[FieldName]) -> None:
     state = state_of(with_appearance(random_scene(7, free=5), 4))
-    bins = binned(state, dynamic, AWKWARD)
-    values = valued(bins, dynamic, AWKWARD)
+    bins = quantize_state(state, dynamic, AWKWARD)
+    values = dequantize_state(bins, dynamic, AWKWARD)
     assert values.keys() == dynamic
-    again = binned({**state, **values}, dynamic, AWKWARD)
+    again = quantize_state({**state, **values}, dynamic, AWKWARD)
     assert (again.anchors == bins.anchors).all()
     assert (again.free.bins == bins.free.bins).all()
     assert all((again.weights[name] == found).all() for name, found in bins.weights.items())
@@ -43,9 +43,9 @@ def test_a_value_is_one_product_of_two_float32(bin: int, step: float) -> None:
     state = state_of(random_scene(1))
     positions = torch.from_numpy(np.full((1, 3), np.float32(bin) * np.float32(step)))
     rows: frozenset[FieldName] = frozenset({"anchor_positions"})
-    bins = binned({**state, "anchor_positions": positions}, rows, {"anchor_positions": step})
+    bins = quantize_state({**state, "anchor_positions": positions}, rows, {"anchor_positions": step})
     assert bins.anchors.tolist() == [[bin] * 3]
-    assert torch.equal(valued(bins, rows, {"anchor_positions": step})["anchor_positions"], positions)
+    assert torch.equal(dequantize_state(bins, rows, {"anchor_positions": step})["anchor_positions"], positions)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), (LARGEST + 1) * 2.0**-6, -3e38])
@@ -53,22 +53,22 @@ def test_a_value_that_no_bin_stands_for(value: float) -> None:
     state = state_of(random_scene(3))
     state["anchor_positions"][1, 2] = value
     with pytest.raises(StreamError, match="steps from zero, at most 4194304 can be coded"):
-        binned(state, frozenset({"anchor_positions"}), STEPS)
+        quantize_state(state, frozenset({"anchor_positions"}), STEPS)
 
 
 def test_columns_stand_in_the_order_of_the_state_table() -> None:
-    assert rounded_fields("anchor") == ("anchor_positions", "offset_scales", "base_scales", "appearance")
+    assert quantized_fields("anchor") == ("anchor_positions", "offset_scales", "base_scales", "appearance")
     state = state_of(with_appearance(random_scene(2, free=1), 4))
     state["offset_scales"] = torch.tensor([[1.0, 2, 3], [4, 5, 6]]) / 64
     state["appearance"] = torch.arange(1, 9).reshape(2, 4) / 64
     state["free"] = torch.arange(14)[None] / 64
-    found = binned(state, CODABLE, STEPS)
+    found = quantize_state(state, CODABLE, STEPS)
     assert [end - first for _, first, end in found.columns] == [3, 3, 3, 4]
     assert found.anchors[:, 3:6].tolist() == [[1, 2, 3], [4, 5, 6]]
     assert found.anchors[:, 9:].tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
     assert found.free.bins.tolist() == [[*range(14)]]
     widths = {"free_means": 3, "free_log_scales": 3, "free_quats": 4, "free_logit_opacities": 1, "free_colors": 3}
     steps = STEPS | {name: 2.0**-7 * (i + 1) for i, name in enumerate(widths)}
-    coarse = binned(state, CODABLE, steps)
+    coarse = quantize_state(state, CODABLE, steps)
     expected = [round(2 * column / (i + 1)) for i, column in zip(np.repeat(range(5), [*widths.values()]), range(14))]
     assert coarse.free.bins.tolist() == [expected]

@@ -19,7 +19,7 @@ def test_a_change_of_residuals_knows_rows_and_sizes() -> None:
 
 
 def test_rows_that_stay_keep_their_change_and_new_ones_have_none() -> None:
-    change = Change.of(RESIDUALS).select(np.array([False, True, False, True])).grown(2)
+    change = Change.of(RESIDUALS).select(np.array([False, True, False, True])).extended(2)
     assert change.residuals.tolist() == [[1, -2], [0, -1], [0, 0], [0, 0]]
     assert change.history.tolist() == [1, 1, 0, 0]
     assert change.sizes.tolist() == [3, 1, 0, 0]

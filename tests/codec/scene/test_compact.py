@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from properties import examples
 from rigs import random_scene
 from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
-from structgstream.codec.container.blocks import coded_fields
-from structgstream.codec.container.payload import FRAME, packet_of
-from structgstream.codec.container.records import RECORD, RecordType, scanned
+from structgstream.codec.container.blocks import coded_payloads
+from structgstream.codec.container.payload import FRAME, parse_packet
+from structgstream.codec.container.records import RECORD, RecordType, scan_records
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.header import pack_header, unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
@@ -209,7 +209,7 @@ def test_bytes_of_each_field_add_up() -> None:
 
 def test_the_header_comes_back() -> None:
     header = compact_header(small_scene(3, free=2), steps={name: float(np.float32(0.013)) for name in STEPS})
-    back = unpacked_header(packed_header(header))
+    back = unpack_header(pack_header(header))
     assert (back.codec, back.steps, back.dynamic) == ("compact", header.steps, header.dynamic)
     assert back.reference.keys() == {"anchor_positions", "offset_scales", "covariance_mlp"}
     assert all(torch.equal(back.reference[name], value) for name, value in header.reference.items())
@@ -243,7 +243,7 @@ def test_a_header_that_does_not_fit_the_codec() -> None:
 def test_a_step_that_is_none(step: object) -> None:
     header = compact_header(small_scene())
     with pytest.raises(StreamError, match="The init record does not follow the format"):
-        unpacked_header(packed_header(replace(header, steps={**header.steps, "free_quats": step})))  # type: ignore[dict-item]
+        unpack_header(pack_header(replace(header, steps={**header.steps, "free_quats": step})))  # type: ignore[dict-item]
 
 
 def test_a_value_out_of_range() -> None:
@@ -297,13 +297,13 @@ def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index
     header, _, seen, packets = small()
     decoder = CompactDecoder(header)
     for packet in packets[(index // 3) * 3 : index]:
-        decoder.decode(coded_fields(packet.payload, FRAME.size, where=""), kind=packet.kind, index=packet.index)
+        decoder.decode(coded_payloads(packet.payload, FRAME.size, where=""), kind=packet.kind, index=packet.index)
     state, failed, different = decoder.state, 0, 0
     for payload in flipped(packets[index].payload, FRAME.size):
         decoder.state = state
         try:
-            packet = packet_of(payload, packets[index].kind)
-            found = decoder.decode(coded_fields(payload, FRAME.size, where=""), kind=packet.kind, index=index)
+            packet = parse_packet(payload, packets[index].kind)
+            found = decoder.decode(coded_payloads(payload, FRAME.size, where=""), kind=packet.kind, index=index)
         except StreamError:
             failed += 1
             continue
@@ -315,10 +315,10 @@ def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index
 
 def test_every_byte_of_an_init_record_changed_gives_a_decoder_or_one_kind_of_error() -> None:
     header, data, _, packets = small()
-    payload, failed = next(scanned(data)).payload, 0
+    payload, failed = next(scan_records(data)).payload, 0
     for mangled in flipped(payload):
         try:
-            scene = SceneDecoder(unpacked_header(mangled)).decode(packets[0])
+            scene = SceneDecoder(unpack_header(mangled)).decode(packets[0])
         except StreamError:
             failed += 1
             continue
@@ -360,7 +360,7 @@ def test_a_mangled_packet_gives_a_scene_or_one_kind_of_error(data: st.DataObject
     for packet in packets[(index // 3) * 3 : index]:
         decoder.decode(packet)
     try:
-        scene = decoder.decode(packet_of(bytes(payload[:end]), packets[index].kind))
+        scene = decoder.decode(parse_packet(bytes(payload[:end]), packets[index].kind))
     except StreamError:
         return
     assert len(scene.anchors) == 3

@@ -14,7 +14,7 @@ from structgstream.codec.entropy.models import Models
 from structgstream.codec.scene import free_rows
 from structgstream.codec.scene.bins import FreeBins
 from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.free_rows import MOST_FREE, coded_free
+from structgstream.codec.scene.free_rows import MOST_FREE, code_free
 from structgstream.errors import StreamError
 
 
@@ -37,9 +37,9 @@ def exchange(after: FreeBins, before: FreeBins, models: tuple[Models, Models] | 
     """What a decoder finds; checks that the encoder thinks the same."""
     mine, its = models or (Models(), Models())
     writer = AdaptiveEncoder(mine, where="Frame 0")
-    known = coded_free(writer, after, before, where="Packet 0")
+    known = code_free(writer, after, before, where="Packet 0")
     reader = AdaptiveDecoder(its, fields_of(writer), where="Packet 0")  # type: ignore[arg-type]
-    back = coded_free(reader, None, before, where="Packet 0")
+    back = code_free(reader, None, before, where="Packet 0")
     reader.end()
     for one, other in ((known, back), (after, back)):
         assert (one.births == other.births).all()
@@ -79,7 +79,7 @@ def test_what_changed_is_remembered_and_what_is_born_did_not_change() -> None:
     found = exchange(after, before)
     assert found.change.active.tolist() == [True, False, False]
     assert found.change.residuals.sum() == 3
-    assert not found.unmoved().change.active.any()
+    assert not found.without_change().change.active.any()
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_what_changed_is_remembered_and_what_is_born_did_not_change() -> None:
 )
 def test_births_that_cannot_be_coded(births: list[int], before: list[int], message: str) -> None:
     with pytest.raises(StreamError, match=message):
-        coded_free(new_encoder(), free(births), free(before), where="Frame 0")
+        code_free(new_encoder(), free(births), free(before), where="Frame 0")
 
 
 def hostile(count: int, frames: list[int], numbers: list[int]) -> FreeBins:
@@ -107,7 +107,7 @@ def hostile(count: int, frames: list[int], numbers: list[int]) -> FreeBins:
         inputs = [column_, other * 3 + 1, other]
         writer.numbers("free.born", np.zeros(len(frames), np.int64), inputs, counts=[14, 546, 182])
     reader = AdaptiveDecoder(Models(), fields_of(writer), where="Packet 0")  # type: ignore[arg-type]
-    found = coded_free(reader, None, FreeBins.none(), where="Packet 0")
+    found = code_free(reader, None, FreeBins.none(), where="Packet 0")
     reader.end()
     return found
 
@@ -151,16 +151,16 @@ def test_the_most_that_few_bytes_can_make(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(free_rows, "MOST_FREE", 2**12)
     many = FreeBins(np.arange(1, 2**12 + 1), np.zeros((2**12, 14), np.int32), Change.none(2**12, 14))
     writer = new_encoder()
-    coded_free(writer, many, FreeBins.none(), where="")
+    code_free(writer, many, FreeBins.none(), where="")
     assert sum(map(len, writer.fields().values())) < 200
     assert len(exchange(many, FreeBins.none()).births) == 2**12
     more = FreeBins(np.arange(1, 2**12 + 2), np.zeros((2**12 + 1, 14), np.int32), many.change)
     with pytest.raises(StreamError, match="adds 1 free Gaussians, which makes more than"):
-        coded_free(new_encoder(), more, many, where="Frame 1")
+        code_free(new_encoder(), more, many, where="Frame 1")
 
 
 def test_a_birth_takes_few_bytes() -> None:
     writer = new_encoder()
     many = free([2**32 + i for i in range(300)], scale=20.0)
-    coded_free(writer, many, FreeBins.none(), where="")
+    code_free(writer, many, FreeBins.none(), where="")
     assert sum(map(len, writer.fields().values())) / 300 < 14, "6 to 7 bits an attribute"

@@ -11,7 +11,7 @@ from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.rows import coded_change
+from structgstream.codec.scene.rows import code_change
 from structgstream.errors import StreamError
 
 GROUPS = (("anchor_positions", 0, 2), ("offset_scales", 2, 3))
@@ -35,7 +35,7 @@ def stories(draw: st.DrawFn) -> list[np.ndarray]:
 
 def written(models: Models, residuals: np.ndarray, before: Change) -> tuple[dict[str, bytes], Change]:
     writer = AdaptiveEncoder(models, where="Frame 0")
-    change = coded_change(writer, Change.of(residuals), before, groups=GROUPS)
+    change = code_change(writer, Change.of(residuals), before, groups=GROUPS)
     return NOTHING | writer.fields(), change
 
 
@@ -50,7 +50,7 @@ def test_changes_come_back_and_the_documents_say_the_same(frames: list[np.ndarra
         mine, its = Models(mine), Models(its)
         fields, known = written(mine, residuals, known)
         reader = AdaptiveDecoder(its, fields, where="Packet 0")  # type: ignore[arg-type]
-        back = coded_change(reader, None, back, groups=GROUPS)
+        back = code_change(reader, None, back, groups=GROUPS)
         reader.end()
         for one in (known, back):
             assert (one.residuals == residuals).all()
@@ -67,7 +67,7 @@ def test_changes_come_back_and_the_documents_say_the_same(frames: list[np.ndarra
 
 def test_nothing_to_code_takes_nothing() -> None:
     before = Change.none(5, 0)
-    assert coded_change(AdaptiveEncoder(Models(), where=""), before, before, groups=()) is before
+    assert code_change(AdaptiveEncoder(Models(), where=""), before, before, groups=()) is before
 
 
 def test_what_stands_still_is_free() -> None:

@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 
 from properties import examples
 from streams import small_scene
-from structgstream.codec.entropy.coder import Encoder, Tables, varint
-from structgstream.codec.scene.bins import on_bins
+from structgstream.codec.entropy.section_coder import SectionEncoder, Tables, varint
+from structgstream.codec.scene.bins import round_to_bins
 from structgstream.codec.scene.static_fields import (
     FREE_NUMBERS,
     MOST_ANCHORS,
     MOST_WEIGHTS,
     UNCODED_FIELDS,
-    decoded_fields,
-    encoded_fields,
+    decode_fields,
+    encode_fields,
     most_columns,
 )
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
-from structgstream.scene.order import space_order
+from structgstream.scene.order import morton_order
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
 
 CODED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.name not in UNCODED_FIELDS)
@@ -39,7 +39,7 @@ def fields_of(anchors: int = 5, *, seed: int = 0, scale: float = 1.0) -> dict[Fi
         with_appearance(small_scene(anchors, seed=seed), 2), environment=torch.arange(12.0).reshape(4, 3) - 5
     )
     state = state_of(scene)
-    return on_bins({name: state[name] * scale for name in CODED}, STEPS)
+    return round_to_bins({name: state[name] * scale for name in CODED}, STEPS)
 
 
 def row(**changes: torch.Tensor) -> dict[FieldName, torch.Tensor]:
@@ -54,13 +54,13 @@ def row(**changes: torch.Tensor) -> dict[FieldName, torch.Tensor]:
 
 @cache
 def three_anchors() -> dict[FieldName, bytes]:
-    return encoded_fields(fields_of(3), STEPS)
+    return encode_fields(fields_of(3), STEPS)
 
 
 def check(fields: Mapping[FieldName, torch.Tensor]) -> int:
     """Comes back bit for bit; the size in bytes."""
-    coded = encoded_fields(fields, STEPS)
-    back = decoded_fields(coded, STEPS)
+    coded = encode_fields(fields, STEPS)
+    back = decode_fields(coded, STEPS)
     assert list(back) == sorted(fields, key=CODED.index) or back.keys() == fields.keys()
     for name, value in fields.items():
         assert back[name].dtype == torch.float32
@@ -87,7 +87,7 @@ def test_positions_in_any_order(cells: list[list[int]], ordered: bool) -> None:
     step = STEPS["anchor_positions"]
     positions = torch.from_numpy(bins.numpy().astype(np.float32) * np.float32(step))
     if ordered:
-        positions = positions[space_order(positions, step=step)]
+        positions = positions[morton_order(positions, step=step)]
     fields: dict[FieldName, torch.Tensor] = {"anchor_positions": positions}
     check(fields)
 
@@ -98,7 +98,7 @@ def test_the_corners_of_what_positions_may_be() -> None:
     apart = torch.zeros(5, 3, dtype=torch.int32)
     apart[2, 1] = 2**20
     with pytest.raises(StreamError, match=r"Anchors are 1048576 steps apart, at most 2\^20; take a larger step"):
-        encoded_fields(row(anchor_positions=apart), STEPS)
+        encode_fields(row(anchor_positions=apart), STEPS)
 
 
 def test_ordered_positions_take_fewer_bits() -> None:
@@ -106,15 +106,15 @@ def test_ordered_positions_take_fewer_bits() -> None:
     places = torch.randperm(32**3, generator=g)[:2000]
     bins = torch.stack([places % 32, places // 32 % 32, places // 32**2], dim=1)
     positions = bins * STEPS["anchor_positions"]
-    order = space_order(positions, step=STEPS["anchor_positions"])
-    fields = fields_of(2000) | on_bins({"anchor_positions": positions[order]}, STEPS)
+    order = morton_order(positions, step=STEPS["anchor_positions"])
+    fields = fields_of(2000) | round_to_bins({"anchor_positions": positions[order]}, STEPS)
     check(fields)
-    size = len(encoded_fields(fields, STEPS)["anchor_positions"])
+    size = len(encode_fields(fields, STEPS)["anchor_positions"])
     # 2000 of 32768 places, in no particular order: log2 of the binomial is 10.7 kbit.
     assert 10_700 / 8 < size < 1.25 * 10_700 / 8
     shuffled = fields["anchor_positions"][torch.randperm(2000, generator=g)]
     mixed: dict[FieldName, torch.Tensor] = {**fields, "anchor_positions": shuffled}
-    assert len(encoded_fields(mixed, STEPS)["anchor_positions"]) > 2 * size
+    assert len(encode_fields(mixed, STEPS)["anchor_positions"]) > 2 * size
 
 
 def test_a_coarse_row_takes_the_bits_of_its_precision() -> None:
@@ -128,7 +128,7 @@ def test_a_coarse_row_takes_the_bits_of_its_precision() -> None:
         fields: dict[FieldName, torch.Tensor] = {**fields_of(1000), "anchor_features": bins.float()}
         del fields["appearance"], fields["appearance_basis"]
         steps: dict[FieldName, float] = {**STEPS, "anchor_features": 1.0}
-        return 8 * len(encoded_fields(fields, steps)["anchor_features"])
+        return 8 * len(encode_fields(fields, steps)["anchor_features"])
 
     wanted = 1000 * (1 + 16 * (np.log2(41) + np.log2(5)) / 2)
     assert size(mixed) < 1.1 * wanted
@@ -148,97 +148,97 @@ def test_numbers_that_no_bin_stands_for() -> None:
     fields = fields_of()
     for wrong in (fields["anchor_features"] + 1e-4, -0.0 * fields["anchor_features"].abs()):
         with pytest.raises(StreamError, match="header's anchor_features are no multiples of the step 0.05; quantize"):
-            encoded_fields({**fields, "anchor_features": wrong}, STEPS)
+            encode_fields({**fields, "anchor_features": wrong}, STEPS)
     for wrong in (torch.nan, torch.inf, 1e9):
         with pytest.raises(StreamError, match="steps from zero"):
-            encoded_fields({**fields, "anchor_features": torch.full((5, 2), wrong)}, STEPS)
+            encode_fields({**fields, "anchor_features": torch.full((5, 2), wrong)}, STEPS)
 
 
 def test_steps_that_are_missing() -> None:
     fields = fields_of()
     less: dict[FieldName, float] = {name: step for name, step in STEPS.items() if name != "color_mlp"}
     with pytest.raises(StreamError, match="states no step for color_mlp in the init record"):
-        encoded_fields(fields, less)
+        encode_fields(fields, less)
     with pytest.raises(StreamError, match="states no step for color_mlp in the init record"):
-        decoded_fields(encoded_fields(fields, STEPS), less)
+        decode_fields(encode_fields(fields, STEPS), less)
 
 
 def test_fields_without_a_coding() -> None:
-    coded = encoded_fields(fields_of(), STEPS)
+    coded = encode_fields(fields_of(), STEPS)
     with pytest.raises(StreamError, match="holds camera_color coded; expected raw"):
-        decoded_fields({**coded, "camera_color": b""}, STEPS)
-    assert encoded_fields({**fields_of(), "camera_color": torch.ones(2, 6) / 3}, STEPS) == coded
+        decode_fields({**coded, "camera_color": b""}, STEPS)
+    assert encode_fields({**fields_of(), "camera_color": torch.ones(2, 6) / 3}, STEPS) == coded
     less: dict[FieldName, bytes] = {name: data for name, data in coded.items() if name != "anchor_positions"}
     with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_positions"):
-        decoded_fields(less, STEPS)
+        decode_fields(less, STEPS)
     less = {name: data for name, data in coded.items() if name != "appearance"}
     with pytest.raises(StreamError, match="holds appearance_basis without appearance, which determines its shape"):
-        decoded_fields(less, STEPS)
+        decode_fields(less, STEPS)
 
 
 def test_more_numbers_than_allowed_are_refused() -> None:
-    coded = encoded_fields(fields_of(), STEPS)
+    coded = encode_fields(fields_of(), STEPS)
     limits: dict[FieldName, int] = {"anchor_positions": MOST_ANCHORS, "color_mlp": MOST_WEIGHTS}
     limits |= {row.name: most_columns(row.name) for row in STATE_TABLE if row.init_coding == "rows"}
     assert [*limits.values()][2:] == [3, 3, 3 * 64, 256, 256]
     for name, most in limits.items():
         rest = coded[name][1:]
         with pytest.raises(StreamError, match=f"has {most + 1} .*at most {most} are allowed"):
-            decoded_fields({**coded, name: varint(most + 1) + rest}, STEPS)
+            decode_fields({**coded, name: varint(most + 1) + rest}, STEPS)
         if most != 3:
             with pytest.raises(StreamError, match="damaged|not fit"):
-                decoded_fields({**coded, name: varint(most) + rest}, STEPS)
+                decode_fields({**coded, name: varint(most) + rest}, STEPS)
 
 
 def test_few_bytes_do_not_make_many_numbers() -> None:
     """A section whose symbols take no bits has any number of anchors in a few bytes, and 256 columns for each."""
 
     def positions(anchors: int) -> bytes:
-        return encoded_fields({"anchor_positions": torch.zeros(anchors, 3)}, STEPS)["anchor_positions"]
+        return encode_fields({"anchor_positions": torch.zeros(anchors, 3)}, STEPS)["anchor_positions"]
 
     most = FREE_NUMBERS // 3
     assert len(positions(most)) < 60
-    assert decoded_fields({"anchor_positions": positions(most)}, STEPS)["anchor_positions"].shape == (most, 3)
+    assert decode_fields({"anchor_positions": positions(most)}, STEPS)["anchor_positions"].shape == (most, 3)
     with pytest.raises(StreamError, match="numbers, more than the .* take smaller steps"):
         positions(most + 2000)
     message = "The init record has more than 64 numbers per byte; it is damaged"
     with pytest.raises(StreamError, match=message):
-        decoded_fields({"anchor_positions": varint(most + 2000) + positions(most)[3:]}, STEPS)
+        decode_fields({"anchor_positions": varint(most + 2000) + positions(most)[3:]}, STEPS)
     anchors = FREE_NUMBERS // 256
-    encoder = Encoder(Tables())
+    encoder = SectionEncoder(Tables())
     encoder.number("anchor_features.columns", 256)
     many: dict[FieldName, bytes] = {
         "anchor_positions": positions(anchors),
         "anchor_features": encoder.fields["anchor_features"],
     }
     with pytest.raises(StreamError, match=message):
-        decoded_fields(many, STEPS)
+        decode_fields(many, STEPS)
     # As many more as bytes are there.
     with pytest.raises(StreamError, match="ends 1 bytes too early in anchor_features"):
-        decoded_fields({**many, "color_mlp": bytes(256)}, STEPS)
+        decode_fields({**many, "color_mlp": bytes(256)}, STEPS)
 
 
 def test_offsets_and_directions_that_do_not_fit() -> None:
     fields = fields_of()
-    coded = encoded_fields(fields, STEPS)
+    coded = encode_fields(fields, STEPS)
     with pytest.raises(StreamError, match="damaged|not fit"):
-        decoded_fields({**coded, "anchor_offsets": coded["anchor_features"]}, STEPS)
+        decode_fields({**coded, "anchor_offsets": coded["anchor_features"]}, STEPS)
     one: dict[FieldName, torch.Tensor] = {**fields, "appearance_basis": fields["appearance_basis"][:1]}
     with pytest.raises(StreamError, match=r"holds 2 numbers of appearance_basis, which do not fit \(2, 2\)"):
-        decoded_fields(_unchecked(one), STEPS)
+        decode_fields(_unchecked(one), STEPS)
 
 
 def test_an_environment_of_no_whole_rows() -> None:
-    alone = Encoder(Tables())
+    alone = SectionEncoder(Tables())
     alone.number("environment.count", 4)
     alone.naturals("environment.value", np.arange(4), np.zeros(4, np.uint16), count=1)
     with pytest.raises(StreamError, match=r"holds 4 numbers of environment, which do not fit \(1, 3\)"):
-        decoded_fields({**encoded_fields(fields_of(), STEPS), "environment": alone.fields["environment"]}, STEPS)
+        decode_fields({**encode_fields(fields_of(), STEPS), "environment": alone.fields["environment"]}, STEPS)
 
 
 def _unchecked(fields: dict[FieldName, torch.Tensor]) -> dict[FieldName, bytes]:
-    whole = encoded_fields(fields_of(), STEPS)
-    alone = Encoder(Tables())
+    whole = encode_fields(fields_of(), STEPS)
+    alone = SectionEncoder(Tables())
     bins = np.rint(fields["appearance_basis"].numpy().ravel() / STEPS["appearance_basis"]).astype(np.int64)
     alone.number("appearance_basis.count", len(bins))
     values = np.where(bins < 0, -2 * bins - 1, 2 * bins)
@@ -249,20 +249,20 @@ def _unchecked(fields: dict[FieldName, torch.Tensor]) -> dict[FieldName, bytes]:
 @pytest.mark.parametrize("name", CODED)
 def test_every_byte_changed_or_missing_gives_fields_or_one_kind_of_error(name: FieldName) -> None:
     fields = fields_of()
-    coded = encoded_fields(fields, STEPS)
+    coded = encode_fields(fields, STEPS)
     failed = 0
     for at in range(len(coded[name])):
         mangled = bytearray(coded[name])
         mangled[at] ^= 1 << at % 8
         try:
-            assert decoded_fields({**coded, name: bytes(mangled)}, STEPS).keys() == fields.keys()
+            assert decode_fields({**coded, name: bytes(mangled)}, STEPS).keys() == fields.keys()
         except StreamError:
             failed += 1
         with pytest.raises(StreamError, match="The init record"):
-            decoded_fields({**coded, name: coded[name][:at]}, STEPS)
+            decode_fields({**coded, name: coded[name][:at]}, STEPS)
     assert failed > len(coded[name]) // 3
     with pytest.raises(StreamError, match=f"has more bytes of {name} than it should"):
-        decoded_fields({**coded, name: coded[name] + b"\0"}, STEPS)
+        decode_fields({**coded, name: coded[name] + b"\0"}, STEPS)
 
 
 @examples(100)
@@ -271,6 +271,6 @@ def test_any_bytes_give_fields_or_one_kind_of_error(data: st.DataObject) -> None
     coded = three_anchors()
     name = data.draw(st.sampled_from(CODED))
     try:
-        decoded_fields({**coded, name: data.draw(st.binary(max_size=40))}, STEPS)
+        decode_fields({**coded, name: data.draw(st.binary(max_size=40))}, STEPS)
     except StreamError:
         return

@@ -12,7 +12,7 @@ from rich.console import Console
 from backends import QUICKEST
 from small_presets import few_points
 from structgstream.cli import main
-from structgstream.cli.options import resolved_config
+from structgstream.cli.options import resolve_config
 from structgstream.data.clip import bundled_clip, bundled_clip_path
 from structgstream.data.wrappers import WithRig
 from structgstream.kernels.backend import select_backend
@@ -21,9 +21,9 @@ from structgstream_studies.cli.experiment import Display, print_sheet
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import read_results
 from structgstream_studies.experiments.sheets import Sheet
-from structgstream_studies.experiments.studies import ablation_runs, needed
+from structgstream_studies.experiments.studies import ablation_runs, with_dependencies
 from structgstream_studies.experiments.sweep import Outcome, Progress
-from structgstream_studies.experiments.tasks import Variation
+from structgstream_studies.experiments.tasks import VariantRun
 from structgstream_studies.experiments.worker import Task
 
 CLIP = str(bundled_clip_path())
@@ -66,9 +66,9 @@ def quick_presets() -> Iterator[None]:
 def ablated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The table of the distance regularisation, of which all but one step was done before."""
     folder, backend = tmp_path_factory.mktemp("ablate") / "out", select_backend(QUICKEST)
-    config, _ = resolved_config(QUICK[1], QUICK[2:], command="ablate", seed=None)
+    config, _ = resolve_config(QUICK[1], QUICK[2:], command="ablate", seed=None)
     part = CapturePart(bundled_clip_path(), scale=0.25, frames=2)
-    *tasks, last = needed(ablation_runs(["distance"], config, part, frames=2, seeds=(0,), folder=folder))
+    *tasks, last = with_dependencies(ablation_runs(["distance"], config, part, frames=2, seeds=(0,), folder=folder))
     assert len(tasks) == 3
     for task in tasks:
         task.run(backend)
@@ -167,7 +167,7 @@ def configs_asked(arguments: list[str], folder: Path, monkeypatch: pytest.Monkey
     asked: dict[str, StreamConfig] = {}
 
     def noted(tasks: Sequence[Task], *_: object, **__: object) -> Outcome:
-        asked.update({task.key: task.config for task in tasks if isinstance(task, Variation)})
+        asked.update({task.key: task.config for task in tasks if isinstance(task, VariantRun)})
         return Outcome((), (), ())
 
     monkeypatch.setattr("structgstream_studies.experiments.sweep.sweep", noted)

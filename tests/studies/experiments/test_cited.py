@@ -7,16 +7,16 @@ import pytest
 
 from structgstream.errors import ConfigError
 from structgstream_studies.experiments.cited import CITED, cited_sheet
-from structgstream_studies.experiments.documents import refreshed
+from structgstream_studies.experiments.documents import refresh_text
 
 
 @pytest.mark.parametrize("name", CITED)
 def test_a_cited_table_says_that_it_is_cited_and_of_what(name: str) -> None:
-    text = refreshed(f"<!-- cited {name} -->\n<!-- end -->\n", {})
+    text = refresh_text(f"<!-- cited {name} -->\n<!-- end -->\n", {})
     assert "**Cited from the paper, not measured here:**" in text
     assert CITED[name].data in text
     assert "| cited method |" in text
-    assert refreshed(text, {}) == text
+    assert refresh_text(text, {}) == text
 
 
 @pytest.mark.parametrize("name", CITED)
@@ -41,4 +41,4 @@ def test_the_papers_own_rows_are_as_printed() -> None:
 
 def test_what_is_not_cited() -> None:
     with pytest.raises(ConfigError, match="'arc'; there are n3dv, meetroom, immersive"):
-        refreshed("<!-- cited arc -->\n<!-- end -->\n", {})
+        refresh_text("<!-- cited arc -->\n<!-- end -->\n", {})

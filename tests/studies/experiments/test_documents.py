@@ -9,7 +9,7 @@ import pytest
 from outcomes import outcome, outcomes
 from structgstream.errors import ConfigError, StorageError
 from structgstream_studies.experiments.__main__ import main
-from structgstream_studies.experiments.documents import MARKED, read_studies, refresh, refreshed
+from structgstream_studies.experiments.documents import MARKED, read_studies, refresh, refresh_text
 from structgstream_studies.experiments.results import Result, write_result
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -51,7 +51,7 @@ def marked_parts(text: str) -> list[str]:
 
 
 def test_marked_parts_are_made_from_results() -> None:
-    ablation, methods, readings, made_by = marked_parts(refreshed(TEXT, results()))
+    ablation, methods, readings, made_by = marked_parts(refresh_text(TEXT, results()))
     assert "| w/o scaling factor | 30.77 ± 1.00 | -0.23 ± 0.06 | 33.53 | -0.28 | reproduced |" in ablation
     assert "| Struct-GStream (rig) | 3 | 31.00 ± 1.00 |" in methods
     assert "| - | the defaults | - | 30.00 |" in readings
@@ -82,7 +82,7 @@ def compact_results() -> dict[str, list[Result]]:
 
 
 def test_parts_about_the_compact_stream() -> None:
-    effects, rates, plot, differences = marked_parts(refreshed(COMPACT, compact_results()))
+    effects, rates, plot, differences = marked_parts(refresh_text(COMPACT, compact_results()))
     assert "| compact, with everything | 1 | 31.00 | - | - | - | - | - | 20.0 |" in effects
     assert "| paper mode | 1 | 31.00 | - | +0.00 | - | - | - | 1000.0 |" in effects
     assert "| compact, quality +1 | 1 | 32.00 | - | - | 40.0 | 9.60 | - |" in rates
@@ -93,13 +93,13 @@ def test_parts_about_the_compact_stream() -> None:
 
 
 def test_without_results_of_the_compact_stream_there_are_rows_of_dashes() -> None:
-    effects, rates, plot, differences = marked_parts(refreshed(COMPACT, {}))
+    effects, rates, plot, differences = marked_parts(refresh_text(COMPACT, {}))
     assert "| w/o change gate | - | - |" in effects
     assert "| compact, quality -2 | - | - |" in rates
     assert "against" not in rates
     assert "No result yet." in plot
     assert "No result yet." in differences
-    assert refreshed(refreshed(COMPACT, {}), {}) == refreshed(COMPACT, {})
+    assert refresh_text(refresh_text(COMPACT, {}), {}) == refresh_text(COMPACT, {})
 
 
 def test_the_picture_of_the_rates_is_drawn_beside_the_document(tmp_path: Path) -> None:
@@ -112,15 +112,15 @@ def test_the_picture_of_the_rates_is_drawn_beside_the_document(tmp_path: Path) -
 
 
 def test_the_rest_of_a_document_stays_and_a_second_time_changes_nothing() -> None:
-    once = refreshed(TEXT, results())
+    once = refresh_text(TEXT, results())
     assert MARKED.sub("@", once) == MARKED.sub("@", TEXT)
     assert MARKED.sub("@", TEXT).count("@") == 4
-    assert refreshed(once, results()) == once
-    assert refreshed("No table.\n", results()) == "No table.\n"
+    assert refresh_text(once, results()) == once
+    assert refresh_text("No table.\n", results()) == "No table.\n"
 
 
 def test_a_capture_without_results_has_tables_without_numbers() -> None:
-    ablation, methods, _, made_by = marked_parts(refreshed(TEXT, {}))
+    ablation, methods, _, made_by = marked_parts(refresh_text(TEXT, {}))
     assert "33.53" in ablation
     assert "±" not in ablation + methods
     assert "No result yet." in made_by
@@ -137,7 +137,7 @@ def test_a_capture_without_results_has_tables_without_numbers() -> None:
 )
 def test_a_marker_that_asks_for_something_unknown(marker: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        refreshed(f"{marker}\n<!-- end -->\n", results())
+        refresh_text(f"{marker}\n<!-- end -->\n", results())
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_a_marker_that_asks_for_something_unknown(marker: str, words: str) -> No
 )
 def test_a_table_without_an_end_is_told_and_swallows_no_words(text: str) -> None:
     with pytest.raises(ConfigError, match="does not end"):
-        refreshed(text, results())
+        refresh_text(text, results())
 
 
 def test_files_that_change_are_named_and_others_are_left_alone(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_files_that_change_are_named_and_others_are_left_alone(tmp_path: Path) -
     words.write_text("No table.\n")
     written = words.stat().st_mtime_ns
     assert refresh([table, words], tmp_path / "results") == [table]
-    assert table.read_text() == refreshed(TEXT, results())
+    assert table.read_text() == refresh_text(TEXT, results())
     assert words.stat().st_mtime_ns == written
     assert refresh([table, words], tmp_path / "results") == []
     (tmp_path / "results" / "ring" / "other.json").write_text("{}")
@@ -187,4 +187,6 @@ def test_the_tables_of_our_documents_are_those_of_our_results() -> None:
     found = read_studies(ROOT / "results")
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         text = path.read_text()
-        assert refreshed(text, found) == text, f"run: python -m structgstream_studies.experiments results {path.name}"
+        assert refresh_text(text, found) == text, (
+            f"run: python -m structgstream_studies.experiments results {path.name}"
+        )

@@ -8,8 +8,8 @@ import pytest
 
 from drawn import coloured, pixels_of
 from outcomes import outcome
-from structgstream.evaluation.figure import COLOURS
-from structgstream_studies.experiments.figures import busiest, write_comparison, write_curves, write_details
+from structgstream.evaluation.figure import COLORS
+from structgstream_studies.experiments.figures import most_varied_crop, write_comparison, write_curves, write_details
 from structgstream_studies.experiments.results import Result
 
 
@@ -33,11 +33,11 @@ TITLES = {"without-free": "w/o free 3DGs", "full": "full method", "held": "frame
 def test_curves_have_a_line_for_each_variant_that_was_run(tmp_path: Path) -> None:
     write_curves(tmp_path / "new" / "c.png", runs(), keys=list(TITLES), titles=TITLES)
     picture = pixels_of(tmp_path / "new" / "c.png")
-    assert coloured(picture, COLOURS[0]) > 100
-    assert coloured(picture, COLOURS[1]) == coloured(picture, COLOURS[2]) == 0
+    assert coloured(picture, COLORS[0]) > 100
+    assert coloured(picture, COLORS[1]) == coloured(picture, COLORS[2]) == 0
     held = [outcome("held", frames=[{"psnr": 29.0 - i} for i in range(4)])]
     write_curves(tmp_path / "more.png", [*runs(), *held], keys=list(TITLES), titles=TITLES)
-    assert coloured(pixels_of(tmp_path / "more.png"), COLOURS[2]) > 100
+    assert coloured(pixels_of(tmp_path / "more.png"), COLORS[2]) > 100
 
 
 def test_a_score_that_nobody_has_gets_no_panel(tmp_path: Path) -> None:
@@ -50,9 +50,9 @@ def test_a_score_that_nobody_has_gets_no_panel(tmp_path: Path) -> None:
 def test_methods_are_points_with_the_spread_as_bars(tmp_path: Path) -> None:
     write_comparison(tmp_path / "m.png", runs(), titles=TITLES)
     picture = pixels_of(tmp_path / "m.png")
-    assert coloured(picture, COLOURS[0]) > 30
+    assert coloured(picture, COLORS[0]) > 30
     left, right = np.split(picture, [picture.shape[1] // 2], axis=1)
-    assert min(coloured(half, COLOURS[0]) for half in (left, right)) > 15
+    assert min(coloured(half, COLORS[0]) for half in (left, right)) > 15
 
 
 def test_a_method_without_a_cost_is_left_out_and_no_cost_is_drawn_at_the_edge(tmp_path: Path) -> None:
@@ -60,8 +60,8 @@ def test_a_method_without_a_cost_is_left_out_and_no_cost_is_drawn_at_the_edge(tm
     write_comparison(tmp_path / "m.png", [*runs(), *free], titles=TITLES)
     picture = pixels_of(tmp_path / "m.png")
     left, right = np.split(picture, [picture.shape[1] // 2], axis=1)
-    assert coloured(left, COLOURS[2]) > 10
-    assert coloured(right, COLOURS[2]) == 0
+    assert coloured(left, COLORS[2]) > 10
+    assert coloured(right, COLORS[2]) == 0
 
 
 def test_details_show_where_pictures_differ_most_and_nothing_else(tmp_path: Path) -> None:
@@ -93,15 +93,15 @@ def test_five_pictures_stand_in_two_rows(tmp_path: Path) -> None:
 def test_the_detail_with_the_most_of_a_mask(top: int, left: int) -> None:
     mask = np.zeros((40, 80), np.int64)
     mask[top : top + 10, left : left + 20] = 1
-    assert busiest(mask) == (top, left, 10, 20)
+    assert most_varied_crop(mask) == (top, left, 10, 20)
 
 
 def test_the_larger_of_two_spots_is_shown() -> None:
     mask = np.zeros((40, 80), np.int64)
     mask[2:5, 3:6] = 1
     mask[30:34, 70:74] = 1
-    top, left, height, width = busiest(mask)
+    top, left, height, width = most_varied_crop(mask)
     assert mask[top : top + height, left : left + width].sum() == 16
     mask[28:36, 10:16] = 1
-    assert (busiest(mask)[0], busiest(mask)[1]) == (26, 0)
-    assert busiest(np.zeros((41, 83), np.int64)) == (0, 0, 10, 20)
+    assert (most_varied_crop(mask)[0], most_varied_crop(mask)[1]) == (26, 0)
+    assert most_varied_crop(np.zeros((41, 83), np.int64)) == (0, 0, 10, 20)

@@ -6,7 +6,7 @@ import pytest
 from outcomes import outcome, outcomes
 from rigs import arc_rig
 from structgstream.errors import ConfigError
-from structgstream_studies.experiments.documents import refreshed
+from structgstream_studies.experiments.documents import refresh_text
 from structgstream_studies.experiments.folds import even_cameras, folds_sheet
 from structgstream_studies.experiments.variants import FULL
 
@@ -49,7 +49,7 @@ def test_each_method_has_a_row_for_each_fold_and_its_difference_to_paper_mode() 
 
 def test_a_document_shows_both_folds() -> None:
     studies = {"ring": [outcome(FULL)], "ring-fold2": [outcome(FULL, psnr=28.0, capture=SECOND)]}
-    text = refreshed("<!-- folds ring ring-fold2 -->\n<!-- end -->\n", studies)
+    text = refresh_text("<!-- folds ring ring-fold2 -->\n<!-- end -->\n", studies)
     assert "| Struct-GStream (rig) | 1 | a, b | 1 | - | 30.00 |" in text
     assert "| Struct-GStream (rig) | 2 | c, d | 1 | - | 28.00 |" in text
-    assert refreshed(text, studies) == text
+    assert refresh_text(text, studies) == text

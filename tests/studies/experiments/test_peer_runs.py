@@ -14,7 +14,12 @@ from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream_studies.experiments.peer_runs import PEER_TITLES, PeerRun
 from structgstream_studies.experiments.results import read_result
-from structgstream_studies.experiments.studies import comparison_runs, fits_frames_alone, needed, write_methods
+from structgstream_studies.experiments.studies import (
+    comparison_runs,
+    fits_frames_alone,
+    with_dependencies,
+    write_methods,
+)
 from structgstream_studies.peers import methods
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream_studies.peers.threedgs import ThreeDGS
@@ -112,7 +117,7 @@ def test_methods_that_fit_frames_alone_do_so_for_some_frames(tmp_path: Path) -> 
         ("3dgs", 5, 3),
     }
     assert len(runs) == len({one.name for one in runs}) == 6
-    assert [task.name for task in needed(runs)] == [one.name for one in runs]
+    assert [task.name for task in with_dependencies(runs)] == [one.name for one in runs]
     assert not fits_frames_alone("rig")
 
 

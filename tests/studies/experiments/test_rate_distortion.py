@@ -9,9 +9,9 @@ from structgstream.presets import COMPACT, RIG, to_json
 from structgstream_studies.experiments.rate_distortion import (
     QUALITIES,
     bd_sheet,
+    bullet_list,
     curve_of,
     curve_titles,
-    listed,
     qualities,
     quality_key,
     rates_sheet,
@@ -142,5 +142,5 @@ def test_curves_that_share_nothing_have_dashes_and_a_sentence() -> None:
 
 
 def test_sentences_as_a_list() -> None:
-    assert listed([]) == ""
-    assert listed(["One.", "Two."]) == "\n- One.\n- Two.\n"
+    assert bullet_list([]) == ""
+    assert bullet_list(["One.", "Two."]) == "\n- One.\n- Two.\n"

@@ -7,7 +7,7 @@ import numpy as np
 
 from drawn import coloured, pixels_of
 from outcomes import outcome
-from structgstream.evaluation.figure import COLOURS, INK
+from structgstream.evaluation.figure import COLORS, INK
 from structgstream_studies.experiments.rate_figures import write_rates
 from structgstream_studies.experiments.results import Result
 
@@ -24,10 +24,10 @@ def test_the_curve_and_the_points_that_there_are(tmp_path: Path) -> None:
     write_rates(tmp_path / "without.png", curve())
     both, alone = pixels_of(tmp_path / "new" / "with.png"), pixels_of(tmp_path / "without.png")
     for half in np.split(both, [both.shape[1] // 2], axis=1):
-        assert coloured(half, COLOURS[0]) > 20
-        assert coloured(half, COLOURS[1]) == 0
+        assert coloured(half, COLORS[0]) > 20
+        assert coloured(half, COLORS[1]) == 0
         assert coloured(half, INK) > 100
-    assert coloured(alone, COLOURS[0]) == 0
+    assert coloured(alone, COLORS[0]) == 0
     assert coloured(alone, INK) > 200
 
 
@@ -38,4 +38,4 @@ def test_a_score_or_a_rate_that_nobody_has_leaves_its_panel_empty(tmp_path: Path
     picture = pixels_of(tmp_path / "r.png")
     left, right = np.split(picture, [picture.shape[1] // 2], axis=1)
     assert coloured(left, INK) > coloured(right, INK)
-    assert coloured(picture, COLOURS[1]) == 0
+    assert coloured(picture, COLORS[1]) == 0

@@ -10,7 +10,7 @@ import pytest
 from outcomes import outcome
 from structgstream.errors import StorageError
 from structgstream.evaluation.report import FrameScores, Report, Scores
-from structgstream_studies.experiments.results import read_result, read_results, result_of, rounded, write_result
+from structgstream_studies.experiments.results import read_result, read_results, result_of, round_floats, write_result
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
@@ -24,8 +24,8 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
 
 
 def test_floats_are_rounded_to_six_digits_and_nothing_else_is(tmp_path: Path) -> None:
-    assert rounded(3.14159265) == 3.14159
-    assert rounded({"a": [1e-9 / 3, (2 / 3, "x")], "n": 123456789, "t": True, "z": None}) == {
+    assert round_floats(3.14159265) == 3.14159
+    assert round_floats({"a": [1e-9 / 3, (2 / 3, "x")], "n": 123456789, "t": True, "z": None}) == {
         "a": [3.33333e-10, [0.666667, "x"]],
         "n": 123456789,
         "t": True,

@@ -8,7 +8,14 @@ import pytest
 from outcomes import outcome, outcomes
 from structgstream_studies.experiments.readings import BASE, READINGS, readings_sheet
 from structgstream_studies.experiments.results import Result
-from structgstream_studies.experiments.sheets import SCORES, Sheet, ablation_sheet, comparison_sheet, markdown, written
+from structgstream_studies.experiments.sheets import (
+    SCORES,
+    Sheet,
+    ablation_sheet,
+    comparison_sheet,
+    format_score,
+    markdown,
+)
 from structgstream_studies.experiments.studies import COMPARED, variant_titles
 from structgstream_studies.experiments.summary import Spread
 from structgstream_studies.experiments.variants import FULL, TABLES, AblationTable
@@ -135,10 +142,10 @@ def test_every_tenth_frame_has_no_temporal_scores() -> None:
 
 
 def test_a_score_is_written_in_its_unit_with_its_digits() -> None:
-    assert written(Spread(1.2345e6, 0.0, 1), "online_bytes") == "1.23"
-    assert written(Spread(1.2345e6, 0.04e6, 3), "online_bytes") == "1.23 ± 0.04"
-    assert written(Spread(0.5, 0.0, 1), "psnr", signed=True) == "+0.50"
-    assert written(None, "psnr") == "-"
+    assert format_score(Spread(1.2345e6, 0.0, 1), "online_bytes") == "1.23"
+    assert format_score(Spread(1.2345e6, 0.04e6, 3), "online_bytes") == "1.23 ± 0.04"
+    assert format_score(Spread(0.5, 0.0, 1), "psnr", signed=True) == "+0.50"
+    assert format_score(None, "psnr") == "-"
     assert all(name in SCORES for table in TABLES.values() for name in table.scores)
 
 

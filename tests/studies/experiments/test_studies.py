@@ -18,18 +18,18 @@ from structgstream_studies.experiments.studies import (
     ablation_runs,
     comparison_runs,
     method_titles,
-    needed,
     results_of,
     rows_of,
     variant_titles,
+    with_dependencies,
     write_ablation,
     write_methods,
 )
-from structgstream_studies.experiments.tasks import FirstFrame, Variation
+from structgstream_studies.experiments.tasks import FirstFrameRun, VariantRun
 from structgstream_studies.experiments.variants import FULL, TABLES
 
 
-def runs_of(*tables: str, folder: Path, seeds: tuple[int, ...] = (0, 1, 2)) -> list[Variation]:
+def runs_of(*tables: str, folder: Path, seeds: tuple[int, ...] = (0, 1, 2)) -> list[VariantRun]:
     return ablation_runs(tables, quick(), CLIP, frames=3, seeds=seeds, folder=folder)
 
 
@@ -46,8 +46,8 @@ def test_every_row_is_run_with_every_seed_and_those_of_two_tables_once(tmp_path:
 
 
 def test_variants_of_a_seed_wait_for_one_first_frame(tmp_path: Path) -> None:
-    tasks = needed(runs_of("free", "distance", folder=tmp_path, seeds=(0, 1)))
-    firsts = [task for task in tasks if isinstance(task, FirstFrame)]
+    tasks = with_dependencies(runs_of("free", "distance", folder=tmp_path, seeds=(0, 1)))
+    firsts = [task for task in tasks if isinstance(task, FirstFrameRun)]
     # Each seed has one for the variants that differ later, and one without the regularisation.
     assert len(firsts) == 4
     before = set()
@@ -79,7 +79,7 @@ def test_the_papers_presets_are_methods_that_are_named_as_what_is_printed() -> N
 def test_methods_are_presets_and_the_floor(tmp_path: Path) -> None:
     runs = comparison_runs(["rig", "fast", "held"], CLIP, frames=3, alone_every=2, seeds=(4,), folder=tmp_path)
     assert [run.key for run in runs] == [FULL, "fast", "held"]
-    configs = [run.config for run in runs if isinstance(run, Variation)]
+    configs = [run.config for run in runs if isinstance(run, VariantRun)]
     assert configs[:2] == [replace(PRESETS[name], seed=4) for name in ("rig", "fast")]
     assert configs[2].online.iterations == 0
     assert configs[2].initial == configs[0].initial

@@ -11,10 +11,10 @@ from fake_tasks import Frames
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream_studies.experiments import sweep as module
-from structgstream_studies.experiments.sweep import Outcome, Progress, seats_for, sweep, unique
-from structgstream_studies.experiments.worker import Seat
+from structgstream_studies.experiments.sweep import Outcome, Progress, sweep, unique, worker_slots
+from structgstream_studies.experiments.worker import WorkerSlot
 
-SEATS = [Seat("reference", 1), Seat("reference", 1)]
+SEATS = [WorkerSlot("reference", 1), WorkerSlot("reference", 1)]
 
 
 def tasks_in(folder: Path) -> list[Frames]:
@@ -117,21 +117,21 @@ def test_a_sweep_of_nothing_ends_at_once(stopped: Stopped) -> None:
 @pytest.mark.parametrize(("jobs", "threads"), [(None, [1] * 8), (3, [2] * 3), (1, [8]), (12, [1] * 12)])
 def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch, jobs: int | None, threads: list[int]) -> None:
     monkeypatch.setattr(module, "usable_cores", lambda: 8)
-    assert seats_for("cpu", jobs=jobs) == [Seat("cpu", count) for count in threads]
+    assert worker_slots("cpu", jobs=jobs) == [WorkerSlot("cpu", count) for count in threads]
 
 
 def test_jobs_take_turns_on_the_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert [seat.gpu for seat in seats_for("auto", jobs=None)] == [0, 1]
-    assert [seat.gpu for seat in seats_for("cuda", jobs=3)] == [0, 1, 0]
-    assert [seat.gpu for seat in seats_for("cpu", jobs=2)] == [None, None]
+    assert [seat.gpu for seat in worker_slots("auto", jobs=None)] == [0, 1]
+    assert [seat.gpu for seat in worker_slots("cuda", jobs=3)] == [0, 1, 0]
+    assert [seat.gpu for seat in worker_slots("cpu", jobs=2)] == [None, None]
 
 
 def test_no_jobs_are_refused() -> None:
     with pytest.raises(ConfigError, match="1 or more, got 0"):
-        seats_for("cpu", jobs=0)
+        worker_slots("cpu", jobs=0)
 
 
 def test_tasks_of_one_name_are_one(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.results import Result, read_result
-from structgstream_studies.experiments.tasks import FirstFrame, Variation
+from structgstream_studies.experiments.tasks import FirstFrameRun, VariantRun
 from structgstream_studies.experiments.variants import variants
 
 
@@ -35,22 +35,22 @@ class Runs:
 
     folder: Path
     backend: Backend
-    first: FirstFrame
-    full: Variation
-    held: Variation
+    first: FirstFrameRun
+    full: VariantRun
+    held: VariantRun
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     folder, backend = tmp_path_factory.mktemp("runs"), quickest_backend()
-    full = Variation("full", CLIP, quick(), folder, 3)
-    held = Variation("held", CLIP, variants(quick())["held"].config, folder, 3)
+    full = VariantRun("full", CLIP, quick(), folder, 3)
+    held = VariantRun("held", CLIP, variants(quick())["held"].config, folder, 3)
     for task in (full.first, full, held):
         task.run(backend)
     return Runs(folder, backend, full.first, full, held)
 
 
-def result_of(run: Variation) -> Result:
+def result_of(run: VariantRun) -> Result:
     found = read_result(run.result)
     assert found is not None
     return found
@@ -105,7 +105,7 @@ def test_what_decides_frame_0_decides_its_name(runs: Runs) -> None:
 
 def test_frame_0_is_kept_as_it_was_fitted(runs: Runs, tmp_path: Path) -> None:
     """A compact stream rounds it, by its own steps; what was rounded before would not say what those cost."""
-    first = FirstFrame(CLIP, compact(), tmp_path)
+    first = FirstFrameRun(CLIP, compact(), tmp_path)
     first.run(runs.backend)
     assert open_stream(first.stream).header.codec == "raw"
     assert packets(first.stream) == packets(runs.first.stream)
@@ -143,7 +143,7 @@ def test_done_tasks_need_nothing_and_are_done(runs: Runs) -> None:
     assert replace(runs.full, folder=runs.folder / "other").needs == (runs.first.name,)
 
 
-EDITS: dict[str, Callable[[Variation], Variation]] = {
+EDITS: dict[str, Callable[[VariantRun], VariantRun]] = {
     "another key": lambda run: replace(run, key="held"),
     "another seed": lambda run: replace(run, config=replace(run.config, seed=1)),
     "another configuration": lambda run: replace(run, config=variants(run.config)["with-color-mlp"].config),
@@ -160,7 +160,7 @@ EDITS: dict[str, Callable[[Variation], Variation]] = {
 
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=EDITS.keys())
-def test_a_result_does_not_answer(runs: Runs, tmp_path: Path, edit: Callable[[Variation], Variation]) -> None:
+def test_a_result_does_not_answer(runs: Runs, tmp_path: Path, edit: Callable[[VariantRun], VariantRun]) -> None:
     asked = replace(edit(runs.full), folder=tmp_path)
     assert not asked.done()
     asked.result.parent.mkdir()
@@ -173,7 +173,7 @@ def test_a_result_answers_the_same_question_in_other_words(runs: Runs) -> None:
     assert replace(runs.full, capture=said).done()
 
 
-def broken_off(runs: Runs, folder: Path, *, frames: int) -> Variation:
+def broken_off(runs: Runs, folder: Path, *, frames: int) -> VariantRun:
     """The full method as a crash leaves it: some whole frames, half of one, and a log that is one frame behind."""
     run = replace(runs.full, folder=folder)
     run.stream.parent.mkdir()

@@ -13,9 +13,9 @@ import torch
 from fake_tasks import Calls
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import Backend
-from structgstream_studies.experiments.worker import Seat, work
+from structgstream_studies.experiments.worker import WorkerSlot, work
 
-SEAT = Seat("reference", 3)
+SEAT = WorkerSlot("reference", 3)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rigs import arc_rig
-from structgstream.codec.container.records import PREFIX, scanned
+from structgstream.codec.container.records import PREFIX, scan_records
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
 from structgstream.scene.state import STATE_TABLE
@@ -20,7 +20,7 @@ from structgstream_studies.peers.container import (
     PeerSink,
     is_peer_file,
     packed_array,
-    packet_of,
+    parse_packet,
     unpacked_arrays,
 )
 from structgstream_studies.peers.method import Arrays
@@ -60,7 +60,7 @@ def frame(i: int) -> Arrays:
 
 
 def packet(i: int) -> Packet:
-    return packet_of(frame(i), index=i, pts_seconds=i / 25, kind=PacketKind.DELTA if i else PacketKind.KEY)
+    return parse_packet(frame(i), index=i, pts_seconds=i / 25, kind=PacketKind.DELTA if i else PacketKind.KEY)
 
 
 def broken_off(path: Path, *packets: Packet) -> bytes:
@@ -113,7 +113,7 @@ def test_a_file_gives_back_header_and_arrays(tmp_path: Path) -> None:
 
 def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path: Path) -> None:
     data = written(tmp_path / "a.sgp")
-    ends = [record.end for record in scanned(data)]
+    ends = [record.end for record in scan_records(data)]
     for cut in range(ends[0], len(data)):
         reader = read(data[:cut])
         assert not reader.complete
@@ -125,7 +125,7 @@ def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path: Path) -> None:
 
 def test_a_flipped_byte_ends_what_can_be_read(tmp_path: Path) -> None:
     data = written(tmp_path / "a.sgp")
-    second = list(scanned(data))[2]
+    second = list(scan_records(data))[2]
     for at in range(second.offset, second.end, 7):
         broken = bytearray(data)
         broken[at] ^= 0x40
@@ -150,10 +150,10 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 def test_frames_out_of_order_are_refused(tmp_path: Path) -> None:
     for index, pts, kind in ((1, 0.0, PacketKind.KEY), (0, 0.0, PacketKind.DELTA)):
-        one = packet_of(frame(0), index=index, pts_seconds=pts, kind=kind)
+        one = parse_packet(frame(0), index=index, pts_seconds=pts, kind=kind)
         with pytest.raises(StreamError):
             read(broken_off(tmp_path / "b.sgp", one))
-    same_time = [packet_of(frame(0), index=i, pts_seconds=0.0, kind=PacketKind.KEY) for i in range(2)]
+    same_time = [parse_packet(frame(0), index=i, pts_seconds=0.0, kind=PacketKind.KEY) for i in range(2)]
     with pytest.raises(StreamError, match="not presented after"):
         read(broken_off(tmp_path / "b.sgp", *same_time))
 
@@ -161,7 +161,7 @@ def test_frames_out_of_order_are_refused(tmp_path: Path) -> None:
 def test_writing_goes_on_where_it_stopped(tmp_path: Path) -> None:
     path = tmp_path / "a.sgp"
     data = written(path)
-    third = list(scanned(data))[3]
+    third = list(scan_records(data))[3]
     path.write_bytes(data[: third.offset + 9])
     sink = PeerSink(path, frames=3, resumed=read(path.read_bytes()))
     sink.open(HEADER)

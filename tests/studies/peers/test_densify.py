@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from structgstream_studies.peers.densify import DensifyConfig, candidates, densified, reset_opacities
+from structgstream_studies.peers.densify import DensifyConfig, candidates, densify, reset_opacities
 from structgstream_studies.peers.plain import PlainGaussians
 
 CONFIG = DensifyConfig()
@@ -29,7 +29,7 @@ def rows(scales: list[float], opacities: list[float]) -> PlainGaussians:
 
 def run(gaussians: PlainGaussians, gradient: list[float], *, prune_large: bool = False, config: DensifyConfig = CONFIG):
     generator = torch.Generator().manual_seed(0)
-    return densified(
+    return densify(
         gaussians, torch.tensor(gradient), config=config, extent=1.0, prune_large=prune_large, generator=generator
     )
 
@@ -71,7 +71,7 @@ def test_a_reset_lowers_and_never_raises() -> None:
 
 
 def test_rounds_come_when_they_are_due() -> None:
-    assert [i for i in range(1, 1001) if DensifyConfig(start=500, stop=900).due(i)] == [600, 700, 800, 900]
+    assert [i for i in range(1, 1001) if DensifyConfig(start=500, stop=900).is_due(i)] == [600, 700, 800, 900]
     reset = replace(CONFIG, reset_at=2000)
     assert not reset.has_reset(2000)
     assert reset.has_reset(2001)

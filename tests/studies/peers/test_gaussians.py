@@ -15,8 +15,8 @@ from structgstream_studies.peers.gaussians import GaussiansConfig, fit_gaussians
 from structgstream_studies.peers.hash_grid import GridConfig
 from structgstream_studies.peers.methods import TINY_METHODS
 from structgstream_studies.peers.plain import Y0, PlainGaussians
-from structgstream_studies.peers.threedgstream import box_of, in_box, transformed
-from structgstream_studies.peers.warm_up import WarmUpConfig, identity_loss, warmed_up
+from structgstream_studies.peers.threedgstream import apply_transformation, box_of, in_box
+from structgstream_studies.peers.warm_up import WarmUpConfig, identity_loss, warm_up
 
 BACKEND = quickest_backend()
 CAPTURE = moving_capture(1)
@@ -77,11 +77,11 @@ def test_the_warmed_up_cache_moves_nothing_and_repeats() -> None:
     grid = GridConfig(levels=4, log2_rows=10, base=4, hidden=16)
     positions = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
     config = WarmUpConfig(iterations=300, rate=2e-3, batch=128, batches=4)
-    cache, loss = warmed_up(positions, config=config, grid=grid, backend=BACKEND, seed=1)
-    again, _ = warmed_up(positions, config=config, grid=grid, backend=BACKEND, seed=1)
+    cache, loss = warm_up(positions, config=config, grid=grid, backend=BACKEND, seed=1)
+    again, _ = warm_up(positions, config=config, grid=grid, backend=BACKEND, seed=1)
     assert torch.equal(cache.grid, again.grid)
     assert loss < 0.05
-    untrained, before = warmed_up(positions, config=replace(config, iterations=1), grid=grid, backend=BACKEND, seed=1)
+    untrained, before = warm_up(positions, config=replace(config, iterations=1), grid=grid, backend=BACKEND, seed=1)
     assert before > 1.0
     assert not torch.equal(untrained.network, cache.network)
 
@@ -111,7 +111,7 @@ def test_only_what_is_in_the_box_moves() -> None:
     assert (positions <= 1).all()
     outputs = torch.zeros(len(rows), 8)
     outputs[:, 0], outputs[:, 3] = 2.0, 1.0
-    after = transformed(base, rows, outputs, 0.5)
+    after = apply_transformation(base, rows, outputs, 0.5)
     expected = base.means.clone()
     expected[rows, 0] += 1.0
     torch.testing.assert_close(after.means, expected)

@@ -12,7 +12,7 @@ import torch
 from backends import quickest_backend
 from memory_captures import MemoryCapture
 from peers.captures import Watched, moving_capture
-from structgstream.codec.container.records import scanned
+from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StreamError
 from structgstream.recorder import record
@@ -125,7 +125,7 @@ def test_going_on_with_a_whole_file_changes_nothing(runs: dict[str, Run], tmp_pa
     reports = recorded(runs["3dgs"].capture, path, TINY_METHODS["3dgs"], resume=True)
     assert list(reports) == []
     assert path.read_bytes() == whole
-    last = list(scanned(whole))[-1]
+    last = list(scan_records(whole))[-1]
     path.write_bytes(whole[: last.offset])
     reports = recorded(runs["3dgs"].capture, path, TINY_METHODS["3dgs"], resume=True)
     assert list(reports) == []

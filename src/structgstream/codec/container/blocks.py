@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from structgstream.codec.container.stored import Stored
+from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import StreamError
 from structgstream.scene.state import STATE_TABLE, FieldName
 
@@ -45,7 +45,7 @@ class Block:
     end: int
 
 
-def packed_block(name: FieldName, value: Tensor) -> bytes:
+def pack_raw_block(name: FieldName, value: Tensor) -> bytes:
     """One field, coded raw."""
     array = value.detach().cpu().contiguous().numpy()
     code = 1 if array.dtype == np.int64 else 0
@@ -54,12 +54,12 @@ def packed_block(name: FieldName, value: Tensor) -> bytes:
     return head + struct.pack(f"<{array.ndim}I", *array.shape) + array.tobytes()
 
 
-def coded_block(name: FieldName, data: bytes) -> bytes:
+def pack_coded_block(name: FieldName, data: bytes) -> bytes:
     """One field, coded."""
     return BLOCK.pack(_CODES[name], CODED, 2, 1) + struct.pack("<I", len(data)) + data
 
 
-def blocks_in(payload: Stored, start: int, *, where: str) -> Iterator[Block]:
+def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[Block]:
     """Every block from byte ``start`` to the end.
 
     Raises:
@@ -92,31 +92,31 @@ def blocks_in(payload: Stored, start: int, *, where: str) -> Iterator[Block]:
         start = end
 
 
-def unpacked_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName, Tensor]:
+def unpack_raw_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName, Tensor]:
     """The tensors of all blocks from byte ``start`` to the end.
 
     Raises:
-        StreamError: as :func:`blocks_in`.
+        StreamError: as :func:`iterate_blocks`.
     """
     values: dict[FieldName, Tensor] = {}
-    for block in blocks_in(payload, start, where=where):
+    for block in iterate_blocks(payload, start, where=where):
         if block.coding != RAW:
             raise StreamError(f"{where} holds field {block.name} coded; expected raw.")
         values[block.name] = _numbers(payload, block)
     return values
 
 
-def mixed_blocks(
+def unpack_blocks(
     payload: bytes, start: int, *, where: str
 ) -> tuple[dict[FieldName, Tensor], dict[FieldName, memoryview]]:
     """The tensors of the raw blocks, and the bytes of the coded ones, from byte ``start`` to the end.
 
     Raises:
-        StreamError: as :func:`blocks_in`.
+        StreamError: as :func:`iterate_blocks`.
     """
     values: dict[FieldName, Tensor] = {}
     coded: dict[FieldName, memoryview] = {}
-    for block in blocks_in(payload, start, where=where):
+    for block in iterate_blocks(payload, start, where=where):
         if block.coding == RAW:
             values[block.name] = _numbers(payload, block)
         else:
@@ -124,14 +124,14 @@ def mixed_blocks(
     return values, coded
 
 
-def coded_fields(payload: bytes, start: int, *, where: str) -> dict[FieldName, memoryview]:
+def coded_payloads(payload: bytes, start: int, *, where: str) -> dict[FieldName, memoryview]:
     """The bytes of all blocks from byte ``start`` to the end, which must be coded.
 
     Raises:
-        StreamError: as :func:`blocks_in`, or a block is raw.
+        StreamError: as :func:`iterate_blocks`, or a block is raw.
     """
     found: dict[FieldName, memoryview] = {}
-    for block in blocks_in(payload, start, where=where):
+    for block in iterate_blocks(payload, start, where=where):
         if block.coding != CODED:
             raise StreamError(f"{where} holds field {block.name} raw; expected coded.")
         found[block.name] = memoryview(payload)[block.data : block.end]

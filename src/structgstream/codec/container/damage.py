@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from structgstream.codec.container.byte_source import ByteSource
 from structgstream.codec.container.index import INDEX_ENTRY
 from structgstream.codec.container.payload import FRAME
-from structgstream.codec.container.records import CHECKSUM, RECORD, Record, RecordType, head_at, record_at
-from structgstream.codec.container.stored import Stored
+from structgstream.codec.container.records import CHECKSUM, RECORD, Record, RecordType, read_head, read_record
 
 LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
 _CHUNK_BYTES = 2**20
@@ -37,14 +37,14 @@ def next_index(record: Record) -> int:
     return int(FRAME.unpack_from(record.payload)[0])
 
 
-class Search:
+class PacketSearch:
     """Finds whole records after damage in ``data``.
 
     Use one object per stream: all its calls together verify checksums of at most four times the stream's bytes, which
     bounds the work that a malicious file can cause.
     """
 
-    def __init__(self, data: Stored) -> None:
+    def __init__(self, data: ByteSource) -> None:
         self._data = data
         self._left = _WORK * len(data)
 
@@ -59,12 +59,12 @@ class Search:
         for offset in self._heads(damaged + 1):
             if not self._fits(offset, damaged, expected, after_seconds):
                 continue
-            head = head_at(self._data, offset)
+            head = read_head(self._data, offset)
             assert head is not None, "it fits"
             self._left -= head[1]
             if self._left < 0:
                 return None
-            if (record := record_at(self._data, offset)) is not None:
+            if (record := read_record(self._data, offset)) is not None:
                 return record
         return None
 
@@ -80,7 +80,7 @@ class Search:
 
     def _fits(self, offset: int, damaged: int, expected: int, after_seconds: float) -> bool:
         """Whether a record at ``offset`` is consistent with ``expected`` frames before the damage."""
-        if (head := head_at(self._data, offset)) is None:
+        if (head := read_head(self._data, offset)) is None:
             return False
         kind, length = head
         last = expected + (offset - damaged) // LEAST_PACKET_BYTES

@@ -5,6 +5,7 @@ import struct
 from array import array
 from collections.abc import Iterable
 
+from structgstream.codec.container.byte_source import ByteSource
 from structgstream.codec.container.payload import FRAME
 from structgstream.codec.container.records import (
     CHECKSUM,
@@ -13,22 +14,21 @@ from structgstream.codec.container.records import (
     RECORD,
     RecordType,
     footer_offset,
-    head_at,
     packed,
-    record_at,
+    read_head,
+    read_record,
 )
-from structgstream.codec.container.stored import Stored
 
 INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 
 
-def packed_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
+def pack_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
     """Index record, to be written at byte ``offset``, and footer; entries: frame index, record type, offset."""
     index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
     return packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC)
 
 
-def indexed_offsets(data: Stored, start: int) -> "array[int] | None":
+def read_index_offsets(data: ByteSource, start: int) -> "array[int] | None":
     """Offsets, from the index, of the packets from byte ``start`` on; None if the stream must be scanned.
 
     The index is not used if footer or index is damaged, or disagrees with the heads of the records.
@@ -36,7 +36,7 @@ def indexed_offsets(data: Stored, start: int) -> "array[int] | None":
     end = footer_offset(data)
     if end is None or end < start:
         return None
-    index = record_at(data, end)
+    index = read_record(data, end)
     if index is None or len(index.payload) % INDEX_ENTRY.size:
         return None
     found = _by_heads(data, start, end)
@@ -45,12 +45,12 @@ def indexed_offsets(data: Stored, start: int) -> "array[int] | None":
     return array("Q", (offset for _, _, offset in INDEX_ENTRY.iter_unpack(found)))
 
 
-def _by_heads(data: Stored, start: int, end: int) -> bytearray | None:
+def _by_heads(data: ByteSource, start: int, end: int) -> bytearray | None:
     """The expected entries of the index, from the records' heads; None if the sequence of packets is invalid."""
     entries = bytearray()
     before_seconds = 0.0
     while start < end:
-        if (head := head_at(data, start)) is None:
+        if (head := read_head(data, start)) is None:
             return None
         kind, length = head
         if kind in (RecordType.KEY, RecordType.DELTA):

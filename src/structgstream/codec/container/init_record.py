@@ -8,7 +8,7 @@ from typing import Any
 
 from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
-from structgstream.codec.container.blocks import blocks_in
+from structgstream.codec.container.blocks import iterate_blocks
 from structgstream.errors import StreamError
 
 MAX_JSON_BYTES = 2**20
@@ -16,7 +16,7 @@ LENGTH = struct.Struct("<I")
 _ZSTD_LEVEL = 19
 
 
-def packed_init(description: Mapping[str, Any], blocks: Iterable[bytes]) -> bytes:
+def pack_init(description: Mapping[str, Any], blocks: Iterable[bytes]) -> bytes:
     """The payload of a description, which is plain JSON values, and blocks.
 
     Raises:
@@ -46,7 +46,7 @@ def first_block(payload: bytes) -> int:
     return LENGTH.size + length
 
 
-def description_of(payload: bytes) -> dict[str, Any]:
+def read_description(payload: bytes) -> dict[str, Any]:
     """The description; its stated size is checked before anything is unpacked.
 
     Raises:
@@ -63,11 +63,11 @@ def description_of(payload: bytes) -> dict[str, Any]:
         raise ValueError(str(error)) from error
 
 
-def field_bytes_of(payload: bytes) -> dict[str, int]:
+def field_sizes(payload: bytes) -> dict[str, int]:
     """Bytes of each field in the payload.
 
     Raises:
         StreamError: the payload violates the format.
     """
-    blocks = blocks_in(payload, first_block(payload), where="The init record")
+    blocks = iterate_blocks(payload, first_block(payload), where="The init record")
     return {block.name: block.end - block.start for block in blocks}

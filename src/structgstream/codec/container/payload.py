@@ -5,7 +5,7 @@ import math
 import struct
 from collections.abc import Mapping
 
-from structgstream.codec.container.blocks import blocks_in
+from structgstream.codec.container.blocks import iterate_blocks
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
@@ -13,13 +13,15 @@ from structgstream.scene.state import FieldName
 FRAME = struct.Struct("<Id")  # index, presentation time in seconds
 
 
-def packet_with(blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind) -> Packet:
+def packet_from_blocks(
+    blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind
+) -> Packet:
     """The packet of a frame with these field blocks, in this order."""
     payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())
     return Packet(kind, index, pts_seconds, payload, {name: len(block) for name, block in blocks.items()})
 
 
-def packet_of(payload: bytes, kind: PacketKind) -> Packet:
+def parse_packet(payload: bytes, kind: PacketKind) -> Packet:
     """The packet in a key or delta record.
 
     Raises:
@@ -30,5 +32,5 @@ def packet_of(payload: bytes, kind: PacketKind) -> Packet:
     index, pts_seconds = FRAME.unpack_from(payload)
     if not math.isfinite(pts_seconds):
         raise StreamError(f"Packet {index} has the presentation time {pts_seconds}; it is damaged.")
-    blocks = blocks_in(payload, FRAME.size, where=f"Packet {index}")
+    blocks = iterate_blocks(payload, FRAME.size, where=f"Packet {index}")
     return Packet(kind, index, pts_seconds, payload, {block.name: block.end - block.start for block in blocks})

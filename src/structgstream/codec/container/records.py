@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
-from structgstream.codec.container.stored import Stored
+from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import StreamError
 
 MAGIC = b"\x89SGS\r\n\x1a\n"
@@ -63,7 +63,7 @@ def packed(kind: RecordType, payload: bytes) -> bytes:
     return head + payload + CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(head)))
 
 
-def check_prefix(data: Stored, name: str) -> None:
+def check_prefix(data: ByteSource, name: str) -> None:
     """Check that ``data`` is a stream of this major version.
 
     Raises:
@@ -83,7 +83,7 @@ def check_prefix(data: Stored, name: str) -> None:
         raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}")
 
 
-def head_at(data: Stored, offset: int) -> tuple[int, int] | None:
+def read_head(data: ByteSource, offset: int) -> tuple[int, int] | None:
     """Type and payload length stated by the record at ``offset``; None if the data ends before them."""
     if offset + RECORD.size + CHECKSUM.size > len(data):
         return None
@@ -91,9 +91,9 @@ def head_at(data: Stored, offset: int) -> tuple[int, int] | None:
     return None if offset + RECORD.size + length + CHECKSUM.size > len(data) else (kind, length)
 
 
-def record_at(data: Stored, offset: int) -> Record | None:
+def read_record(data: ByteSource, offset: int) -> Record | None:
     """The record at ``offset``, or None if truncated or damaged. Its length is checked before anything is allocated."""
-    if (head := head_at(data, offset)) is None:
+    if (head := read_head(data, offset)) is None:
         return None
     start = offset + RECORD.size
     end = start + head[1]
@@ -104,7 +104,7 @@ def record_at(data: Stored, offset: int) -> Record | None:
     return Record(head[0], payload, offset)
 
 
-def footer_offset(data: Stored) -> int | None:
+def footer_offset(data: ByteSource) -> int | None:
     """Offset of the index record at the end of a complete stream; None if the stream is unfinished or truncated.
 
     Reads only the footer and the head of the index, so that a server can poll a growing file.
@@ -115,14 +115,14 @@ def footer_offset(data: Stored) -> int | None:
     offset, magic = FOOTER.unpack(data[at:])
     if magic != FOOTER_MAGIC or not PREFIX.size <= offset < at:
         return None
-    head = head_at(data, offset)
+    head = read_head(data, offset)
     if head is None or head[0] != RecordType.INDEX or offset + RECORD.size + head[1] + CHECKSUM.size != at:
         return None
     return offset
 
 
-def why_stopped(data: Stored, offset: int) -> str:
-    """Why :func:`record_at` found no whole record at ``offset``, as a clause of a message."""
+def incomplete_reason(data: ByteSource, offset: int) -> str:
+    """Why :func:`read_record` found no whole record at ``offset``, as a clause of a message."""
     if offset == len(data):
         return f"it ends at byte {offset} without an index"
     if offset + RECORD.size <= len(data):
@@ -132,8 +132,8 @@ def why_stopped(data: Stored, offset: int) -> str:
     return f"it is cut at byte {len(data)}, within the record that begins at byte {offset}"
 
 
-def scanned(data: Stored, offset: int = PREFIX.size) -> Iterator[Record]:
+def scan_records(data: ByteSource, offset: int = PREFIX.size) -> Iterator[Record]:
     """Every record from byte ``offset`` on, up to the first truncated or damaged one."""
-    while (record := record_at(data, offset)) is not None:
+    while (record := read_record(data, offset)) is not None:
         yield record
         offset = record.end

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coders of packets, with adaptive binary decisions (``coder.py``, Note [Two directions])."""
+"""Coders of packets, with adaptive binary decisions (``section_coder.py``, Note [Two directions])."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from structgstream.codec.entropy.models import (
     BLOCK_CONTEXTS,
     LARGEST_NUMBER,
     NUMBER_NODES,
-    Arithmetic,
+    ArithmeticState,
     Models,
     residual_contexts,
 )
@@ -52,10 +52,10 @@ class _Adaptive(ABC):
     def __init__(self, models: Models, *, where: str) -> None:
         self._models = models
         self._where = where
-        self._codes: dict[str, Arithmetic] = {}
+        self._codes: dict[str, ArithmeticState] = {}
 
     @abstractmethod
-    def _code(self, name: str) -> Arithmetic:
+    def _code(self, name: str) -> ArithmeticState:
         """The arithmetic code of a name's field."""
 
     def activity(self, name: str, active: Flags | None, *, history: NDArray[np.uint8], sizes: Bins) -> Flags:
@@ -64,7 +64,7 @@ class _Adaptive(ABC):
             blocks = self._models.get(f"{name}.blocks", BLOCK_CONTEXTS, nodes=1)
             rows = self._models.get(f"{name}.rows", ACTIVITY_CONTEXTS, nodes=1)
             code_activity(self._code(name), (blocks, rows), history=history, sizes=sizes, active=values)
-            self._looked_at(name, True)
+            self._check_coded(name, True)
         return values.astype(np.bool_)
 
     def residuals(self, name: str, values: Bins | None, *, last: Bins, others: Bins) -> Bins:
@@ -72,7 +72,7 @@ class _Adaptive(ABC):
         if found.size:
             model = self._models.get(name, residual_contexts(found.shape[1]), nodes=NUMBER_NODES)
             last = np.ascontiguousarray(last)
-            self._looked_at(name, code_residuals(self._code(name), model, last=last, others=others, residuals=found))
+            self._check_coded(name, code_residuals(self._code(name), model, last=last, others=others, residuals=found))
         return found
 
     def flags(self, name: str, values: Flags | None, inputs: Inputs, *, counts: Sequence[int]) -> Flags:
@@ -90,11 +90,11 @@ class _Adaptive(ABC):
         if len(found):
             model = self._models.get(name, counts, nodes=nodes)
             sound = code_numbers(self._code(name), model, contexts=contexts, values=found, flags=nodes == 1)
-            self._looked_at(name, sound)
+            self._check_coded(name, sound)
         return found
 
     @abstractmethod
-    def _looked_at(self, name: str, sound: bool) -> None:
+    def _check_coded(self, name: str, sound: bool) -> None:
         """Called after a name has been coded; ``sound``: whether its numbers are within bounds."""
 
 
@@ -111,10 +111,10 @@ class AdaptiveEncoder(_Adaptive):
         """The bytes of each field; finishes the encoder."""
         return {name: code.finished() for name, code in self._codes.items()}
 
-    def _code(self, name: str) -> Arithmetic:
-        return self._codes.setdefault(name.partition(".")[0], Arithmetic(None))
+    def _code(self, name: str) -> ArithmeticState:
+        return self._codes.setdefault(name.partition(".")[0], ArithmeticState(None))
 
-    def _looked_at(self, name: str, sound: bool) -> None:
+    def _check_coded(self, name: str, sound: bool) -> None:
         if not sound:
             raise StreamError(f"{self._where} changes {name} by more than can be coded; take a larger step.")
 
@@ -124,7 +124,7 @@ class AdaptiveDecoder(_Adaptive):
 
     def __init__(self, models: Models, fields: Mapping[FieldName, bytes | memoryview], *, where: str) -> None:
         super().__init__(models, where=where)
-        self._codes = {name: Arithmetic(data) for name, data in fields.items()}
+        self._codes = {name: ArithmeticState(data) for name, data in fields.items()}
 
     def end(self) -> None:
         """Checks that all bytes have been read.
@@ -133,17 +133,17 @@ class AdaptiveDecoder(_Adaptive):
             StreamError: there are more, or fewer.
         """
         for name, code in self._codes.items():
-            if not code.is_whole():
+            if not code.is_exhausted():
                 raise StreamError(f"{self._where} has {code.size} bytes of {name}, which are not all; it is damaged.")
 
-    def _code(self, name: str) -> Arithmetic:
+    def _code(self, name: str) -> ArithmeticState:
         field = name.partition(".")[0]
         if field not in self._codes:
             raise StreamError(f"{self._where} holds no {field}, which the header announces; it is damaged.")
         return self._codes[field]
 
-    def _looked_at(self, name: str, sound: bool) -> None:
+    def _check_coded(self, name: str, sound: bool) -> None:
         if not sound:
             raise StreamError(f"{self._where}, {name}, holds a number out of bounds; it is damaged.")
-        if self._code(name).is_over():
+        if self._code(name).is_overrun():
             raise StreamError(f"{self._where} ends too early in {name.partition('.')[0]}; it is damaged.")

@@ -12,7 +12,7 @@ from structgstream.errors import StreamError
 Whole = TypeVar("Whole", int, NDArray[np.int64])
 
 
-def packed_bits(pieces: Iterable[str]) -> bytes:
+def pack_bits(pieces: Iterable[str]) -> bytes:
     """Concatenates strings of ``0`` and ``1`` to bytes, the last padded with zeros."""
     text = "".join(pieces)
     size = -(-len(text) // 8)
@@ -50,7 +50,7 @@ def bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.frexp(values.astype(np.float64))[1].astype(np.int64)  # exact below 2^53
 
 
-def numbers_of(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
+def unpack_numbers(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
     """Numbers int64 ``[n]`` with widths ``[n]`` of 0 to 56 bits that fill ``data`` up to zero padding in the last byte.
 
     Raises:
@@ -69,7 +69,7 @@ def numbers_of(data: bytes | memoryview, widths: NDArray[np.int64], *, where: st
 
 
 class BitReader:
-    """Reads what :func:`packed_bits` wrote.
+    """Reads what :func:`pack_bits` wrote.
 
     Args:
         data: all bytes; the caller bounds their number.

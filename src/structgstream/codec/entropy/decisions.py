@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.entropy import reference_decisions as reference
-from structgstream.codec.entropy.models import Arithmetic, Model
-from structgstream.codec.entropy.rans import takes_native
+from structgstream.codec.entropy.models import ArithmeticState, Model
+from structgstream.codec.entropy.rans import uses_native
 from structgstream.errors import OutOfMemoryError, StreamError
 from structgstream.kernels._load import native_library
 
@@ -19,7 +19,7 @@ _NO_MEMORY, _DAMAGED = 1, 2
 
 
 def code_activity(
-    arithmetic: Arithmetic,
+    arithmetic: ArithmeticState,
     models: tuple[Model, Model],
     *,
     history: NDArray[np.uint8],
@@ -38,7 +38,7 @@ def code_activity(
         native: C++ or Python; None takes C++ if available.
     """
     arithmetic.reserve(len(active))
-    if not takes_native(native):
+    if not uses_native(native):
         reference.code_activity(arithmetic, models, history=history, sizes=sizes, active=active)
         return
     state, blocks, rows = arithmetic.native(), models[0].native, models[1].native
@@ -53,7 +53,7 @@ def code_activity(
 
 
 def code_residuals(
-    arithmetic: Arithmetic,
+    arithmetic: ArithmeticState,
     model: Model,
     *,
     last: NDArray[np.int32],
@@ -72,7 +72,7 @@ def code_residuals(
         native: as in :func:`code_activity`.
     """
     arithmetic.reserve(residuals.size)
-    if not takes_native(native):
+    if not uses_native(native):
         return reference.code_residuals(arithmetic, model, last=last, others=others, residuals=residuals)
     state, its_model = arithmetic.native(), model.native
     result = native_library().sgs_code_residuals(
@@ -87,7 +87,7 @@ def code_residuals(
 
 
 def code_numbers(
-    arithmetic: Arithmetic,
+    arithmetic: ArithmeticState,
     model: Model,
     *,
     contexts: NDArray[np.int32],
@@ -106,7 +106,7 @@ def code_numbers(
         native: as in :func:`code_activity`.
     """
     arithmetic.reserve(len(values))
-    if not takes_native(native):
+    if not uses_native(native):
         return reference.code_numbers(arithmetic, model, contexts=contexts, values=values, flags=flags)
     state, its_model = arithmetic.native(), model.native
     result = native_library().sgs_code_numbers(

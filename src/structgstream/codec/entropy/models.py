@@ -123,7 +123,7 @@ class Models:
         return self._before | self._now
 
 
-class Arithmetic:
+class ArithmeticState:
     """The arithmetic code of one field, in either direction.
 
     Args:
@@ -152,11 +152,11 @@ class Arithmetic:
         """Takes over the state after a C++ call."""
         self.place, self.low, self.range, self.started = state.place, state.low, state.range, state.started
 
-    def is_whole(self) -> bool:
+    def is_exhausted(self) -> bool:
         """Whether a decoder has read exactly all bytes."""
         return self.place == self.size + AHEAD if self.started else not self.size
 
-    def is_over(self) -> bool:
+    def is_overrun(self) -> bool:
         """Whether a decoder has read further than any valid code allows."""
         return self.place > self.size + AHEAD
 

@@ -63,7 +63,7 @@ def encode(
     if not len(symbols):
         return _varint(0)
     lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
-    code = _native_encode if takes_native(native) else encode_lanes
+    code = _native_encode if uses_native(native) else encode_lanes
     states, words = code(symbols, contexts, tables, lanes=lanes)
     head = _varint(len(symbols)) + _varint(len(words) << 2 | LANES.index(lanes))
     return head + states.astype("<u4").tobytes() + words.astype("<u2").tobytes()
@@ -99,7 +99,7 @@ def decode(
         return np.empty(0, np.uint8)
     states = np.frombuffer(data, "<u4", lanes, start).astype(np.uint32)
     words = np.frombuffer(data, "<u2", word_count, start + 4 * lanes).astype(np.uint16)
-    code = _native_decode if takes_native(native) else decode_lanes
+    code = _native_decode if uses_native(native) else decode_lanes
     if (symbols := code(words, states, contexts, tables)) is None:
         raise StreamError(f"{where} is damaged: its words and final states contradict each other.")
     return symbols
@@ -158,7 +158,7 @@ def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> 
     return np.ascontiguousarray(contexts)
 
 
-def takes_native(native: bool | None) -> bool:
+def uses_native(native: bool | None) -> bool:
     """Whether to use C++; None uses it if available.
 
     Raises:

@@ -14,7 +14,7 @@ from structgstream.codec.entropy.models import (
     LENGTH_NODES,
     LENGTHS,
     NEAR_SIZES,
-    Arithmetic,
+    ArithmeticState,
     Model,
     carry,
 )
@@ -57,7 +57,7 @@ class _Coder:
     Probabilities and weights are Python lists meanwhile, many times faster than NumPy scalars.
     """
 
-    def __init__(self, arithmetic: Arithmetic, model: Model) -> None:
+    def __init__(self, arithmetic: ArithmeticState, model: Model) -> None:
         self._arithmetic, self._model = arithmetic, model
         self._encodes = arithmetic.encodes
         self._chances, self._seen = model.chances.ravel().tolist(), model.seen.ravel().tolist()
@@ -163,7 +163,7 @@ def size_class(size: int) -> int:
 
 
 def code_activity(
-    arithmetic: Arithmetic,
+    arithmetic: ArithmeticState,
     models: tuple[Model, Model],
     *,
     history: NDArray[np.uint8],
@@ -211,7 +211,7 @@ def code_activity(
 
 
 def code_residuals(
-    arithmetic: Arithmetic,
+    arithmetic: ArithmeticState,
     model: Model,
     *,
     last: NDArray[np.int32],
@@ -266,7 +266,7 @@ def _limited(value: int, most: int) -> int:
 
 
 def code_numbers(
-    arithmetic: Arithmetic,
+    arithmetic: ArithmeticState,
     model: Model,
     *,
     contexts: NDArray[np.int32],

@@ -4,7 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.bits import BitReader, fixed, golomb, packed_bits, unzigzag, zigzag
+from structgstream.codec.entropy.bits import BitReader, fixed, golomb, pack_bits, unzigzag, zigzag
 from structgstream.errors import StreamError
 
 ALPHABET = 16
@@ -14,7 +14,7 @@ _ORDER = 2
 _MOST_ZEROS = 28
 
 
-def symbols_of(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
+def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
     """Symbols u8 ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others' values.
 
     Args:
@@ -29,13 +29,13 @@ def symbols_of(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes
     size = np.abs(values)
     symbols = np.where(size > LARGEST, ESCAPE, zigzag(values)).astype(np.uint8)
     large = values[size > LARGEST].tolist()
-    return symbols, packed_bits(golomb(abs(v) - LARGEST - 1, order=_ORDER) + fixed(v < 0, 1) for v in large)
+    return symbols, pack_bits(golomb(abs(v) - LARGEST - 1, order=_ORDER) + fixed(v < 0, 1) for v in large)
 
 
-def residuals_of(
+def symbols_to_residuals(
     symbols: NDArray[np.uint8], escapes: bytes | memoryview, *, where: str = "A section of escapes"
 ) -> NDArray[np.int32]:
-    """Inverse of :func:`symbols_of`: residuals int32 ``[n]``.
+    """Inverse of :func:`residuals_to_symbols`: residuals int32 ``[n]``.
 
     Raises:
         StreamError: a symbol is above 15, the number of values differs from that of escapes, or a value is beyond 32

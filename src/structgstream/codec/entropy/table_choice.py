@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.bits import fixed, golomb, packed_bits, signed_golomb, zigzag
+from structgstream.codec.entropy.bits import fixed, golomb, pack_bits, signed_golomb, zigzag
 from structgstream.codec.entropy.table_sets import (
     COUNT_BITS,
     NUMBER_BITS,
@@ -26,7 +26,7 @@ from structgstream.codec.entropy.tables import (
     code_costs,
     geometric_family,
     logs,
-    normalised,
+    normalize_counts,
     weighed,
 )
 from structgstream.errors import StreamError
@@ -70,7 +70,7 @@ class _Explicit:
         return text + "".join(signed_golomb(step, order=self.order) for step in steps)
 
 
-def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
+def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
     """Tables for counted symbols, and their coding relative to the previous ones.
 
     Args:
@@ -93,7 +93,9 @@ def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
     rows, cost = np.where((parametric < keep)[:, None], family[number], kept), np.minimum(keep, parametric)
     pieces = ["10" + fixed(g, NUMBER_BITS) if new else "0" for g, new in zip(number.tolist(), parametric < keep)]
     # Explicit rows are tried only where exact frequencies would save more than the head of such a row.
-    least = _data_cost(counts, normalised(counts).rows.astype(np.int64)) + (_EXPLICIT_BITS + COUNT_BITS << COST_BITS)
+    least = _data_cost(counts, normalize_counts(counts).rows.astype(np.int64)) + (
+        _EXPLICIT_BITS + COUNT_BITS << COST_BITS
+    )
     tried = np.flatnonzero(least < cost)
     for geometric_reference, precision, order in product((False, True), range(1 << PRECISION_BITS), (0, 1)):
         references = family[number[tried]] if geometric_reference else kept[tried]
@@ -103,7 +105,7 @@ def chosen_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
                 context = tried[place]
                 rows[context], cost[context], pieces[context] = entry.rows[place], entry.cost[place], entry.bits(place)
     changes = any(piece != "0" for piece in pieces)
-    return FrequencyTables(rows.astype(np.uint16)), packed_bits(pieces) if changes else b""
+    return FrequencyTables(rows.astype(np.uint16)), pack_bits(pieces) if changes else b""
 
 
 def _explicit(

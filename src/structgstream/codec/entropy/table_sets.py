@@ -38,7 +38,7 @@ def top_level(precision: int) -> int:
     return (FREQUENCY_BITS + 1) << precision
 
 
-def decoded_tables(
+def decode_tables(
     data: bytes | memoryview, previous: FrequencyTables, *, where: str = "A table set"
 ) -> FrequencyTables:
     """The tables coded in ``data`` relative to the previous ones, which have the same contexts and alphabet.

@@ -42,7 +42,9 @@ class FrequencyTables:
                 f"{dtype} {shape}."
             )
         if (self.rows.sum(1, dtype=np.int64) != TOTAL).any():
-            raise StreamError(f"Every row of frequencies must sum to {TOTAL}; normalise counts with normalised().")
+            raise StreamError(
+                f"Every row of frequencies must sum to {TOTAL}; normalise counts with normalize_counts()."
+            )
         object.__setattr__(self, "rows", np.ascontiguousarray(self.rows))
 
     @property
@@ -61,7 +63,7 @@ class FrequencyTables:
         return (np.cumsum(self.rows, axis=1, dtype=np.int64) - self.rows).astype(np.uint16)
 
 
-def normalised(counts: NDArray[np.integer]) -> FrequencyTables:
+def normalize_counts(counts: NDArray[np.integer]) -> FrequencyTables:
     """Frequencies that nearly minimise the code length of counted symbols; a row without counts is uniform.
 
     Symbols that occur get at least 1, others 0. Starting from the floors of the quotas, each missing unit is added to
@@ -103,7 +105,7 @@ def weighed(weights: NDArray[np.int64]) -> NDArray[np.int64]:
     """Frequencies ``[..., A]`` for integer weights: the floors of the quotas, at least 1 where the weight is positive.
 
     The difference to 4096 is added to the first of the largest weights. Decoders apply this to the weights of a table
-    set; :func:`normalised` is for counts.
+    set; :func:`normalize_counts` is for counts.
     """
     rows = np.where(weights > 0, np.maximum(weights * TOTAL // weights.sum(-1, keepdims=True), 1), 0)
     peak = weights.argmax(-1)[..., None]

@@ -42,7 +42,7 @@ class FreeBins:
         """No free Gaussians."""
         return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
 
-    def unmoved(self) -> "FreeBins":
+    def without_change(self) -> "FreeBins":
         """The same bins with zero change, as after a key packet."""
         return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
 
@@ -67,29 +67,31 @@ class SceneBins:
     weight_changes: Mapping[FieldName, Change]
     free: FreeBins
 
-    def unmoved(self) -> "SceneBins":
+    def without_change(self) -> "SceneBins":
         """The same bins with zero change."""
         return replace(
             self,
             change=Change.none(*self.anchors.shape),
             weight_changes={name: Change.none(*bins.shape) for name, bins in self.weights.items()},
-            free=self.free.unmoved(),
+            free=self.free.without_change(),
         )
 
 
-def rounded_fields(granularity: Granularity) -> tuple[FieldName, ...]:
+def quantized_fields(granularity: Granularity) -> tuple[FieldName, ...]:
     """The fields of a granularity that packets can carry as bins, in the order of the table."""
-    return tuple(name for name in fields_of(granularity) if FIELDS[name].rounded)
+    return tuple(name for name in fields_of(granularity) if FIELDS[name].quantized)
 
 
-def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> SceneBins:
+def quantize_state(
+    state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]
+) -> SceneBins:
     """Quantizes the dynamic fields of a state.
 
     Raises:
         StreamError: a bin is beyond :data:`LARGEST`.
     """
-    names: list[FieldName] = [name for name in rounded_fields("anchor") if name in dynamic]
-    rows = [nearest_bins(state[name], steps[name]) for name in names]
+    names: list[FieldName] = [name for name in quantized_fields("anchor") if name in dynamic]
+    rows = [quantize(state[name], steps[name]) for name in names]
     count = len(state["anchor_positions"])
     anchors = np.concatenate(rows, axis=1) if rows else np.zeros((count, 0), np.int32)
     ends = accumulate(found.shape[1] for found in rows)
@@ -97,38 +99,40 @@ def binned(state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], ste
         (name, end - found.shape[1], end) for name, found, end in zip(names, rows, ends, strict=True)
     ]
     weights: dict[FieldName, Bins] = {
-        name: nearest_bins(state[name], steps[name])[:, None] for name in rounded_fields("shared") if name in dynamic
+        name: quantize(state[name], steps[name])[:, None] for name in quantized_fields("shared") if name in dynamic
     }
     free = FreeBins.none()
     if "free" in dynamic:
         births = state["free_births"].cpu().numpy().astype(np.int64)
-        bins = nearest_bins(state["free"], _free_steps(steps))
+        bins = quantize(state["free"], _free_steps(steps))
         free = FreeBins(births, bins, Change.none(len(births), FREE_COLUMNS))
     changes: dict[FieldName, Change] = {name: Change.none(*bins.shape) for name, bins in weights.items()}
     return SceneBins(anchors, columns, Change.none(*anchors.shape), weights, changes, free)
 
 
-def valued(bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]) -> dict[FieldName, Tensor]:
+def dequantize_state(
+    bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]
+) -> dict[FieldName, Tensor]:
     """Dequantizes the dynamic fields."""
     state: dict[FieldName, Tensor] = {}
     for name, first, end in bins.columns:
-        state[name] = values_of(bins.anchors[:, first:end], steps[name])
+        state[name] = dequantize(bins.anchors[:, first:end], steps[name])
     for name, weights in bins.weights.items():
-        state[name] = values_of(weights[:, 0], steps[name])
+        state[name] = dequantize(weights[:, 0], steps[name])
     if "free" in dynamic:
-        state["free"] = values_of(bins.free.bins, _free_steps(steps))
+        state["free"] = dequantize(bins.free.bins, _free_steps(steps))
         state["free_births"] = torch.from_numpy(bins.free.births.copy())
     return state
 
 
-def on_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
+def round_to_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
     """Quantizes and dequantizes the fields that have a step; others are returned as they are.
 
     Raises:
         StreamError: a bin is beyond :data:`LARGEST`.
     """
     return {
-        name: values_of(nearest_bins(value, steps[name]), steps[name]) if name in steps else value
+        name: dequantize(quantize(value, steps[name]), steps[name]) if name in steps else value
         for name, value in state.items()
     }
 
@@ -138,7 +142,7 @@ def _free_steps(steps: Mapping[str, float]) -> NDArray[np.float32]:
     return np.repeat(np.array([steps[parameter.name] for parameter in FREE_PARAMETERS], np.float32), widths)
 
 
-def nearest_bins(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
+def quantize(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
     """Quantizes a tensor: each value to the nearest bin.
 
     Raises:
@@ -150,6 +154,6 @@ def nearest_bins(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
     return found.astype(np.int32)
 
 
-def values_of(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
+def dequantize(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
     """Dequantizes bins: float32 products of bin and step."""
     return torch.from_numpy(bins.astype(np.float32) * np.asarray(step, np.float32))

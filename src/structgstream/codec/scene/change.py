@@ -44,7 +44,7 @@ class Change:
         """The change of the rows of a mask ``[n]``."""
         return Change(self.residuals[rows], self.history[rows], self.sizes[rows])
 
-    def grown(self, rows: int) -> "Change":
+    def extended(self, rows: int) -> "Change":
         """The change with ``rows`` unchanged rows appended."""
         more = Change.none(rows, self.residuals.shape[1])
         return Change(

@@ -14,20 +14,20 @@ from structgstream.codec.arrays import Bins
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import LARGEST, SceneBins, binned, rounded_fields, valued
+from structgstream.codec.scene.bins import LARGEST, SceneBins, dequantize_state, quantize_state, quantized_fields
 from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.free_rows import coded_free
-from structgstream.codec.scene.rows import coded_change
+from structgstream.codec.scene.free_rows import code_free
+from structgstream.codec.scene.rows import code_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName, fields_of, parameters_of
 
 FREE_FIELDS: frozenset[FieldName] = frozenset(fields_of("free"))
 """Births, deaths and changes of free Gaussians are coded together: these fields are all dynamic, or none is."""
-CODABLE: frozenset[FieldName] = frozenset(rounded_fields("anchor") + rounded_fields("shared")) | FREE_FIELDS
+CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized_fields("shared")) | FREE_FIELDS
 """Fields that may be dynamic."""
 
 
-def coded_scene(
+def code_scene(
     coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, *, has_free: bool, where: str
 ) -> SceneBins:
     """Codes the bins of a frame given those of the frame ``before``, in either direction.
@@ -36,17 +36,17 @@ def coded_scene(
         StreamError: decoded values are out of range or inconsistent.
     """
     given = None if after is None else Change.of(after.anchors - before.anchors)
-    change = coded_change(coder, given, before.change, groups=before.columns)
+    change = code_change(coder, given, before.change, groups=before.columns)
     anchors = before.anchors + change.residuals
     weights: dict[FieldName, Bins] = {}
     changes: dict[FieldName, Change] = {}
     for name, bins in before.weights.items():
         given = None if after is None else Change.of(after.weights[name] - bins)
-        changes[name] = coded_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
+        changes[name] = code_change(coder, given, before.weight_changes[name], groups=[(name, 0, 1)])
         weights[name] = bins + changes[name].residuals
     free = before.free
     if has_free:
-        free = coded_free(coder, None if after is None else after.free, before.free, where=where)
+        free = code_free(coder, None if after is None else after.free, before.free, where=where)
     for found in (anchors, *weights.values(), free.bins):
         if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
             raise StreamError(f"{where} has a bin beyond 22 bits, the largest allowed; it is damaged.")
@@ -88,7 +88,7 @@ class _Compact:
         self._header = header
         known: dict[FieldName, Tensor] = {**header.static, **header.reference}
         # Static fields are not read; a key packet starts without free Gaussians.
-        self._reference = binned(known, rows, header.steps)
+        self._reference = quantize_state(known, rows, header.steps)
         self.state: CompactState | None = None
 
     def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Models]:
@@ -98,19 +98,19 @@ class _Compact:
             raise StreamError(f"Packet {index} needs packet {index - 1}, which was not decoded before it.")
         return self.state.bins, Models(self.state.models)
 
-    def _coded(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
+    def _code(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
         has_free = not FREE_FIELDS.isdisjoint(self._header.dynamic)
-        return coded_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
+        return code_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
 
     def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
         # Residuals of a key packet are relative to the reference, so they do not predict those of the next packet.
-        self.state = CompactState(index, bins.unmoved() if kind is PacketKind.KEY else bins, models)
+        self.state = CompactState(index, bins.without_change() if kind is PacketKind.KEY else bins, models)
 
 
 class CompactEncoder(_Compact):
     """Encodes the frames of one stream, in order."""
 
-    def follow(self, state: CompactState | None) -> None:
+    def replay(self, state: CompactState | None) -> None:
         """Continue from a decoder's state."""
         self.state = state
 
@@ -121,14 +121,14 @@ class CompactEncoder(_Compact):
             StreamError: a value is out of range, or a delta packet does not follow the packet before it.
         """
         before, models = self._start(kind, index)
-        after = binned(state, self._header.dynamic, self._header.steps)
+        after = quantize_state(state, self._header.dynamic, self._header.steps)
         if after.anchors.shape != before.anchors.shape:
             raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
         for name, bins in after.weights.items():
             if bins.shape != before.weights[name].shape:
                 raise StreamError(f"Frame {index} has {name} of another size than the header.")
         encoder = AdaptiveEncoder(models, where=f"Frame {index}")
-        self._keep(kind, index, self._coded(encoder, after, before, index), models)
+        self._keep(kind, index, self._code(encoder, after, before, index), models)
         fields = encoder.fields()
         return {name: fields.get(name, b"") for name in self._header.dynamic}
 
@@ -146,7 +146,7 @@ class CompactDecoder(_Compact):
         """
         before, models = self._start(kind, index)
         decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
-        bins = self._coded(decoder, None, before, index)
+        bins = self._code(decoder, None, before, index)
         decoder.end()
         self._keep(kind, index, bins, models)
-        return valued(bins, self._header.dynamic, self._header.steps)
+        return dequantize_state(bins, self._header.dynamic, self._header.steps)

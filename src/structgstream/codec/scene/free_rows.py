@@ -11,7 +11,7 @@ from structgstream.codec.entropy.adaptive import AdaptiveCoder
 from structgstream.codec.entropy.bits import bit_lengths
 from structgstream.codec.scene.bins import FREE_PARAMETERS, FreeBins
 from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.rows import coded_change
+from structgstream.codec.scene.rows import code_change
 from structgstream.errors import StreamError
 from structgstream.scene.state import FREE_COLUMNS
 
@@ -24,7 +24,7 @@ _LED = (12, 13)  # columns predicted from the change in the column before: green
 _FRAME_BITS = 32  # a birth is frame * 2^32 + number
 
 
-def coded_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
+def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
     """Codes deaths, changes and births from ``before`` to ``after``, whose births and bins are read.
 
     Raises:
@@ -43,20 +43,20 @@ def coded_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *
         kept = np.isin(after.births, before.births)
         change = Change.of(after.bins[kept] - old.bins)
         new = FreeBins(after.births[~kept], after.bins[~kept], Change.none(0, FREE_COLUMNS))
-    change = coded_change(coder, change, old.change, groups=GROUPS)
+    change = code_change(coder, change, old.change, groups=GROUPS)
     kept_bins = old.bins + change.residuals
-    born = _coded_births(coder, new, kept_bins, where=where)
+    born = _code_births(coder, new, kept_bins, where=where)
     births = np.concatenate([old.births, born.births])
     if not (np.diff(births) > 0).all():
         raise StreamError(f"{where} has births that do not ascend; it is damaged.")
     return FreeBins(
         births,
         np.concatenate([kept_bins, born.bins]),
-        change.grown(len(born.births)),
+        change.extended(len(born.births)),
     )
 
 
-def _coded_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
+def _code_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
     """Codes the births, given the bins of the survivors."""
     given = None if new is None else np.array([len(new.births)])
     count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
@@ -83,11 +83,11 @@ def _coded_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, wh
     if int(number.max()) >= 1 << _FRAME_BITS:
         raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
     births = (frame << _FRAME_BITS) + number
-    bins = _coded_born(coder, None if new is None else new.bins, alive, count=count, where=where)
+    bins = _code_birth_gaps(coder, None if new is None else new.bins, alive, count=count, where=where)
     return FreeBins(births, bins, Change.none(count, FREE_COLUMNS))
 
 
-def _coded_born(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
+def _code_birth_gaps(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
     """Codes the bins ``[count, 14]`` of newborn Gaussians, column by column.
 
     Most columns are predicted from the row before (the first from the last survivor). Quaternions and opacities, which

@@ -15,7 +15,7 @@ from structgstream.codec.scene.change import Change, row_sizes
 _REMEMBERED = 7  # activity of three frames
 
 
-def coded_change(
+def code_change(
     coder: AdaptiveCoder, change: Change | None, before: Change, *, groups: Sequence[tuple[str, int, int]]
 ) -> Change:
     """Codes a change, with the rows' previous change as context.

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from structgstream.codec.arrays import Bins, Contexts, Naturals
 from structgstream.codec.entropy.bits import bit_lengths, unzigzag, zigzag
-from structgstream.codec.entropy.coder import Coder, Decoder, Encoder, Tables
 from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMBOL
-from structgstream.codec.scene.bins import LARGEST, nearest_bins, values_of
+from structgstream.codec.entropy.section_coder import SectionCoder, SectionDecoder, SectionEncoder, Tables
+from structgstream.codec.scene.bins import LARGEST, dequantize, quantize
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, InitCoding
@@ -56,7 +56,7 @@ def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
     return FREE_NUMBERS + NUMBERS_A_BYTE * sum(map(len, coded))
 
 
-def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
+def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
     """The bytes of every field that has a coding.
 
     Args:
@@ -71,13 +71,13 @@ def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName,
     for name in _coded_names(fields.keys()):
         if name not in steps:
             raise StreamError(f"The header states no step for {name} in the init record.")
-        found = nearest_bins(fields[name], steps[name])
-        if values_of(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
+        found = quantize(fields[name], steps[name])
+        if dequantize(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
             raise StreamError(f"The header's {name} are no multiples of the step {steps[name]:g}; quantize them first.")
         bins[name] = found
-    encoder = Encoder(Tables())
+    encoder = SectionEncoder(Tables())
     numbers = sum(found.size for found in bins.values())
-    _coded(encoder, bins, bins.keys(), _Budget(numbers))
+    _code_fields(encoder, bins, bins.keys(), _Budget(numbers))
     if numbers > (most := _most_numbers(encoder.fields.values())):
         raise StreamError(
             f"The header has {numbers} numbers, more than the {most} that its bytes allow; take smaller steps."
@@ -85,10 +85,10 @@ def encoded_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName,
     return {name: encoder.fields[name] for name in bins}
 
 
-def decoded_fields(
+def decode_fields(
     coded: Mapping[FieldName, bytes | memoryview], steps: Mapping[FieldName, float]
 ) -> dict[FieldName, Tensor]:
-    """The fields that :func:`encoded_fields` wrote.
+    """The fields that :func:`encode_fields` wrote.
 
     Raises:
         StreamError: the bytes are damaged, or there is no step or no coding for a field.
@@ -98,10 +98,10 @@ def decoded_fields(
         raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & UNCODED_FIELDS))} coded; expected raw.")
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
-    decoder = Decoder(Tables(), coded, where=_WHERE)
-    bins = _coded(decoder, None, coded.keys(), _Budget(_most_numbers(coded.values())))
+    decoder = SectionDecoder(Tables(), coded, where=_WHERE)
+    bins = _code_fields(decoder, None, coded.keys(), _Budget(_most_numbers(coded.values())))
     decoder.end()
-    return {name: values_of(found, steps[name]) for name, found in bins.items()}
+    return {name: dequantize(found, steps[name]) for name, found in bins.items()}
 
 
 def _coded_names(names: Set[FieldName]) -> list[FieldName]:
@@ -119,21 +119,21 @@ def most_columns(name: FieldName) -> int:
     return math.prod(sizes)
 
 
-def _coded(
-    coder: Coder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], budget: _Budget
+def _code_fields(
+    coder: SectionCoder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], budget: _Budget
 ) -> dict[FieldName, Bins]:
     """Codes the fields ``names``: anchor fields, then the others."""
     given: Mapping[FieldName, Bins] = bins or {}
     found: dict[FieldName, Bins] = {}
-    positions = _coded_positions(coder, given.get("anchor_positions"), budget)
+    positions = _code_positions(coder, given.get("anchor_positions"), budget)
     found["anchor_positions"] = positions
     shifts = np.zeros(len(positions), np.int32)
     for name in _of_coding("rows", names):
         shape = (len(positions), math.prod(given[name].shape[1:])) if name in given else None
         rows = None if shape is None else given[name].reshape(shape)
-        found[name], shifts = _coded_rows(coder, name, rows, shifts, budget=budget)
+        found[name], shifts = _code_rows(coder, name, rows, shifts, budget=budget)
     for name in _of_coding("numbers", names):
-        found[name] = _coded_numbers(coder, name, given[name].ravel() if name in given else None, budget)
+        found[name] = _code_numbers(coder, name, given[name].ravel() if name in given else None, budget)
     return _shaped(found)
 
 
@@ -159,7 +159,7 @@ def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
     return found
 
 
-def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
+def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> Bins:
     """Codes cells by the differences of successive Z-order keys.
 
     Rows need not be in Z-order; if they are not, signs are coded too.
@@ -171,7 +171,7 @@ def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
         return np.zeros((0, 3), np.int32)
     lowest = None if bins is None else bins.min(0)
     origin = np.array(
-        [_coded_signed(coder, "anchor_positions.origin", None if lowest is None else lowest[axis]) for axis in range(3)]
+        [_code_signed(coder, "anchor_positions.origin", None if lowest is None else lowest[axis]) for axis in range(3)]
     )
     steps: Naturals | None = None
     if bins is not None:
@@ -205,8 +205,8 @@ def _coded_positions(coder: Coder, bins: Bins | None, budget: _Budget) -> Bins:
     return _checked(morton_cells(torch.from_numpy(keys)).numpy() + origin)
 
 
-def _coded_rows(
-    coder: Coder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, budget: _Budget
+def _code_rows(
+    coder: SectionCoder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, budget: _Budget
 ) -> tuple[Bins, NDArray[np.int32]]:
     """Codes rows ``[n, C]``, column by column, and their shifts, in the context of another field's shifts ``like``."""
     given = None if bins is None else bins.shape[1]
@@ -220,17 +220,17 @@ def _coded_rows(
     last = before = np.zeros(len(like), np.int64)
     for column in range(columns):
         middle = None if bins is None or not len(bins) else int(np.median(bins[:, column]))
-        middle = _coded_signed(coder, f"{name}.middle", 0 if bins is not None and middle is None else middle)
+        middle = _code_signed(coder, f"{name}.middle", 0 if bins is not None and middle is None else middle)
         middles = middle + (1 << shifts >> 1) >> shifts
         values = None if bins is None else (bins[:, column] >> shifts) - middles
         contexts = shifts * _SIZES + np.minimum(bit_lengths(last + before), _SIZES - 1)
-        values = _coded_values(coder, name, values, contexts.astype(np.uint16))
+        values = _code_values(coder, name, values, contexts.astype(np.uint16))
         last, before = np.abs(values), last
         found[:, column] = _checked(values + middles << shifts)
     return found, shifts
 
 
-def _coded_values(coder: Coder, name: FieldName, values: Naturals | None, contexts: Contexts) -> Naturals:
+def _code_values(coder: SectionCoder, name: FieldName, values: Naturals | None, contexts: Contexts) -> Naturals:
     """Codes signed numbers ``[n]``: magnitudes up to 6 as symbols, larger ones as symbol 7 and the excess over 7."""
     clipped = None if values is None else np.clip(values, -LARGEST_SYMBOL, LARGEST_SYMBOL).astype(np.int32)
     found = coder.residuals(f"{name}.value", clipped, contexts, count=SHIFTS * _SIZES).astype(np.int64)
@@ -251,7 +251,7 @@ def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.where(together == 0, like, shifts).astype(np.int32)
 
 
-def _coded_numbers(coder: Coder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
+def _code_numbers(coder: SectionCoder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
     """Codes numbers ``[n]`` of any size."""
     count = _bounded(
         coder.number(f"{name}.count", None if bins is None else len(bins)), MOST_WEIGHTS, f"numbers of {name}"
@@ -262,7 +262,7 @@ def _coded_numbers(coder: Coder, name: FieldName, bins: Bins | None, budget: _Bu
     return _checked(unzigzag(values))
 
 
-def _coded_signed(coder: Coder, name: str, value: int | None) -> int:
+def _code_signed(coder: SectionCoder, name: str, value: int | None) -> int:
     found = coder.number(name, None if value is None else zigzag(int(value)))
     return int(_checked(np.array([unzigzag(found)]))[0])
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from structgstream.cli.options import Folder, parsed_with_rest, resolved_config
-from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, swept
+from structgstream.cli.options import Folder, parse_known_options, resolve_config
+from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, run_sweep
 
 if TYPE_CHECKING:
-    from structgstream_studies.experiments.tasks import Variation
+    from structgstream_studies.experiments.tasks import VariantRun
 
 TableName = Literal["structured", "free", "patching", "distance", "readings", "effects", "rates"]
 
@@ -49,24 +49,29 @@ class Ablate(ExperimentOptions):
 
 def main(arguments: list[str]) -> None:
     """Runs, prints, draws."""
-    options, rest = parsed_with_rest(Ablate, "ablate", arguments=arguments)
-    from structgstream.presets import DEFAULT_PRESET, PAPER_MODE
+    options, rest = parse_known_options(Ablate, "ablate", arguments=arguments)
+    from structgstream.presets import DEFAULT_PRESET, PAPER_METHOD_PRESET
 
-    full, _ = resolved_config(options.preset or PAPER_MODE, rest, command="ablate", seed=None)
-    compact, _ = resolved_config(options.preset or DEFAULT_PRESET, rest, command="ablate", seed=None)
-    paper, _ = resolved_config(PAPER_MODE, rest, command="ablate", seed=None)
+    full, _ = resolve_config(options.preset or PAPER_METHOD_PRESET, rest, command="ablate", seed=None)
+    compact, _ = resolve_config(options.preset or DEFAULT_PRESET, rest, command="ablate", seed=None)
+    paper, _ = resolve_config(PAPER_METHOD_PRESET, rest, command="ablate", seed=None)
     capture, frames = capture_part(options.scene, options)
     from structgstream.kernels.backend import select_backend
-    from structgstream_studies.experiments.studies import COMPACT_TABLES, ablation_runs, needed, write_ablation
+    from structgstream_studies.experiments.studies import (
+        COMPACT_TABLES,
+        ablation_runs,
+        with_dependencies,
+        write_ablation,
+    )
 
-    runs: list[Variation] = []
+    runs: list[VariantRun] = []
     of_compact = [name for name in options.table if name in COMPACT_TABLES]
     others = [name for name in options.table if name not in COMPACT_TABLES]
     for tables, config in ((others, full), (of_compact, compact)):
         runs += ablation_runs(
             tables, config, capture, frames=frames, seeds=options.seeds, folder=options.output, paper=paper
         )
-    swept(needed(runs), options)
+    run_sweep(with_dependencies(runs), options)
     console = Console()
     for table in options.table:
         for sheet in write_ablation(options.output, table, runs, backend=select_backend(options.device)):

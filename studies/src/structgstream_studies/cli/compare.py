@@ -8,8 +8,8 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Folder, parsed
-from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, swept
+from structgstream.cli.options import Folder, parse_options
+from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, run_sweep
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Compare(ExperimentOptions):
 
 def main(arguments: list[str]) -> None:
     """Runs, prints, draws."""
-    options = parsed(Compare, "compare", arguments=arguments)
+    options = parse_options(Compare, "compare", arguments=arguments)
     if options.scratch_every < 1:
         raise UsageError(f"--scratch-every counts frames, from 1; got {options.scratch_every}.")
     capture, frames = capture_part(options.scene, options)
     from structgstream.kernels.backend import select_backend
-    from structgstream_studies.experiments.studies import comparison_runs, needed, write_methods
+    from structgstream_studies.experiments.studies import comparison_runs, with_dependencies, write_methods
 
     runs = comparison_runs(
         options.methods,
@@ -54,7 +54,7 @@ def main(arguments: list[str]) -> None:
         seeds=options.seeds,
         folder=options.output,
     )
-    swept(needed(runs), options)
+    run_sweep(with_dependencies(runs), options)
     console = Console()
     print_sheet(write_methods(options.output, runs, backend=select_backend(options.device)), console)
     console.print(f"Table and pictures: {options.output}", highlight=False, markup=False, soft_wrap=True)

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import CaptureOptions, Device, Folder
-from structgstream.cli.tables import columns, plain
+from structgstream.cli.tables import compact_table, literal_cells
 from structgstream_studies.errors import ExperimentError
 
 if TYPE_CHECKING:
@@ -71,16 +71,16 @@ def capture_part(scene: Folder, asked: ExperimentOptions) -> tuple["CapturePart"
     return part, len(source)
 
 
-def swept(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
+def run_sweep(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
     """Runs the unfinished tasks, and reports failures and how to continue.
 
     Raises:
         ExperimentError: tasks failed; the others are done.
         Interrupted: the user pressed Ctrl-C.
     """
-    from structgstream_studies.experiments.sweep import seats_for, sweep
+    from structgstream_studies.experiments.sweep import sweep, worker_slots
 
-    seats, logs = seats_for(options.device, jobs=options.jobs), options.output / "logs"
+    seats, logs = worker_slots(options.device, jobs=options.jobs), options.output / "logs"
     console = Console()
     view = Display(console)
     try:
@@ -134,12 +134,12 @@ def print_sheet(sheet: "Sheet", console: Console) -> None:
     wide = console.width >= 20 * len(sheet.columns)
     step = len(sheet.columns) if wide else NARROW
     for start in range(1, len(sheet.columns), step):
-        table = columns()
+        table = compact_table()
         table.title = Text(sheet.title if start == 1 else f"{sheet.title}, continued")
         shown = [0, *range(start, min(start + step, len(sheet.columns)))]
         for i in shown:
             table.add_column(sheet.columns[i], justify="left" if i == 0 else "right")
         for row in sheet.rows:
-            table.add_row(*plain(*(row[i] for i in shown)))
+            table.add_row(*literal_cells(*(row[i] for i in shown)))
         console.print(table)
         console.print()

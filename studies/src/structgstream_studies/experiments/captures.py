@@ -41,7 +41,7 @@ class CapturePart:
             CaptureError: the folder holds no capture, or not these frames or cameras.
         """
         from structgstream.data.open import open_capture
-        from structgstream.data.wrappers import thinned
+        from structgstream.data.wrappers import every_nth_frame
 
         whole = open_capture(
             self.folder,
@@ -51,7 +51,7 @@ class CapturePart:
             frames=self.frames,
             near=self.near,
         )
-        return thinned(whole, self.every)
+        return every_nth_frame(whole, self.every)
 
 
 def capture_facts(part: CapturePart, source: "FrameSource") -> dict[str, Any]:

@@ -22,7 +22,7 @@ from structgstream_studies.experiments.cited import cited_sheet, cited_words
 from structgstream_studies.experiments.effects import effects_sheet
 from structgstream_studies.experiments.figures import write_comparison, write_curves
 from structgstream_studies.experiments.folds import folds_sheet
-from structgstream_studies.experiments.rate_distortion import bd_sheet, listed, rates_sheet, versus_sheet
+from structgstream_studies.experiments.rate_distortion import bd_sheet, bullet_list, rates_sheet, versus_sheet
 from structgstream_studies.experiments.rate_figures import write_rates
 from structgstream_studies.experiments.readings import readings_sheet
 from structgstream_studies.experiments.results import Result, read_results
@@ -47,7 +47,7 @@ def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
     changed = []
     for path in documents:
         old = path.read_text()
-        new = refreshed(old, found)
+        new = refresh_text(old, found)
         if new != old:
             path.write_text(new)
             changed.append(path)
@@ -79,7 +79,7 @@ def _draw(what: str, words: Sequence[str], studies: Studies, *, folder: Path) ->
         write_comparison(folder / f"{words[0]}-methods.png", mine, titles=_method_titles())
 
 
-def refreshed(text: str, studies: Studies) -> str:
+def refresh_text(text: str, studies: Studies) -> str:
     """``text`` with every marked part made from the results of ``studies``.
 
     Raises:
@@ -141,7 +141,7 @@ def _rates(words: Sequence[str], studies: Studies) -> str:
     """The points of the curve, and their comparison with other methods if there are results."""
     mine = studies.get(words[0], ())
     versus, remarks = versus_sheet(mine)
-    return markdown(rates_sheet(mine)) + (f"\n{markdown(versus)}{listed(remarks)}" if versus.rows else "")
+    return markdown(rates_sheet(mine)) + (f"\n{markdown(versus)}{bullet_list(remarks)}" if versus.rows else "")
 
 
 def _bd_rate(words: Sequence[str], studies: Studies) -> str:
@@ -149,7 +149,7 @@ def _bd_rate(words: Sequence[str], studies: Studies) -> str:
     if not one or not other:
         return "No result yet.\n"
     sheet, remarks = bd_sheet(one, other)
-    return markdown(sheet) + listed(remarks)
+    return markdown(sheet) + bullet_list(remarks)
 
 
 def _rate_plot(words: Sequence[str], studies: Studies) -> str:

@@ -11,7 +11,7 @@ from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.rounding import RoundingConfig
 from structgstream_studies.experiments.results import Result
-from structgstream_studies.experiments.sheets import SCORES, Sheet, written
+from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import Summary, summaries
 from structgstream_studies.experiments.variants import FULL, Variant
 
@@ -165,8 +165,8 @@ def _cells(summary: Summary | None, whole: Summary | None) -> list[str]:
     difference = None if whole is None or summary.key == WHOLE else summary.difference(whole, "psnr")
     cells = [
         str(len(summary.results)),
-        written(summary.score("psnr"), "psnr"),
-        written(summary.score("psnr_camera_color"), "psnr_camera_color"),
-        written(difference, "psnr", signed=True),
+        format_score(summary.score("psnr"), "psnr"),
+        format_score(summary.score("psnr_camera_color"), "psnr_camera_color"),
+        format_score(difference, "psnr", signed=True),
     ]
-    return cells + [written(summary.score(score), name) for score, name in _COLUMNS]
+    return cells + [format_score(summary.score(score), name) for score, name in _COLUMNS]

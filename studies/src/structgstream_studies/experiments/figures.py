@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.evaluation.figure import COLOURS, INK, figure_of, save_figure, without_frame
+from structgstream.evaluation.figure import COLORS, INK, figure_of, save_figure, without_frame
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES
 from structgstream_studies.experiments.summary import Summary, summaries
@@ -34,7 +34,7 @@ def write_curves(path: Path, results: Iterable[Result], *, keys: Sequence[str], 
     axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     for axis, name in zip(axes, shown):
         for number, key in enumerate(key for key in keys if key in found):
-            colour = INK if key == FULL else COLOURS[number % len(COLOURS)]
+            colour = INK if key == FULL else COLORS[number % len(COLORS)]
             _curve(axis, found[key], name, label=titles[key], colour=colour, width=2.0 if key == FULL else 1.2)
         axis.set_ylabel(SCORES[name].title, fontsize=9)
         without_frame(axis)
@@ -60,7 +60,7 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
             if cost is None or quality is None:
                 continue
             x = max(cost.mean * SCORES[name].factor, 1e-4)
-            colour = INK if key == FULL else COLOURS[number % len(COLOURS)]
+            colour = INK if key == FULL else COLORS[number % len(COLORS)]
             axis.errorbar(x, quality.mean, yerr=quality.deviation, fmt="o", color=colour, capsize=3)
             axis.annotate(titles[key], (x, quality.mean), xytext=(6, 4), textcoords="offset points", fontsize=8)
         axis.set_xscale("log")
@@ -83,7 +83,7 @@ def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    top, left, height, width = busiest(disagreement([*pictures.values(), truth]))
+    top, left, height, width = most_varied_crop(pixel_range([*pictures.values(), truth]))
     cells = {**pictures, "ground truth": truth}
     columns = min(len(cells), 4)
     rows = -(-len(cells) // columns)
@@ -98,13 +98,13 @@ def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *
     save_figure(figure, path)
 
 
-def disagreement(pictures: Sequence[Picture]) -> NDArray[np.int64]:
+def pixel_range(pictures: Sequence[Picture]) -> NDArray[np.int64]:
     """How far the pictures ``[H, W, 3]`` are apart in each pixel, ``[H, W]``: the range, summed over channels."""
     stack = np.stack(pictures).astype(np.int64)
     return (stack.max(0) - stack.min(0)).sum(-1)
 
 
-def busiest(weights: NDArray[np.int64]) -> tuple[int, int, int, int]:
+def most_varied_crop(weights: NDArray[np.int64]) -> tuple[int, int, int, int]:
     """Top, left, height and width of the detail of ``weights`` ``[H, W]`` with the largest sum."""
     height, width = weights.shape[0] // CROP_SHARE, weights.shape[1] // CROP_SHARE
     total = np.pad(weights.cumsum(0, dtype=np.int64).cumsum(1), ((1, 0), (1, 0)))

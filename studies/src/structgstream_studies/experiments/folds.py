@@ -16,7 +16,7 @@ import torch
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
 from structgstream_studies.experiments.results import Result
-from structgstream_studies.experiments.sheets import SCORES, Sheet, written
+from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import Summary, summaries
 from structgstream_studies.experiments.variants import FULL
 
@@ -77,5 +77,5 @@ def _cells(fold: Mapping[str, Summary], key: str) -> list[str]:
         return ["-"] * (3 + len(_COLUMNS))
     scored = next(iter(summary.results.values())).identity["capture"]["scored"]
     difference = None if full is None or key == FULL else summary.difference(full, "psnr")
-    cells = [written(summary.score(score), name) for score, name in _COLUMNS]
-    return [", ".join(scored), str(len(summary.results)), *cells, written(difference, "psnr", signed=True)]
+    cells = [format_score(summary.score(score), name) for score, name in _COLUMNS]
+    return [", ".join(scored), str(len(summary.results)), *cells, format_score(difference, "psnr", signed=True)]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from structgstream.presets import to_json
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import write_result
-from structgstream_studies.experiments.tasks import answers, scored
+from structgstream_studies.experiments.tasks import is_result_of, score_recording
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
@@ -55,9 +55,9 @@ class PeerRun:
 
     def done(self) -> bool:
         """Whether there is a result with the same identity."""
-        return answers(self.result, self._asked(), self.capture, frames=self.frames)
+        return is_result_of(self.result, self._identity(), self.capture, frames=self.frames)
 
-    def _asked(self) -> dict[str, Any]:
+    def _identity(self) -> dict[str, Any]:
         from structgstream_studies.peers.methods import METHODS
 
         return {"key": self.key, "method": self.key, "seed": self.seed, "config": to_json(METHODS[self.key].config)}
@@ -71,7 +71,10 @@ class PeerRun:
     def run(self, backend: "Backend") -> None:
         """Reconstructs the missing frames of the file, then scores it."""
         self._reconstruct(backend)
-        write_result(self.result, scored(self.recording(), self.stream, self.capture, backend, asked=self._asked()))
+        write_result(
+            self.result,
+            score_recording(self.recording(), self.stream, self.capture, backend, run_identity=self._identity()),
+        )
 
     def _reconstruct(self, backend: "Backend") -> None:
         from structgstream.evaluation.environment import environment

@@ -14,7 +14,7 @@ from structgstream.presets import StreamConfig
 from structgstream_studies.experiments.bd_rate import bd_psnr, bd_rate, psnr_at, rate_at
 from structgstream_studies.experiments.effects import WHOLE, require_compact
 from structgstream_studies.experiments.results import Result
-from structgstream_studies.experiments.sheets import SCORES, Sheet, written
+from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import Spread, Summary, summaries
 from structgstream_studies.experiments.variants import FULL, Variant
 
@@ -78,9 +78,9 @@ def rates_sheet(results: Iterable[Result]) -> Sheet:
                 rows.append([title, *["-"] * len(heads)])
             continue
         cost = summary.score("online_bytes")
-        cells = [written(summary.score(name), name) for name in scores]
-        cells += [written(cost, "online_kilobytes"), _megabits(cost, fps)]
-        cells += [written(summary.score(score), name) for score, name in after]
+        cells = [format_score(summary.score(name), name) for name in scores]
+        cells += [format_score(cost, "online_kilobytes"), _megabits(cost, fps)]
+        cells += [format_score(summary.score(score), name) for score, name in after]
         rows.append([title, str(len(summary.results)), *cells])
     return Sheet("Rates", ["stream", *heads], rows)
 
@@ -182,6 +182,6 @@ def _point(summary: Summary, score: str, seeds: Iterable[int]) -> Point | None:
     return None if cost is None or quality is None or cost.mean <= 0 else (cost.mean * 1e-3, quality.mean)
 
 
-def listed(remarks: Sequence[str]) -> str:
+def bullet_list(remarks: Sequence[str]) -> str:
     """Sentences as a list in Markdown; nothing for none."""
     return "".join(["\n", *(f"- {remark}\n" for remark in remarks)]) if remarks else ""

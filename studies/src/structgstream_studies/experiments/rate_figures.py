@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from structgstream.evaluation.figure import COLOURS, INK, figure_of, save_figure, without_frame
+from structgstream.evaluation.figure import COLORS, INK, figure_of, save_figure, without_frame
 from structgstream_studies.experiments.rate_distortion import JUDGED, OTHERS, QUALITIES, quality_key
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES
@@ -30,7 +30,7 @@ def write_rates(path: Path, results: Iterable[Result]) -> None:
         _points(axis, curve, score, line="-o", colour=INK, label="compact")
         for number, (key, name) in enumerate(OTHERS.items()):
             if key in found:
-                _points(axis, [found[key]], score, line="s", colour=COLOURS[number], label=name)
+                _points(axis, [found[key]], score, line="s", colour=COLORS[number], label=name)
         axis.set_xscale("log")
         axis.margins(x=0.1, y=0.12)
         axis.set_xlabel("KB a frame after the first", fontsize=9)

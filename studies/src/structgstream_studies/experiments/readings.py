@@ -13,7 +13,7 @@ from structgstream.training.initial import InitialConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.online import OnlineConfig
 from structgstream_studies.experiments.results import Result
-from structgstream_studies.experiments.sheets import SCORES, Sheet, written
+from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import summaries
 
 BASE = "reading-default"
@@ -104,8 +104,8 @@ def readings_sheet(results: Iterable[Result]) -> Sheet:
         if key not in found:
             continue
         summary = found[key]
-        cells = [written(summary.score(name), name) for name in scores]
+        cells = [format_score(summary.score(name), name) for name in scores]
         difference = None if base is None or key == BASE else summary.difference(base, "psnr")
-        rows.append([reading.question, reading.answer, *cells, written(difference, "psnr", signed=True)])
+        rows.append([reading.question, reading.answer, *cells, format_score(difference, "psnr", signed=True)])
     heads = [SCORES[name].title for name in scores]
     return Sheet("Readings", ["question", "reading", *heads, "to the default, dB"], rows)

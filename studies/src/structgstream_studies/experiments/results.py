@@ -111,19 +111,19 @@ def write_result(path: Path, result: Result) -> None:
     partial = path.with_suffix(".partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(json.dumps(rounded(vars(result)), allow_nan=False, separators=(",", ":")) + "\n")
+        partial.write_text(json.dumps(round_floats(vars(result)), allow_nan=False, separators=(",", ":")) + "\n")
         partial.replace(path)
     except OSError as error:
         raise StorageError(f"The result {path} cannot be written ({error.strerror}).") from None
 
 
-def rounded(value: Any) -> Any:
+def round_floats(value: Any) -> Any:
     """Floats rounded to six significant digits, more than measurements have, to keep files small."""
     if isinstance(value, float):
         return float(f"{value:.6g}")
     if isinstance(value, Mapping):
-        return {key: rounded(item) for key, item in value.items()}
-    return [rounded(item) for item in value] if isinstance(value, list | tuple) else value
+        return {key: round_floats(item) for key, item in value.items()}
+    return [round_floats(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def read_result(path: Path) -> Result | None:

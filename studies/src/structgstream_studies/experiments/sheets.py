@@ -110,8 +110,8 @@ def comparison_sheet(results: Iterable[Result], *, titles: Mapping[str, str], sc
     keys = [key for key in titles if key in found]
     rows = []
     for key in keys:
-        thinned = any(result.identity["capture"]["every"] > 1 for result in found[key].results.values())
-        cells = ["-" if thinned and name in TEMPORAL else _cell(found[key], name) for name in shown]
+        every_nth_frame = any(result.identity["capture"]["every"] > 1 for result in found[key].results.values())
+        cells = ["-" if every_nth_frame and name in TEMPORAL else _cell(found[key], name) for name in shown]
         rows.append([titles[key], str(len(found[key].results)), *cells])
     return Sheet("Methods", ["method", "seeds", *(SCORES[name].title for name in shown)], rows)
 
@@ -132,7 +132,7 @@ def _line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
-def written(value: Spread | None, name: str, *, signed: bool = False) -> str:
+def format_score(value: Spread | None, name: str, *, signed: bool = False) -> str:
     """A score as text: mean, and the deviation over seeds where there are several."""
     if value is None:
         return "-"
@@ -143,13 +143,13 @@ def written(value: Spread | None, name: str, *, signed: bool = False) -> str:
 
 
 def _cell(summary: Summary | None, name: str) -> str:
-    return "-" if summary is None else written(summary.score(name), name)
+    return "-" if summary is None else format_score(summary.score(name), name)
 
 
 def _difference(summary: Summary | None, full: Summary | None, key: str) -> str:
     if summary is None or full is None or key == FULL:
         return "-"
-    return written(summary.difference(full, "psnr"), "psnr", signed=True)
+    return format_score(summary.difference(full, "psnr"), "psnr", signed=True)
 
 
 def _verdict(summary: Summary | None, full: Summary | None, gap: float | None, key: str) -> str:

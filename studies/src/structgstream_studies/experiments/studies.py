@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from structgstream.errors import ConfigError
-from structgstream.presets import PAPER_DATA, PAPER_MODE, PRESETS, StreamConfig
+from structgstream.presets import PAPER_DATA, PAPER_METHOD_PRESET, PRESETS, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.effects import EFFECTS_TABLE, effects, effects_sheet
 from structgstream_studies.experiments.figures import Picture, write_comparison, write_curves, write_details
@@ -15,8 +15,8 @@ from structgstream_studies.experiments.peer_runs import PEER_TITLES, PeerRun
 from structgstream_studies.experiments.rate_distortion import (
     QUALITIES,
     RATES_TABLE,
+    bullet_list,
     curve_titles,
-    listed,
     qualities,
     quality_key,
     rates_sheet,
@@ -27,7 +27,7 @@ from structgstream_studies.experiments.readings import READINGS, readings_sheet
 from structgstream_studies.experiments.results import Result, read_result, read_results
 from structgstream_studies.experiments.sheets import Sheet, ablation_sheet, comparison_sheet, markdown
 from structgstream_studies.experiments.sweep import unique
-from structgstream_studies.experiments.tasks import Variation
+from structgstream_studies.experiments.tasks import VariantRun
 from structgstream_studies.experiments.variants import FULL, TABLES, variants
 from structgstream_studies.experiments.worker import Task
 
@@ -54,8 +54,8 @@ def ablation_runs(
     frames: int,
     seeds: Sequence[int],
     folder: Path,
-    paper: StreamConfig = PRESETS[PAPER_MODE],
-) -> list[Variation]:
+    paper: StreamConfig = PRESETS[PAPER_METHOD_PRESET],
+) -> list[VariantRun]:
     """Every variant of the tables with every seed, seed by seed.
 
     Args:
@@ -78,7 +78,7 @@ def ablation_runs(
     for seed in seeds:
         configs = _configs(tables, replace(full, seed=seed), replace(paper, seed=seed))
         keys = dict.fromkeys(key for name in tables for key in rows_of(name))
-        runs += [Variation(key, capture, configs[key], folder, frames) for key in keys]
+        runs += [VariantRun(key, capture, configs[key], folder, frames) for key in keys]
     return runs
 
 
@@ -109,7 +109,7 @@ def comparison_runs(
     alone_every: int,
     seeds: Sequence[int],
     folder: Path,
-) -> list[Variation | PeerRun]:
+) -> list[VariantRun | PeerRun]:
     """Every method with every seed.
 
     Args:
@@ -124,15 +124,15 @@ def comparison_runs(
         ConfigError: there is no such method.
     """
     known = method_titles()
-    runs: list[Variation | PeerRun] = []
+    runs: list[VariantRun | PeerRun] = []
     for seed in seeds:
         for name in methods:
             if name not in known:
                 raise ConfigError(f"There is no method {name!r}; there are {', '.join(known)}.")
             if name in PRESETS or name == "held":
-                config = replace(PRESETS[PAPER_MODE if name == "held" else name], seed=seed)
+                config = replace(PRESETS[PAPER_METHOD_PRESET if name == "held" else name], seed=seed)
                 variant = variants(config)["held" if name == "held" else FULL]
-                runs.append(Variation(method_key(name), capture, variant.config, folder, frames))
+                runs.append(VariantRun(method_key(name), capture, variant.config, folder, frames))
             else:
                 part = replace(capture, every=alone_every) if fits_frames_alone(name) else capture
                 runs.append(PeerRun(name, part, seed, folder, -(-frames // part.every)))
@@ -141,7 +141,7 @@ def comparison_runs(
 
 def method_key(name: str) -> str:
     """The key of a method's results: paper mode is the full method of the ablations."""
-    return FULL if name == PAPER_MODE else name
+    return FULL if name == PAPER_METHOD_PRESET else name
 
 
 def method_titles() -> dict[str, str]:
@@ -158,17 +158,17 @@ def fits_frames_alone(name: str) -> bool:
     return name in METHODS and METHODS[name].stands_alone
 
 
-def needed(runs: Iterable[Variation | PeerRun]) -> list[Task]:
+def with_dependencies(runs: Iterable[VariantRun | PeerRun]) -> list[Task]:
     """The runs with what comes before them, each once, in an order in which they can be done."""
     tasks: list[Task] = []
     for run in runs:
-        if isinstance(run, Variation) and run.needs:
+        if isinstance(run, VariantRun) and run.needs:
             tasks.append(run.first)
         tasks.append(run)
     return unique(tasks)
 
 
-def results_of(runs: Iterable[Variation | PeerRun]) -> list[Result]:
+def results_of(runs: Iterable[VariantRun | PeerRun]) -> list[Result]:
     """The results that are there.
 
     Raises:
@@ -177,7 +177,7 @@ def results_of(runs: Iterable[Variation | PeerRun]) -> list[Result]:
     return [found for run in runs if (found := read_result(run.result)) is not None]
 
 
-def write_ablation(folder: Path, table: str, runs: Sequence[Variation], *, backend: "Backend") -> list[Sheet]:
+def write_ablation(folder: Path, table: str, runs: Sequence[VariantRun], *, backend: "Backend") -> list[Sheet]:
     """The tables of one ablation, and in ``folder`` ``TABLE.md``, ``TABLE-curves.png`` and ``TABLE-detail.png``.
 
     Of the rates there is ``rates.png`` too, beside whatever else the folder has results of.
@@ -216,7 +216,7 @@ def _ablation_sheet(table: str, results: Sequence[Result]) -> Sheet:
     return ablation_sheet(TABLES[table], results, titles=variant_titles())
 
 
-def write_methods(folder: Path, runs: Sequence[Variation | PeerRun], *, backend: "Backend") -> Sheet:
+def write_methods(folder: Path, runs: Sequence[VariantRun | PeerRun], *, backend: "Backend") -> Sheet:
     """The comparison, and in ``folder`` ``methods.md``, ``methods.png`` and ``methods-detail.png``."""
     titles = {method_key(name): title for name, title in method_titles().items()}
     results = results_of(runs)
@@ -230,25 +230,25 @@ def write_methods(folder: Path, runs: Sequence[Variation | PeerRun], *, backend:
 
 def variant_titles() -> dict[str, str]:
     """Every variant's name in tables."""
-    return {key: variant.title for key, variant in variants(PRESETS[PAPER_MODE]).items()}
+    return {key: variant.title for key, variant in variants(PRESETS[PAPER_METHOD_PRESET]).items()}
 
 
 def effect_titles() -> dict[str, str]:
     """The rows of the table of effects, in its order."""
-    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_MODE])
+    found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_METHOD_PRESET])
     return {key: variant.title for key, variant in found.items()}
 
 
 def _write_sheets(path: Path, sheets: Sequence[Sheet], remarks: Sequence[str] = ()) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(f"# {sheet.title}\n\n{markdown(sheet)}" for sheet in sheets) + listed(remarks))
+    path.write_text("\n".join(f"# {sheet.title}\n\n{markdown(sheet)}" for sheet in sheets) + bullet_list(remarks))
 
 
 def _write_details(
-    path: Path, runs: Sequence[Variation | PeerRun], *, titles: Mapping[str, str], backend: "Backend"
+    path: Path, runs: Sequence[VariantRun | PeerRun], *, titles: Mapping[str, str], backend: "Backend"
 ) -> None:
     """Each run's picture, at the first held-out camera, of the frame in which the runs of one seed differ most."""
-    from structgstream.data.wrappers import of_cameras
+    from structgstream.data.wrappers import select_cameras
     from structgstream.evaluation.evaluate import rendered
 
     results = {run: found for run in runs if (found := read_result(run.result)) is not None}
@@ -264,7 +264,7 @@ def _write_details(
         return max(values) - min(values)
 
     index = max(range(0, len(source), every), key=spread)
-    truth = next(of_cameras(source, (camera,)).frames(index)).images[camera]
+    truth = next(select_cameras(source, (camera,)).frames(index)).images[camera]
     pictures: dict[str, Picture] = {}
     for run in results:
         recording = run.recording()

@@ -12,7 +12,7 @@ from pathlib import Path
 from structgstream.errors import ConfigError
 from structgstream.evaluation.environment import usable_cores
 from structgstream.kernels.backend import BackendName
-from structgstream_studies.experiments.worker import Seat, Task, work
+from structgstream_studies.experiments.worker import Task, WorkerSlot, work
 
 POLL_SECONDS = 0.5
 ENDING_SECONDS = 10.0
@@ -40,7 +40,7 @@ class Outcome:
     skipped: tuple[str, ...]
 
 
-def seats_for(device: BackendName, *, jobs: int | None) -> list[Seat]:
+def worker_slots(device: BackendName, *, jobs: int | None) -> list[WorkerSlot]:
     """Places to compute at: one for each GPU, or ``jobs`` shares of the cores (default: one core each).
 
     Raises:
@@ -53,7 +53,7 @@ def seats_for(device: BackendName, *, jobs: int | None) -> list[Seat]:
     gpus = torch.cuda.device_count() if device in ("auto", "cuda") else 0
     count = jobs or gpus or usable_cores()
     threads = max(1, usable_cores() // count)
-    return [Seat(device, threads, number % gpus if gpus else None) for number in range(count)]
+    return [WorkerSlot(device, threads, number % gpus if gpus else None) for number in range(count)]
 
 
 def unique(tasks: Iterable[Task]) -> list[Task]:
@@ -61,7 +61,9 @@ def unique(tasks: Iterable[Task]) -> list[Task]:
     return list({task.name: task for task in tasks}.values())
 
 
-def sweep(tasks: Sequence[Task], seats: Sequence[Seat], *, logs: Path, listener: Listener | None = None) -> Outcome:
+def sweep(
+    tasks: Sequence[Task], seats: Sequence[WorkerSlot], *, logs: Path, listener: Listener | None = None
+) -> Outcome:
     """Does every task that is not done, each in its own process, as soon as those that it needs are done.
 
     Args:
@@ -76,7 +78,7 @@ def sweep(tasks: Sequence[Task], seats: Sequence[Seat], *, logs: Path, listener:
     skipped = {task.name for task in tasks if task.done()}
     waiting = {task.name: task for task in tasks if task.name not in skipped}
     finished, failed = set(skipped), list[str]()
-    free, running = list(seats), dict[str, tuple[BaseProcess, Seat, Task]]()
+    free, running = list(seats), dict[str, tuple[BaseProcess, WorkerSlot, Task]]()
     context = get_context("spawn")  # torch's threads do not survive a fork
     try:
         while True:

@@ -15,7 +15,7 @@ from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.online import OnlineConfig
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.captures import CapturePart, capture_facts
-from structgstream_studies.experiments.results import Result, read_result, result_of, rounded, write_result
+from structgstream_studies.experiments.results import Result, read_result, result_of, round_floats, write_result
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FirstFrame:
+class FirstFrameRun:
     """Fits frame 0 once for all the variants that begin with it."""
 
     capture: CapturePart
@@ -101,7 +101,7 @@ class FirstFrame:
 
 
 @dataclass(frozen=True)
-class Variation:
+class VariantRun:
     """Reconstructs and scores one variant of the method with one seed."""
 
     key: str
@@ -121,14 +121,14 @@ class Variation:
         return self.config.seed
 
     @property
-    def first(self) -> FirstFrame:
+    def first(self) -> FirstFrameRun:
         """Its frame 0, which other variants may share."""
-        return FirstFrame(self.capture, self.config, self.folder)
+        return FirstFrameRun(self.capture, self.config, self.folder)
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the tasks that it needs: frame 0, unless the stream has it already."""
-        return () if self._begun() else (self.first.name,)
+        return () if self._has_started() else (self.first.name,)
 
     @property
     def stream(self) -> Path:
@@ -142,20 +142,23 @@ class Variation:
 
     def done(self) -> bool:
         """Whether there is a result with the same identity."""
-        return answers(self.result, self._asked(), self.capture, frames=self.frames)
+        return is_result_of(self.result, self._identity(), self.capture, frames=self.frames)
 
-    def _begun(self) -> bool:
+    def _has_started(self) -> bool:
         from structgstream.evaluation.run_log import read_log
 
         return self.stream.exists() and 0 in read_log(self.stream)
 
-    def _asked(self) -> dict[str, Any]:
+    def _identity(self) -> dict[str, Any]:
         return {"key": self.key, "method": "struct-gstream", "seed": self.config.seed, "config": to_json(self.config)}
 
     def run(self, backend: "Backend") -> None:
         """Reconstructs the missing frames of the stream, then scores the file."""
         _reconstruct(self.capture, self.config, self.stream, backend, first=self.first)
-        write_result(self.result, scored(self.recording(), self.stream, self.capture, backend, asked=self._asked()))
+        write_result(
+            self.result,
+            score_recording(self.recording(), self.stream, self.capture, backend, run_identity=self._identity()),
+        )
 
     def recording(self) -> "Recording":
         """The stream, opened."""
@@ -164,7 +167,7 @@ class Variation:
         return open_stream(self.stream)
 
 
-def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart, *, frames: int) -> bool:
+def is_result_of(result: Path, run_identity: Mapping[str, Any], capture: CapturePart, *, frames: int) -> bool:
     """Whether a result is there and is the answer to this very question, on these ``frames`` of the capture."""
     found = read_result(result)
     if found is None:
@@ -172,14 +175,14 @@ def answers(result: Path, asked: Mapping[str, Any], capture: CapturePart, *, fra
     identity = dict(found.identity)
     of = identity.pop("capture")
     part = (of["start"], of["scale"], of["every"], of.get("near"), of["frames"])
-    same_part = part == (capture.start, rounded(capture.scale), capture.every, rounded(capture.near), frames)
+    same_part = part == (capture.start, round_floats(capture.scale), capture.every, round_floats(capture.near), frames)
     same_split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
     same_cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
-    return identity == rounded(asked) and same_part and same_split and same_cameras
+    return identity == round_floats(run_identity) and same_part and same_split and same_cameras
 
 
-def scored(
-    recording: "Recording", stream: Path, capture: CapturePart, backend: "Backend", *, asked: Mapping[str, Any]
+def score_recording(
+    recording: "Recording", stream: Path, capture: CapturePart, backend: "Backend", *, run_identity: Mapping[str, Any]
 ) -> Result:
     """The scores of a finished file, with what was asked and who trained it."""
     from structgstream.evaluation.evaluate import evaluate
@@ -187,12 +190,12 @@ def scored(
 
     source, log = capture.open(), read_log(stream)
     report = evaluate(recording, source, backend=backend, cameras=capture.scored, log=log)
-    identity = {**asked, "capture": capture_facts(capture, source)}
+    identity = {**run_identity, "capture": capture_facts(capture, source)}
     return result_of(report, identity=identity, trained_by=log.get(0, {}).get("trained_by", {}))
 
 
 def _reconstruct(
-    capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrame | None
+    capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrameRun | None
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
     from structgstream.evaluation.environment import environment

@@ -43,7 +43,7 @@ class Task(Protocol):
 
 
 @dataclass(frozen=True)
-class Seat:
+class WorkerSlot:
     """Where a task computes: a back-end, a number of threads, and which GPU where there is one."""
 
     device: BackendName
@@ -54,7 +54,7 @@ class Seat:
 FAILED = 1
 
 
-def work(task: Task, seat: Seat, log: Path) -> None:
+def work(task: Task, seat: WorkerSlot, log: Path) -> None:
     """Runs a task; what it prints goes to ``log``. Ends the process with status 1 when the task fails."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:

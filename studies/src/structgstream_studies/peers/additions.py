@@ -71,7 +71,7 @@ def spawned_at(parents: PlainGaussians, config: AdditionsConfig, generator: torc
 
 
 @dataclass
-class _Added(Hooks[View, ViewLoss]):
+class _AdditionsHooks(Hooks[View, ViewLoss]):
     """Iterations of the second stage: draws the additions with the other Gaussians, and prunes transparent ones."""
 
     config: AdditionsConfig
@@ -154,7 +154,7 @@ def fit_additions(
         "sh": config.sh,
     }
     last_pass = LastPass(config.iterations - views)
-    hooks = _Added(config, adam, base, color, extent, watch, last_pass)
+    hooks = _AdditionsHooks(config, adam, base, color, extent, watch, last_pass)
     schedule = Schedule(config.iterations, lambda _: rates, before=before)
     optimize(adam, order, schedule, hooks, watch=watch, on_step=on_step)
     return Additions(hooks.added.detached(), last_pass.psnr)

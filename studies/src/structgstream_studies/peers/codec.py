@@ -8,14 +8,14 @@ from typing import Generic
 
 import torch
 
-from structgstream.codec.container.records import PREFIX, record_at
-from structgstream.codec.container.stored import StoredFile
+from structgstream.codec.container.byte_source import FileBytes
+from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.pipeline import FrameTask, Memory, Pipeline, State, StreamFacts
 from structgstream.presets import RIG, to_json
 from structgstream.scene.state import STATE_TABLE
-from structgstream_studies.peers.container import PeerReader, PeerSink, arrays_of, check_prefix, packet_of
+from structgstream_studies.peers.container import PeerReader, PeerSink, arrays_of, check_prefix, parse_packet
 from structgstream_studies.peers.method import PeerMethod
 
 
@@ -34,10 +34,10 @@ class PeerCoder(Generic[State]):
 
     def encode(self, state: State, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[State]:
         """The packet of a frame, and its reconstruction."""
-        packet = packet_of(self._arrays(state), index=index, pts_seconds=pts_seconds, kind=kind)
-        return Encoded(packet, self.follow(packet))
+        packet = parse_packet(self._arrays(state), index=index, pts_seconds=pts_seconds, kind=kind)
+        return Encoded(packet, self.replay(packet))
 
-    def follow(self, packet: Packet) -> State:
+    def replay(self, packet: Packet) -> State:
         """Decode a packet, and continue after it."""
         previous = None if packet.kind is PacketKind.KEY else self._state
         arrays = arrays_of(packet, where=f"Frame {packet.index}")
@@ -70,11 +70,11 @@ class PeerCodec(Generic[State, Memory]):
         return PeerSink(path, frames=frames, resumed=reader), reader
 
     def _existing(self, path: Path) -> PeerReader[State] | None:
-        data = StoredFile(path)
+        data = FileBytes(path)
         if len(data) < PREFIX.size:
             return None
         check_prefix(data, str(path))
-        if record_at(data, PREFIX.size) is None:
+        if read_record(data, PREFIX.size) is None:
             return None
         reader = PeerReader(data, lambda _: self.method, name=str(path))
         return reader if len(reader) else None

@@ -22,10 +22,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.codec.container.records import PREFIX, RecordType, packed, record_at, scanned, why_stopped
-from structgstream.codec.container.stored import Stored, StoredFile
+from structgstream.codec.container.byte_source import ByteSource, FileBytes
+from structgstream.codec.container.records import (
+    PREFIX,
+    RecordType,
+    incomplete_reason,
+    packed,
+    read_record,
+    scan_records,
+)
 from structgstream.codec.decoder import FRAME
-from structgstream.codec.header import packed_header, unpacked_header
+from structgstream.codec.header import pack_header, unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import PacketInfo
 from structgstream.errors import StorageError, StreamError
@@ -95,7 +102,7 @@ def unpacked_arrays(payload: bytes, start: int, *, where: str) -> tuple[Arrays, 
 def is_peer_file(path: Path | str) -> bool:
     """Whether the file begins as a peer's does."""
     with suppress(StreamError):
-        return StoredFile(path)[: len(MAGIC)] == MAGIC
+        return FileBytes(path)[: len(MAGIC)] == MAGIC
     return False
 
 
@@ -121,21 +128,21 @@ class PeerReader(Generic[State]):
     """
 
     def __init__(
-        self, data: Stored, method: Callable[[StreamHeader], PeerMethod[State, Any]], *, name: str = "The file"
+        self, data: ByteSource, method: Callable[[StreamHeader], PeerMethod[State, Any]], *, name: str = "The file"
     ) -> None:
         self._data, self._name = data, name
         check_prefix(data, name)
-        init = record_at(data, PREFIX.size)
+        init = read_record(data, PREFIX.size)
         if init is None or init.type != RecordType.INIT:
-            raise StreamError(f"Nothing of {name} can be shown: {why_stopped(data, PREFIX.size)}.")
-        self.header = unpacked_header(init.payload)
+            raise StreamError(f"Nothing of {name} can be shown: {incomplete_reason(data, PREFIX.size)}.")
+        self.header = unpack_header(init.payload)
         self.method = method(self.header)
         self.header_bytes = self.end = init.end
         self.total_bytes = len(data)
         self.complete = False
         self.packets: list[PacketInfo] = []
         end = init.end
-        for record in scanned(data, init.end):
+        for record in scan_records(data, init.end):
             end = record.end
             if record.type == RecordType.INDEX:
                 self.complete = True
@@ -143,7 +150,7 @@ class PeerReader(Generic[State]):
             if record.type in _KINDS:
                 self.packets.append(self._info(record.payload, record.type, record.offset, record.end))
                 self.end = record.end
-        self.cut_reason = None if self.complete else why_stopped(data, end)
+        self.cut_reason = None if self.complete else incomplete_reason(data, end)
 
     def _info(self, payload: bytes, kind: int, offset: int, end: int) -> PacketInfo:
         index = len(self.packets)
@@ -170,7 +177,7 @@ class PeerReader(Generic[State]):
             StreamError: it was damaged after the file was opened.
         """
         info = self.packets[index]
-        record = record_at(self._data, info.offset)
+        record = read_record(self._data, info.offset)
         if record is None:
             raise StreamError(f"Frame {index} of {self._name} is damaged.")
         return Packet(info.kind, index, info.pts_seconds, record.payload, info.field_bytes)
@@ -205,7 +212,7 @@ class PeerReader(Generic[State]):
                 yield info, state
 
 
-def packet_of(arrays: Arrays, *, index: int, pts_seconds: float, kind: PacketKind) -> Packet:
+def parse_packet(arrays: Arrays, *, index: int, pts_seconds: float, kind: PacketKind) -> Packet:
     """One frame's arrays as a packet.
 
     Raises:
@@ -252,7 +259,7 @@ class PeerSink:
                 f"Cannot open {self._path} for writing ({error.strerror}); choose another place."
             ) from error
         if self._resumed is None:
-            return self._append(PREFIX.pack(MAGIC, MAJOR, MINOR) + packed(RecordType.INIT, packed_header(header)))
+            return self._append(PREFIX.pack(MAGIC, MAJOR, MINOR) + packed(RecordType.INIT, pack_header(header)))
         self._count, self._end = len(self._resumed), self._resumed.end
         self._file.truncate(self._end)
         return 0
@@ -295,7 +302,7 @@ class PeerSink:
         return len(data)
 
 
-def check_prefix(data: Stored, name: str) -> None:
+def check_prefix(data: ByteSource, name: str) -> None:
     """Check that ``data`` is a peer's file of this major version.
 
     Raises:

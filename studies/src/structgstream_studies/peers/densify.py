@@ -35,7 +35,7 @@ class DensifyConfig:
     max_gaussians: int = 120_000
     """Largest number of Gaussians; candidates with the largest gradients are densified first (3DGS: no bound)."""
 
-    def due(self, iteration: int) -> bool:
+    def is_due(self, iteration: int) -> bool:
         """Whether the set changes after this iteration."""
         return self.start < iteration <= self.stop and iteration % self.interval == 0
 
@@ -45,7 +45,7 @@ class DensifyConfig:
 
 
 @dataclass(frozen=True)
-class Change:
+class Densification:
     """Rows to keep ``[N]``, Gaussians to append, and how many were removed for good."""
 
     keep: Tensor
@@ -79,7 +79,7 @@ def candidates(gradient: Tensor, *, threshold: float, room: int) -> Tensor:
     return chosen
 
 
-def densified(
+def densify(
     gaussians: PlainGaussians,
     gradient: Tensor,
     *,
@@ -87,20 +87,23 @@ def densified(
     extent: float,
     prune_large: bool,
     generator: torch.Generator,
-) -> Change:
+) -> Densification:
     """One round of density control from the mean view-space gradients ``[N]``."""
     largest = gaussians.log_scales.exp().amax(1)
     chosen = candidates(gradient, threshold=config.gradient, room=config.max_gaussians - len(gaussians))
     large = largest > config.percent_dense * extent
     halves = split(gaussians.select(chosen & large), generator)
     added = gaussians.select(chosen & ~large).joined(halves)
-    stays, new = survives(gaussians, config, extent, prune_large), survives(added, config, extent, prune_large)
+    stays, new = (
+        survivor_mask(gaussians, config, extent, prune_large),
+        survivor_mask(added, config, extent, prune_large),
+    )
     parents = chosen & large
     removed = int((~stays & ~parents).sum()) + int((~new).sum())
-    return Change(keep=stays & ~parents, added=added.select(new), removed=removed)
+    return Densification(keep=stays & ~parents, added=added.select(new), removed=removed)
 
 
-def survives(gaussians: PlainGaussians, config: DensifyConfig, extent: float, prune_large: bool) -> Tensor:
+def survivor_mask(gaussians: PlainGaussians, config: DensifyConfig, extent: float, prune_large: bool) -> Tensor:
     """Rows that are opaque enough and, with ``prune_large``, not too large: a mask ``[N]``."""
     keep = gaussians.logit_opacities.sigmoid() >= config.min_opacity
     if prune_large:

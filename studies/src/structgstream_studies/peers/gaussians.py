@@ -15,15 +15,15 @@ from structgstream.scene.state import fields_of, parameters_of
 from structgstream.training.initial import rig_extent
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
-from structgstream.training.optim import Adam, Rate, constant, leaves
+from structgstream.training.optim import Adam, LearningRate, constant, leaves
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.result import FitResult, StepListener
-from structgstream.training.seeding import neighbour_distances, voxel_centers
+from structgstream.training.seeding import neighbor_distances, voxel_centers
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.step import ViewLoss, picture_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
-from structgstream_studies.peers.densify import DensifyConfig, densified, reset_opacities
+from structgstream_studies.peers.densify import DensifyConfig, densify, reset_opacities
 from structgstream_studies.peers.plain import Y0, PlainGaussians
 
 CAMERA = parameters_of(fields_of("camera"))
@@ -35,14 +35,14 @@ LOSSES = LossWeights(l1=0.8, ssim=0.2)
 class GaussiansRates:
     """Learning rates of 3DGS, scheduled over the iterations of the fit."""
 
-    means: Rate = Rate(1.6e-4, 1.6e-6)
+    means: LearningRate = LearningRate(1.6e-4, 1.6e-6)
     """Times 1.1 rig radii."""
-    log_scales: Rate = constant(5e-3)
-    quats: Rate = constant(1e-3)
-    logit_opacities: Rate = constant(5e-2)
-    base_colors: Rate = constant(2.5e-3)
-    sh: Rate = constant(2.5e-3 / 20)
-    camera_color: Rate = Rate(2e-3, 1e-4)
+    log_scales: LearningRate = constant(5e-3)
+    quats: LearningRate = constant(1e-3)
+    logit_opacities: LearningRate = constant(5e-2)
+    base_colors: LearningRate = constant(2.5e-3)
+    sh: LearningRate = constant(2.5e-3 / 20)
+    camera_color: LearningRate = LearningRate(2e-3, 1e-4)
     """As this project's frame 0; unused when ``camera_color`` is off."""
 
 
@@ -111,7 +111,7 @@ def initial_gaussians(points: Tensor, views: list[View], config: GaussiansConfig
             f"Only {count} initial points remain at a voxel size of {config.voxel_size:g}; at least 4 are needed. "
             "Check the poses, or give a capture with more overlap between cameras."
         )
-    log_scales = neighbour_distances(points).log()[:, None].expand(count, 3).contiguous()
+    log_scales = neighbor_distances(points).log()[:, None].expand(count, 3).contiguous()
     means = points.to(device)
     quats = means.new_zeros(count, 4)
     quats[:, 0] = 1.0
@@ -177,7 +177,7 @@ def fit_gaussians(
         )
     adam = Adam(backend, leaves(start.tensors() | camera))
     statistics, last_pass = GradientStatistics(len(start), backend.device), LastPass(config.iterations - len(views))
-    hooks = _FromScratch(config, adam, identity, statistics, extent, generator, watch, last_pass)
+    hooks = _FromScratchHooks(config, adam, identity, statistics, extent, generator, watch, last_pass)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
     iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     gaussians, color = hooks.parts()
@@ -193,7 +193,7 @@ def fit_gaussians(
 
 
 @dataclass
-class _FromScratch(Hooks[View, ViewLoss]):
+class _FromScratchHooks(Hooks[View, ViewLoss]):
     """What 3DGS does in an iteration; ``identity`` is the colour correction where none is learned."""
 
     config: GaussiansConfig
@@ -233,14 +233,14 @@ class _FromScratch(Hooks[View, ViewLoss]):
         config = self.config.densify
         with self.watch.stage("densify"), torch.no_grad():
             self.statistics.add(loss.rendering, screen_gradient)
-            if config.due(iteration):
+            if config.is_due(iteration):
                 self._densify(prune_large=config.has_reset(iteration))
             if iteration == config.reset_at:
                 logits = reset_opacities(self.adam.values["logit_opacities"])
                 self.adam.replace_values("logit_opacities", logits)
 
     def _densify(self, *, prune_large: bool) -> None:
-        change = densified(
+        change = densify(
             self.parts()[0],
             self.statistics.mean(),
             config=self.config.densify,

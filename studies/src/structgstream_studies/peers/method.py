@@ -53,7 +53,7 @@ class PeerMethod(Method[State, Memory], Protocol[State, Memory]):
         ...
 
 
-class LooksAtPicturesOnly:
+class PicturesOnly:
     """Base of peers: they need only the training views, and only one previous frame."""
 
     needs_before = False
@@ -66,7 +66,7 @@ class LooksAtPicturesOnly:
         return FramePictures(training_views(frame, rig, backend.device), None)
 
 
-class EveryFrameAlone(LooksAtPicturesOnly, ABC, Generic[State]):
+class IndependentFrames(PicturesOnly, ABC, Generic[State]):
     """A method that fits every frame from scratch."""
 
     stands_alone = True

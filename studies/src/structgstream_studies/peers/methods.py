@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from structgstream.codec.container.stored import StoredFile
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.packets import StreamHeader
 from structgstream.errors import StreamError
 from structgstream.presets import TINY
@@ -92,4 +92,4 @@ def open_peer(path: Path | str) -> PeerReader[Any]:
     Raises:
         StreamError: there is no such file, or it is not a peer's.
     """
-    return PeerReader(StoredFile(path), decoder_of, name=str(path))
+    return PeerReader(FileBytes(path), decoder_of, name=str(path))

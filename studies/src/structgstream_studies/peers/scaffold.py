@@ -18,14 +18,14 @@ from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_o
 from structgstream.training.initial import InitialConfig, fit_first_frame
 from structgstream.training.losses import LossWeights
 from structgstream.training.result import FitResult
-from structgstream_studies.peers.method import Arrays, EveryFrameAlone, stored
+from structgstream_studies.peers.method import Arrays, IndependentFrames, stored
 
 SCAFFOLD = replace(RIG.initial, distance_input=False, losses=LossWeights(l1=0.8, ssim=0.2, volume=0.01))
 """The preset ``rig`` with Scaffold-GS's inputs and loss: no distance, no term that keeps offsets short."""
 
 
 @dataclass(frozen=True)
-class ScaffoldGS(EveryFrameAlone[Scene]):
+class ScaffoldGS(IndependentFrames[Scene]):
     """The method behind the loop. No frame knows of another, and nothing is remembered."""
 
     config: InitialConfig = field(default_factory=lambda: SCAFFOLD)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from structgstream.pipeline import FrameTask
 from structgstream.training.result import FitResult
 from structgstream_studies.peers.gaussians import GaussiansConfig, fit_gaussians
-from structgstream_studies.peers.method import Arrays, EveryFrameAlone
+from structgstream_studies.peers.method import Arrays, IndependentFrames
 from structgstream_studies.peers.plain import PlainGaussians
 from structgstream_studies.peers.plain_arrays import gaussians_of, with_prefix
 
 
 @dataclass(frozen=True)
-class ThreeDGS(EveryFrameAlone[PlainGaussians]):
+class ThreeDGS(IndependentFrames[PlainGaussians]):
     """The method behind the loop. No frame knows of another, and nothing is remembered."""
 
     config: GaussiansConfig = field(default_factory=GaussiansConfig)

@@ -35,10 +35,10 @@ from structgstream.training.views import View, shuffled_views
 from structgstream_studies.peers.additions import AdditionsConfig, fit_additions, spawned_at
 from structgstream_studies.peers.gaussians import LOSSES, GaussiansConfig, fit_gaussians
 from structgstream_studies.peers.hash_grid import Cache, GridConfig, GridQuery, transformation
-from structgstream_studies.peers.method import Arrays, LooksAtPicturesOnly, stored
+from structgstream_studies.peers.method import Arrays, PicturesOnly, stored
 from structgstream_studies.peers.plain import PlainGaussians, moved
 from structgstream_studies.peers.plain_arrays import color_of, gaussians_of, tensor_of, with_prefix
-from structgstream_studies.peers.warm_up import WarmUpConfig, warmed_up
+from structgstream_studies.peers.warm_up import WarmUpConfig, warm_up
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def in_box(means: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
     return rows, positions[rows]
 
 
-def transformed(base: PlainGaussians, rows: Tensor, outputs: Tensor, shift_scale: float) -> PlainGaussians:
+def apply_transformation(base: PlainGaussians, rows: Tensor, outputs: Tensor, shift_scale: float) -> PlainGaussians:
     """``base`` with ``rows`` moved as the network's ``outputs`` ``[n, 8]`` say."""
     shifts = base.means.new_zeros(base.means.shape).index_copy(0, rows, outputs[:, :3] * shift_scale)
     stays = torch.zeros_like(base.quats)
@@ -116,7 +116,7 @@ def transformed(base: PlainGaussians, rows: Tensor, outputs: Tensor, shift_scale
 
 
 @dataclass
-class _Transformed(Hooks[View, ViewLoss]):
+class _TransformationHooks(Hooks[View, ViewLoss]):
     """What the first stage does in an iteration: move ``rows`` of the base by the cache, as ``query`` asks it."""
 
     config: ThreeDGStreamConfig
@@ -132,7 +132,7 @@ class _Transformed(Hooks[View, ViewLoss]):
         config, state, backend, watch = self.config, self.state, self.adam.backend, self.watch
         with watch.stage("transform"):
             outputs = transformation(Cache.of(self.adam.values), self.query, config.grid)
-            gaussians = transformed(state.base, self.rows, outputs, config.shift_scale)
+            gaussians = apply_transformation(state.base, self.rows, outputs, config.shift_scale)
         with watch.stage("generate"):
             drawn = gaussians.gaussians(sample.camera, backend)
         collects = iteration > config.collect_from
@@ -156,7 +156,7 @@ class _Transformed(Hooks[View, ViewLoss]):
 
 
 @dataclass(frozen=True)
-class ThreeDGStream(LooksAtPicturesOnly):
+class ThreeDGStream(PicturesOnly):
     """The method behind the loop; its memory is the warmed-up cache."""
 
     config: ThreeDGStreamConfig = field(default_factory=ThreeDGStreamConfig)
@@ -182,7 +182,7 @@ class ThreeDGStream(LooksAtPicturesOnly):
         """The cache that every frame starts from."""
         first, config = task(), self.config
         _, positions = in_box(state.base.means, state.box)
-        return warmed_up(positions, config=config.warm_up, grid=config.grid, backend=first.backend, seed=first.seed)[0]
+        return warm_up(positions, config=config.warm_up, grid=config.grid, backend=first.backend, seed=first.seed)[0]
 
     def next(self, past: Past[StreamedGaussians, Cache], task: FrameTask) -> FitResult[StreamedGaussians]:
         """Both stages of a later frame."""
@@ -195,7 +195,7 @@ class ThreeDGStream(LooksAtPicturesOnly):
             query = GridQuery.of(positions, config.grid)
         adam = Adam(backend, leaves(past.memory.tensors()), config.eps)
         last_pass = LastPass(config.iterations - len(views))
-        hooks = _Transformed(
+        hooks = _TransformationHooks(
             config, adam, state, rows, query, GradientStatistics(len(base), backend.device), watch, last_pass
         )
         rates = dict.fromkeys(adam.values, config.rate)
@@ -231,7 +231,7 @@ class ThreeDGStream(LooksAtPicturesOnly):
         assert state.cache is not None
         with torch.no_grad():
             outputs = transformation(state.cache.as_float(), query, self.config.grid)
-            return transformed(state.base, rows, outputs, self.config.shift_scale)
+            return apply_transformation(state.base, rows, outputs, self.config.shift_scale)
 
     def arrays(self, state: StreamedGaussians) -> Arrays:
         """Frame 0: Gaussians, camera colour and box. Later: the cache in float16 and the additions."""

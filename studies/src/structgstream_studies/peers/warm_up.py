@@ -40,7 +40,7 @@ def identity_loss(outputs: Tensor) -> Tensor:
     return shifts.abs().mean() + (1.0 - cosines.square().mean()) + (unused - 1.0).abs().mean()
 
 
-def warmed_up(
+def warm_up(
     positions: Tensor, *, config: WarmUpConfig, grid: GridConfig, backend: Backend, seed: int
 ) -> tuple[Cache, float]:
     """A cache that gives the identity in the unit cube, and its last loss.
@@ -59,7 +59,7 @@ def warmed_up(
         GridQuery.of(_batch(positions.cpu(), config, generator).to(device), grid)
         for _ in range(min(config.batches, config.iterations))
     ]
-    hooks = _Identity(adam, grid)
+    hooks = _WarmUpHooks(adam, grid)
     rates = dict.fromkeys(adam.values, config.rate)
     optimize(adam, cycle(pool), Schedule(config.iterations, lambda _: rates), hooks, watch=Stopwatch(device))
     value = math.nan if hooks.last is None else float(hooks.last.total.detach())
@@ -67,7 +67,7 @@ def warmed_up(
 
 
 @dataclass
-class _Identity(Hooks[GridQuery, Loss]):
+class _WarmUpHooks(Hooks[GridQuery, Loss]):
     """Batches of positions as samples; ``last`` is the last one's loss."""
 
     adam: Adam[str]

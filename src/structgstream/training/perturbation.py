@@ -14,7 +14,7 @@ from structgstream.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
-class DisturbanceConfig:
+class PerturbationConfig:
     """Dropout and perturbation while frame 0 is trained."""
 
     dropped_share: float = 0.0
@@ -29,7 +29,7 @@ class DisturbanceConfig:
     """Share of ``view_noise`` left at the last iteration, decreasing linearly; 1: constant."""
 
 
-class Disturbance:
+class Perturbation:
     """Perturbs the Gaussians of one iteration.
 
     Args:
@@ -38,7 +38,7 @@ class Disturbance:
         strength: factor on the amounts, 0 to 1.
     """
 
-    def __init__(self, config: DisturbanceConfig, generator: torch.Generator, *, strength: float) -> None:
+    def __init__(self, config: PerturbationConfig, generator: torch.Generator, *, strength: float) -> None:
         self._config = config
         self._generator = generator
         self._strength = strength
@@ -59,12 +59,12 @@ class Disturbance:
         return torch.rand(count, generator=self._generator).to(like)
 
 
-def disturbed_center(
+def perturbed_center(
     center: Tensor,
     radius: float,
     iteration: int,
     iterations: int,
-    config: DisturbanceConfig,
+    config: PerturbationConfig,
     generator: torch.Generator,
 ) -> Tensor | None:
     """Perturbed origin ``[3]`` of the view direction in ``iteration`` of ``iterations``; None for the camera's centre.
@@ -86,11 +86,11 @@ def disturbed_center(
     return center + config.view_noise * left * radius * torch.randn(3, generator=generator).to(center)
 
 
-def disturbance_at(
-    iteration: int, iterations: int, config: DisturbanceConfig, generator: torch.Generator
-) -> Disturbance | None:
+def perturbation_at(
+    iteration: int, iterations: int, config: PerturbationConfig, generator: torch.Generator
+) -> Perturbation | None:
     """The perturbation of ``iteration`` of ``iterations``; None for none."""
     strength = 1.0 - iteration / max(1.0, iterations * config.until_share)
     if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
         return None
-    return Disturbance(config, generator, strength=strength)
+    return Perturbation(config, generator, strength=strength)

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from memory_captures import MemoryCapture
-from structgstream import beginning
-from structgstream.beginning import frame_seed, initial_points_of
+from structgstream import initialization
 from structgstream.data.points import PointsConfig
+from structgstream.initialization import frame_seed, initial_points_of
 from structgstream.similarity import Similarity
 from worlds import moving_world
 
@@ -33,7 +33,7 @@ def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.Monk
         asked.append(seed)
         return type("Points", (), {"positions": np.ones((4, 3))})
 
-    monkeypatch.setattr(beginning, "initial_points", found)
+    monkeypatch.setattr(initialization, "initial_points", found)
     given = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, -1.0]])
     options = {"config": PointsConfig(), "seed": 5, "similarity": SIMILARITY}
     points = initial_points_of(source(given), WORLD.frames[0], **options)

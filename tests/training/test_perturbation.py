@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from structgstream.gaussians import Gaussians
-from structgstream.training.disturbance import Disturbance, DisturbanceConfig, disturbance_at, disturbed_center
+from structgstream.training.perturbation import Perturbation, PerturbationConfig, perturbation_at, perturbed_center
 
 COUNT = 20_000
 
@@ -21,13 +21,13 @@ def gaussians() -> Gaussians:
     )
 
 
-def disturbed(config: DisturbanceConfig, *, strength: float = 1.0, seed: int = 0) -> Gaussians:
-    return Disturbance(config, torch.Generator().manual_seed(seed), strength=strength)(gaussians())
+def perturbed(config: PerturbationConfig, *, strength: float = 1.0, seed: int = 0) -> Gaussians:
+    return Perturbation(config, torch.Generator().manual_seed(seed), strength=strength)(gaussians())
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.5])
 def test_a_share_is_left_out_and_the_mean_stays(strength: float) -> None:
-    found = disturbed(DisturbanceConfig(dropped_share=0.4), strength=strength)
+    found = perturbed(PerturbationConfig(dropped_share=0.4), strength=strength)
     gone = found.opacities == 0
     assert gone.float().mean().item() == pytest.approx(0.4 * strength, abs=0.01)
     assert found.opacities.mean().item() == pytest.approx(0.3, abs=0.01)
@@ -38,14 +38,14 @@ def test_a_share_is_left_out_and_the_mean_stays(strength: float) -> None:
 
 def test_opacities_stay_below_one() -> None:
     whole = gaussians()
-    config = DisturbanceConfig(dropped_share=0.9)
-    found = Disturbance(config, torch.Generator(), strength=1.0)(whole)
+    config = PerturbationConfig(dropped_share=0.9)
+    found = Perturbation(config, torch.Generator(), strength=1.0)(whole)
     assert found.opacities.max() < 1.0
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.5])
 def test_means_are_shifted_by_their_extent(strength: float) -> None:
-    found = disturbed(DisturbanceConfig(noise_scales=0.2), strength=strength)
+    found = perturbed(PerturbationConfig(noise_scales=0.2), strength=strength)
     shift = found.means - 1.0
     assert shift.mean().item() == pytest.approx(0.0, abs=0.01)
     assert shift.std().item() == pytest.approx(0.2 * strength * 0.5, rel=0.05)
@@ -54,40 +54,40 @@ def test_means_are_shifted_by_their_extent(strength: float) -> None:
 
 
 def test_the_seed_decides() -> None:
-    config = DisturbanceConfig(dropped_share=0.2, noise_scales=0.2)
-    one, same, other = (disturbed(config, seed=seed) for seed in (1, 1, 2))
+    config = PerturbationConfig(dropped_share=0.2, noise_scales=0.2)
+    one, same, other = (perturbed(config, seed=seed) for seed in (1, 1, 2))
     assert torch.equal(one.means, same.means)
     assert torch.equal(one.opacities, same.opacities)
     assert not torch.equal(one.means, other.means)
 
 
 def test_it_fades_and_ends() -> None:
-    config = DisturbanceConfig(dropped_share=0.4, until_share=0.5)
+    config = PerturbationConfig(dropped_share=0.4, until_share=0.5)
     shares = []
     for iteration in (1, 25, 49):
-        found = disturbance_at(iteration, 100, config, torch.Generator().manual_seed(0))
+        found = perturbation_at(iteration, 100, config, torch.Generator().manual_seed(0))
         assert found is not None
         shares.append((found(gaussians()).opacities == 0).float().mean().item())
     assert shares == pytest.approx([0.4 * 0.98, 0.4 * 0.5, 0.4 * 0.02], abs=0.01)
-    assert disturbance_at(50, 100, config, torch.Generator()) is None
-    assert disturbance_at(1, 100, DisturbanceConfig(), torch.Generator()) is None
+    assert perturbation_at(50, 100, config, torch.Generator()) is None
+    assert perturbation_at(1, 100, PerturbationConfig(), torch.Generator()) is None
 
 
-def centers(config: DisturbanceConfig, *, iteration: int) -> torch.Tensor:
+def centers(config: PerturbationConfig, *, iteration: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
     origin = torch.tensor([1.0, 2.0, 3.0])
-    found = [disturbed_center(origin, 2.0, iteration, 100, config, generator) for _ in range(2_000)]
+    found = [perturbed_center(origin, 2.0, iteration, 100, config, generator) for _ in range(2_000)]
     return torch.stack([one for one in found if one is not None])
 
 
 def test_anchors_look_as_from_beside_the_camera() -> None:
-    found = centers(DisturbanceConfig(view_noise=0.3), iteration=50)
+    found = centers(PerturbationConfig(view_noise=0.3), iteration=50)
     assert found.mean(0).tolist() == pytest.approx([1.0, 2.0, 3.0], abs=0.05)
     assert found.std(0).tolist() == pytest.approx([0.6] * 3, rel=0.06)
 
 
 def test_the_noise_of_the_view_may_fade() -> None:
-    config = DisturbanceConfig(view_noise=0.3, view_noise_left=0.5)
+    config = PerturbationConfig(view_noise=0.3, view_noise_left=0.5)
     assert centers(config, iteration=1).std().item() > 0.9
     assert centers(config, iteration=100).std(0).tolist() == pytest.approx([0.3] * 3, rel=0.06)
-    assert disturbed_center(torch.zeros(3), 1.0, 1, 100, DisturbanceConfig(), torch.Generator()) is None
+    assert perturbed_center(torch.zeros(3), 1.0, 1, 100, PerturbationConfig(), torch.Generator()) is None

@@ -23,14 +23,14 @@ from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim
 from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
 
 Picture = NDArray[np.uint8]
-Selection = Literal["all", "basic"]
+MetricSelection = Literal["all", "basic"]
 """All metrics, or only the cheap ones of two pictures: PSNR and its variants, and SSIM."""
 
 TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 
 
 @dataclass(frozen=True)
-class Instruments:
+class OptionalMetrics:
     """The available metrics, and the reasons for missing ones.
 
     Args:
@@ -49,7 +49,7 @@ class Instruments:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ComparedFrame:
     """One camera's frame, kept for the temporal metrics of the next: pictures and their FLIP and LPIPS features.
 
     Each pair is of truth and rendering, or None where that metric is not computed.
@@ -61,14 +61,14 @@ class Seen:
     lpips: tuple[Features, Features] | None
 
 
-def instruments(
+def load_optional_metrics(
     cameras: Iterable[tuple[str, Camera]],
     *,
     frames: int,
     device: torch.device,
     flow: Flow | None = None,
     lpips_weights: Path | None = None,
-) -> Instruments:
+) -> OptionalMetrics:
     """The metrics that are available here for these cameras (by name) and this number of frames.
 
     Args:
@@ -109,25 +109,31 @@ def instruments(
         missing["ms_ssim"] = reason
     if frames < 2:
         missing |= dict.fromkeys(TEMPORAL, "the stream has one frame, and this score compares two")
-    return Instruments(measure, found, flow, weights, missing)
+    return OptionalMetrics(measure, found, flow, weights, missing)
 
 
-def measured(
-    tools: Instruments, *, truth: Picture, picture: Picture, before: Seen | None, camera: str, index: int
-) -> tuple[dict[str, float | None], Seen]:
+def optional_scores(
+    optional_metrics: OptionalMetrics,
+    *,
+    truth: Picture,
+    picture: Picture,
+    before: ComparedFrame | None,
+    camera: str,
+    index: int,
+) -> tuple[dict[str, float | None], ComparedFrame]:
     """Further scores of one picture, by their names in ``Scores``, and the state for the next frame.
 
     Args:
-        tools: the available metrics.
+        optional_metrics: the available metrics.
         truth: the camera's picture, ``[H, W, 3]`` uint8.
         picture: the rendering.
         before: the same camera's previous frame; None for the first.
         camera: its name.
         index: number of the frame.
     """
-    alex, vgg = (_usable(tools, trunk.name, truth) for trunk in (ALEX, VGG))
+    alex, vgg = (_usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))
     scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth)}
-    seen = None if tools.flip is None else (tools.flip(truth), tools.flip(picture))
+    seen = None if optional_metrics.flip is None else (optional_metrics.flip(truth), optional_metrics.flip(picture))
     scores["flip"] = None if seen is None else flip_of(*seen)
     features = None if alex is None else (alex.features(truth), alex.features(picture))
     scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
@@ -136,8 +142,8 @@ def measured(
         still = ~changed_pixels(truth, before.truth)
         scores["flicker"] = flicker(picture, before.picture, still)
         scores["truth_flicker"] = flicker(truth, before.truth, still)
-        if tools.flow is not None:
-            field = tools.flow(before.truth, truth, camera, index)
+        if optional_metrics.flow is not None:
+            field = optional_metrics.flow(before.truth, truth, camera, index)
             scores["e_warp"] = warping_error(picture, before.picture, field)
         if seen is not None and before.flip is not None:
             true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))
@@ -145,11 +151,11 @@ def measured(
         if alex is not None and features is not None and before.lpips is not None:
             true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
             scores["t_lpips"] = difference_of_change(rendered, true)
-    return scores, Seen(truth, picture, seen, features)
+    return scores, ComparedFrame(truth, picture, seen, features)
 
 
-def _usable(tools: Instruments, name: str, picture: Picture) -> Lpips | None:
-    lpips = tools.lpips.get(name)
+def _usable(optional_metrics: OptionalMetrics, name: str, picture: Picture) -> Lpips | None:
+    lpips = optional_metrics.lpips.get(name)
     return None if lpips is None or min(picture.shape[:2]) < lpips.trunk.smallest else lpips
 
 

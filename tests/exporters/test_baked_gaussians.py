@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from rigs import arc_rig
-from structgstream.exporters.baked import BakedGaussians
+from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import Y0
 from structgstream.similarity import Similarity

@@ -14,14 +14,14 @@ from structgstream.scene.appearance import with_appearance
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, scene_of, state_of
-from structgstream.training.first_bins import (
+from structgstream.training.first_quantization import (
     COARSEST,
     FINEST,
-    MEASURED,
+    SENSITIVITY_FIELDS,
     Sensitivity,
-    first_bins,
-    regauged,
-    sensitivity_of,
+    estimate_sensitivity,
+    quantize_first_frame,
+    regauge,
 )
 from structgstream.training.rounding import RoundingConfig
 
@@ -35,12 +35,12 @@ STEPS = {"anchor_positions": 0.003, "offset_scales": 0.02}
 def before() -> tuple[Scene, Sensitivity]:
     scene = random_scene(40, seed=3)
     scene = replace(scene, free=scene.free.select(torch.zeros(len(scene.free), dtype=torch.bool)))
-    return scene, sensitivity_of(scene, RIG, backend=BACKEND, seed=0)
+    return scene, estimate_sensitivity(scene, RIG, backend=BACKEND, seed=0)
 
 
 @cache
 def after() -> tuple[Scene, Sensitivity]:
-    return regauged(*before())
+    return regauge(*before())
 
 
 def pictures(scene: Scene, rig: CameraRig = RIG) -> torch.Tensor:
@@ -53,7 +53,7 @@ def noise_levels(scene: Scene) -> float:
 
 def test_what_numbers_are_worth_is_what_errors_of_them_do() -> None:
     """A small error of all numbers of a field adds the noise that was foretold, to within chance."""
-    scene, worth = before()
+    scene, sensitivity = before()
     g, state = torch.Generator().manual_seed(1), state_of(scene)
     exact = pictures(scene)
     sizes: dict[FieldName, float] = {"anchor_offsets": 3e-3, "anchor_features": 1e-2, "base_scales": 1e-2}
@@ -61,19 +61,19 @@ def test_what_numbers_are_worth_is_what_errors_of_them_do() -> None:
         error = size * torch.randn(state[name].shape, generator=g)
         wrong: dict[FieldName, torch.Tensor] = {**state, name: state[name] + error}
         found = float((pictures(scene_of(wrong, distance_input=True)) - exact).square().mean())
-        foretold = size**2 * float(worth.fields[name].sum())
+        foretold = size**2 * float(sensitivity.fields[name].sum())
         assert 0.5 < found / foretold < 2.0, name
 
 
 def test_what_no_camera_draws_is_not_used() -> None:
-    scene, worth = before()
-    used = torch.zeros_like(worth.used)
+    scene, sensitivity = before()
+    used = torch.zeros_like(sensitivity.used)
     for name in RIG.training:
         structured = scene.structured(RIG[name], BACKEND).gaussians
         used.view(-1)[structured.ids] = True
-    assert torch.equal(worth.used, used)
-    assert 0 < int(worth.used.sum()) < worth.used.numel()
-    assert not worth.fields["anchor_offsets"][~worth.used].any()
+    assert torch.equal(sensitivity.used, used)
+    assert 0 < int(sensitivity.used.sum()) < sensitivity.used.numel()
+    assert not sensitivity.fields["anchor_offsets"][~sensitivity.used].any()
 
 
 def test_another_gauge_draws_the_same() -> None:
@@ -92,7 +92,7 @@ def test_directions_of_features_are_independent_and_worth_the_same() -> None:
     assert (variances.diff() <= 1e-6 * variances[0]).all(), "the most varied first"
     assert float((covariance - variances.diag()).abs().max()) < 1e-4 * float(variances[0])
     assert float(features.mean(0).abs().max()) < 1e-5
-    products = sensitivity_of(scene, RIG, backend=BACKEND, seed=0).features
+    products = estimate_sensitivity(scene, RIG, backend=BACKEND, seed=0).features
     strong = products.diagonal() > 0.5 * products.diagonal().max()
     assert strong.sum() > len(products) // 2
     inner = products[strong][:, strong]
@@ -102,7 +102,7 @@ def test_directions_of_features_are_independent_and_worth_the_same() -> None:
 def test_the_worth_of_another_gauge_is_that_of_the_numbers_there() -> None:
     """Of features the sum over an anchor is told, of all other fields every number."""
     scene, told = after()
-    found = sensitivity_of(scene, RIG, backend=BACKEND, seed=0)
+    found = estimate_sensitivity(scene, RIG, backend=BACKEND, seed=0)
     assert torch.equal(found.used, told.used)
     one, other = found.fields, told.fields
     for name in ("anchor_offsets", "base_scales"):
@@ -110,21 +110,21 @@ def test_the_worth_of_another_gauge_is_that_of_the_numbers_there() -> None:
     torch.testing.assert_close(one["anchor_features"].sum(), other["anchor_features"].sum(), rtol=2e-2, atol=0)
 
 
-def quantised(levels: float, *, quality: float = 0.0) -> tuple[Scene, dict[FieldName, float]]:
+def quantized(levels: float, *, quality: float = 0.0) -> tuple[Scene, dict[FieldName, float]]:
     config = RoundingConfig(first_noise_levels=levels, quality=quality)
-    scene, worth = after()
-    return first_bins(with_appearance(scene, 2), worth, config=config, voxel_size=VOXEL, steps=STEPS)
+    scene, sensitivity = after()
+    return quantize_first_frame(with_appearance(scene, 2), sensitivity, config=config, voxel_size=VOXEL, steps=STEPS)
 
 
 @pytest.mark.parametrize("levels", [0.3, 1.0, 3.0])
 def test_the_noise_is_about_what_was_asked_for(levels: float) -> None:
-    scene, _ = quantised(levels)
+    scene, _ = quantized(levels)
     found = noise_levels(scene)
     assert 0.3 * levels < found < 3.0 * levels
 
 
 def test_everything_that_is_coded_is_a_whole_number_of_steps() -> None:
-    scene, steps = quantised(0.5)
+    scene, steps = quantized(0.5)
     state = state_of(scene)
     assert steps.keys() == state.keys() - {"free", "free_births", "camera_color"}
     for name, step in steps.items():
@@ -139,7 +139,7 @@ def test_everything_that_is_coded_is_a_whole_number_of_steps() -> None:
 
 
 def test_what_is_not_used_is_zero() -> None:
-    scene, _ = quantised(0.5)
+    scene, _ = quantized(0.5)
     used = before()[1].used
     assert not scene.anchors.offsets[~used].any()
     assert scene.anchors.offsets[used].any()
@@ -147,32 +147,32 @@ def test_what_is_not_used_is_zero() -> None:
 
 def test_offsets_take_what_positions_lose() -> None:
     """On a grid of a tenth of the scene, Gaussians stay where they were."""
-    scene, worth = after()
+    scene, sensitivity = after()
     config = RoundingConfig(first_noise_levels=0.01)
-    moved, steps = first_bins(scene, worth, config=config, voxel_size=0.1, steps=STEPS)
+    moved, steps = quantize_first_frame(scene, sensitivity, config=config, voxel_size=0.1, steps=STEPS)
     assert steps["anchor_positions"] == pytest.approx(0.1)
     lost = (moved.anchors.positions - scene.anchors.positions).abs()
     assert float(lost.max()) > 0.03
     shown = (moved.anchors.positions / STEPS["anchor_positions"]).round() * STEPS["anchor_positions"]
-    used = worth.used & (worth.fields["anchor_offsets"].sum(2) > 0)
+    used = sensitivity.used & (sensitivity.fields["anchor_offsets"].sum(2) > 0)
     means = (scene.anchors.positions[:, None] + scene.anchors.offsets)[used]
     again = (shown[:, None] + moved.anchors.offsets)[used]
     assert float((means - again).abs().max()) < 0.01
 
 
 def test_a_higher_quality_is_finer_everywhere() -> None:
-    _, plain = quantised(0.5)
-    _, fine = quantised(0.5, quality=1.0)
-    for name in (*MEASURED, "opacity_mlp"):
+    _, plain = quantized(0.5)
+    _, fine = quantized(0.5, quality=1.0)
+    for name in (*SENSITIVITY_FIELDS, "opacity_mlp"):
         assert fine[name] == pytest.approx(plain[name] / 2**0.5)
 
 
 def test_a_scene_that_no_camera_sees() -> None:
     scene, _ = before()
     away = replace(scene, anchors=replace(scene.anchors, positions=scene.anchors.positions + 1e4))
-    worth = sensitivity_of(away, RIG, backend=BACKEND, seed=0)
-    assert not worth.used.any()
-    other, worth = regauged(away, worth)
+    sensitivity = estimate_sensitivity(away, RIG, backend=BACKEND, seed=0)
+    assert not sensitivity.used.any()
+    other, sensitivity = regauge(away, sensitivity)
     config = RoundingConfig()
-    found, _ = first_bins(other, worth, config=config, voxel_size=VOXEL, steps=STEPS)
+    found, _ = quantize_first_frame(other, sensitivity, config=config, voxel_size=VOXEL, steps=STEPS)
     assert all(value.isfinite().all() for value in state_of(found).values())

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.stored import Part, StoredFile
+from structgstream.codec.container.byte_source import ByteSlice, FileBytes
 from structgstream.errors import StreamError
 
 DATA = bytes(range(200))
@@ -20,15 +20,20 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("key", [slice(3, 9), slice(None, 4), slice(190, None), slice(150, 900), slice(9, 3), slice(0)])
 def test_pieces_are_those_of_bytes(path: Path, key: slice) -> None:
-    stored = StoredFile(path)
+    stored = FileBytes(path)
     assert stored[key] == DATA[key]
-    part, inner = Part(stored, 20, 120), DATA[20:120]
+    part, inner = ByteSlice(stored, 20, 120), DATA[20:120]
     assert part[key] == inner[key]
-    assert (len(stored), len(part), len(Part(stored, 150, 900)), len(Part(stored, 300, 900))) == (200, 100, 50, 0)
+    assert (len(stored), len(part), len(ByteSlice(stored, 150, 900)), len(ByteSlice(stored, 300, 900))) == (
+        200,
+        100,
+        50,
+        0,
+    )
 
 
 def test_what_is_appended_is_not_seen_and_what_is_cut_is_told_of(path: Path) -> None:
-    stored = StoredFile(path)
+    stored = FileBytes(path)
     with path.open("ab") as file:
         file.write(b"more")
     assert stored[190:] == DATA[190:]
@@ -40,7 +45,7 @@ def test_what_is_appended_is_not_seen_and_what_is_cut_is_told_of(path: Path) -> 
 
 
 def test_a_read_that_gives_less_at_a_time_is_repeated(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored = StoredFile(path)
+    stored = FileBytes(path)
     read = stored._file.read
 
     class Slow:
@@ -55,7 +60,7 @@ def test_a_read_that_gives_less_at_a_time_is_repeated(path: Path, monkeypatch: p
 
 
 def test_a_closed_file_says_so(path: Path) -> None:
-    stored = StoredFile(path)
+    stored = FileBytes(path)
     stored.close()
     stored.close()
     with pytest.raises(StreamError, match="has been closed; open it again"):
@@ -66,7 +71,7 @@ def test_a_closed_file_says_so(path: Path) -> None:
 def test_a_reader_that_nobody_closes_leaves_no_open_file(path: Path) -> None:
     gc.collect()
     before = len(os.listdir("/proc/self/fd"))
-    stored = StoredFile(path)
+    stored = FileBytes(path)
     assert len(os.listdir("/proc/self/fd")) == before + 1
     del stored  # and no ResourceWarning, which would fail this test
     gc.collect()

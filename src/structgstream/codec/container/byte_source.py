@@ -10,15 +10,15 @@ from typing import Protocol
 from structgstream.errors import StreamError
 
 
-class Stored(Protocol):
-    """Length and slices, which ``bytes``, ``memoryview``, :class:`StoredFile` and :class:`Part` have."""
+class ByteSource(Protocol):
+    """Length and slices, which ``bytes``, ``memoryview``, :class:`FileBytes` and :class:`ByteSlice` have."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, key: slice, /) -> bytes | memoryview: ...
 
 
-class StoredFile:
+class FileBytes:
     """A file whose slices are read on demand.
 
     The length is that at opening; bytes appended later by a running reconstruction are not visible. Thread-safe. The
@@ -65,7 +65,7 @@ class StoredFile:
             count -= len(piece)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
-    def __enter__(self) -> "StoredFile":
+    def __enter__(self) -> "FileBytes":
         return self
 
     def __exit__(self, *raised: object) -> None:
@@ -76,10 +76,10 @@ class StoredFile:
         self._finalizer()
 
 
-class Part:
+class ByteSlice:
     """A view of the bytes from ``start`` to ``end``."""
 
-    def __init__(self, data: Stored, start: int, end: int) -> None:
+    def __init__(self, data: ByteSource, start: int, end: int) -> None:
         self._data = data
         self._start = start
         self._size = max(min(end, len(data)) - start, 0)

@@ -3,9 +3,9 @@
 
 Note [Two directions]
 ~~~~~~~~~~~~~~~~~~~~~
-A format is described once, as a function that passes values to a :class:`Coder` and continues with what it returns. An
-encoder gets the true values and returns them; a decoder gets None and returns the decoded values. So both directions
-use the same order and contexts. This module codes the init record, ``adaptive.py`` packets.
+A format is described once, as a function that passes values to a :class:`SectionCoder` and continues with what it
+returns. An encoder gets the true values and returns them; a decoder gets None and returns the decoded values. So both
+directions use the same order and contexts. This module codes the init record, ``adaptive.py`` packets.
 """
 
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.arrays import Bins, Contexts, Naturals
-from structgstream.codec.entropy.bits import bit_lengths, fixed, numbers_of, packed_bits
+from structgstream.codec.entropy.bits import bit_lengths, fixed, pack_bits, unpack_numbers
 from structgstream.codec.entropy.rans import decode, encode, section_bytes
-from structgstream.codec.entropy.residual_symbols import ALPHABET, residuals_of, symbols_of
-from structgstream.codec.entropy.table_choice import chosen_tables
-from structgstream.codec.entropy.table_sets import decoded_tables
+from structgstream.codec.entropy.residual_symbols import ALPHABET, residuals_to_symbols, symbols_to_residuals
+from structgstream.codec.entropy.table_choice import choose_tables
+from structgstream.codec.entropy.table_sets import decode_tables
 from structgstream.codec.entropy.tables import FrequencyTables, geometric_family
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
@@ -29,7 +29,7 @@ CLASSES = 32
 _FLAT = 128  # the geometric row that a context starts with
 
 
-class Coder(Protocol):
+class SectionCoder(Protocol):
     """Encodes or decodes arrays of integers, one section after another; the name selects the frequency tables."""
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
@@ -65,7 +65,7 @@ class Tables:
         self._sets[name] = tables
 
 
-class Encoder:
+class SectionEncoder:
     """Encodes; the part of a name before the dot is the field of :attr:`fields` that the bytes are appended to."""
 
     def __init__(self, tables: Tables) -> None:
@@ -74,7 +74,7 @@ class Encoder:
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
         assert values is not None
-        symbols, escapes = symbols_of(values)
+        symbols, escapes = residuals_to_symbols(values)
         self._section(name, symbols, contexts, count=count, alphabet=ALPHABET)
         self._put(name, varint(len(escapes)) + escapes)
         return values
@@ -85,7 +85,7 @@ class Encoder:
             raise StreamError("A number is beyond 31 bits; take a larger quantization step.")
         lengths = bit_lengths(values)
         self._section(name, lengths.astype(np.uint8), contexts, count=count, alphabet=CLASSES)
-        rest = packed_bits(
+        rest = pack_bits(
             fixed(int(value) - (1 << int(size) - 1), int(size) - 1) for value, size in zip(values, lengths) if size > 1
         )
         self._put(name, rest)
@@ -100,7 +100,7 @@ class Encoder:
         before = self._tables.get(name, contexts=count, alphabet=alphabet)
         counts = np.zeros((count, alphabet), np.int64)
         np.add.at(counts, (contexts, symbols), 1)
-        tables, packed = chosen_tables(counts, before)
+        tables, packed = choose_tables(counts, before)
         self._tables.put(name, tables)
         self._put(name, varint(len(packed)) + packed + encode(symbols, contexts, tables))
 
@@ -109,8 +109,8 @@ class Encoder:
         self.fields[field] = self.fields.get(field, b"") + data
 
 
-class Decoder:
-    """Reads what :class:`Encoder` wrote into the fields."""
+class SectionDecoder:
+    """Reads what :class:`SectionEncoder` wrote into the fields."""
 
     def __init__(self, tables: Tables, fields: Mapping[FieldName, bytes | memoryview], *, where: str) -> None:
         self._tables = tables
@@ -119,12 +119,14 @@ class Decoder:
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
         symbols = self._section(name, contexts, count=count, alphabet=ALPHABET)
-        return residuals_of(symbols, self._taken(name, self.number(name, None)), where=f"{self._where}, {name},")
+        return symbols_to_residuals(
+            symbols, self._taken(name, self.number(name, None)), where=f"{self._where}, {name},"
+        )
 
     def naturals(self, name: str, values: Naturals | None, contexts: Contexts, *, count: int) -> Naturals:
         sizes = self._section(name, contexts, count=count, alphabet=CLASSES).astype(np.int64)
         widths = np.maximum(sizes - 1, 0)
-        rest = numbers_of(self._taken(name, -(-int(widths.sum()) // 8)), widths, where=f"{self._where}, {name},")
+        rest = unpack_numbers(self._taken(name, -(-int(widths.sum()) // 8)), widths, where=f"{self._where}, {name},")
         return np.where(sizes > 0, (1 << widths) + rest, 0)
 
     def number(self, name: str, value: int | None) -> int:
@@ -153,7 +155,7 @@ class Decoder:
     def _section(self, name: str, contexts: Contexts, *, count: int, alphabet: int) -> NDArray[np.uint8]:
         where = f"{self._where}, {name},"
         before = self._tables.get(name, contexts=count, alphabet=alphabet)
-        tables = decoded_tables(self._taken(name, self.number(name, None)), before, where=where)
+        tables = decode_tables(self._taken(name, self.number(name, None)), before, where=where)
         self._tables.put(name, tables)
         size = section_bytes(self._left[name.partition(".")[0]], where=where)
         return decode(self._taken(name, size), contexts, tables, where=where)

@@ -12,8 +12,8 @@ from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.errors import ConfigError
 from structgstream.evaluation.flip import features_of, flip_of
-from structgstream.evaluation.instruments import TEMPORAL, Instruments, instruments, measured
 from structgstream.evaluation.lpips import ALEX, ENVIRONMENT, VGG, Lpips, published_heads
+from structgstream.evaluation.optional_metrics import TEMPORAL, OptionalMetrics, load_optional_metrics, optional_scores
 
 CPU = torch.device("cpu")
 
@@ -47,45 +47,57 @@ def noise(seed: int) -> np.ndarray:
 
 
 def test_missing_weights_are_told_and_nothing_takes_their_place() -> None:
-    tools = instruments(cameras(640, 360), frames=5, device=CPU)
-    assert set(tools.not_available) == {"lpips_alex", "t_lpips", "lpips_vgg"}
-    assert ALEX.file in tools.not_available["t_lpips"]
-    assert VGG.file in tools.not_available["lpips_vgg"]
-    assert tools.lpips == {}
-    scores, _ = measured(tools, truth=noise(0), picture=noise(1), before=None, camera="cam00", index=0)
+    optional_metrics = load_optional_metrics(cameras(640, 360), frames=5, device=CPU)
+    assert set(optional_metrics.not_available) == {"lpips_alex", "t_lpips", "lpips_vgg"}
+    assert ALEX.file in optional_metrics.not_available["t_lpips"]
+    assert VGG.file in optional_metrics.not_available["lpips_vgg"]
+    assert optional_metrics.lpips == {}
+    scores, _ = optional_scores(
+        optional_metrics, truth=noise(0), picture=noise(1), before=None, camera="cam00", index=0
+    )
     assert scores["lpips_alex"] is scores["lpips_vgg"] is None
     assert scores["flip"] == flip(noise(1), noise(0))
 
 
 def test_missing_packages_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    tools = instruments(cameras(640, 360), frames=5, device=CPU)
+    optional_metrics = load_optional_metrics(cameras(640, 360), frames=5, device=CPU)
     for name in ("flip", "temporal_flip", "e_warp"):
-        assert "structgstream[eval]" in tools.not_available[name]
-    _, before = measured(tools, truth=noise(0), picture=noise(1), before=None, camera="cam00", index=0)
-    scores, _ = measured(tools, truth=noise(0), picture=noise(1), before=before, camera="cam00", index=1)
+        assert "structgstream[eval]" in optional_metrics.not_available[name]
+    _, before = optional_scores(
+        optional_metrics, truth=noise(0), picture=noise(1), before=None, camera="cam00", index=0
+    )
+    scores, _ = optional_scores(
+        optional_metrics, truth=noise(0), picture=noise(1), before=before, camera="cam00", index=1
+    )
     assert scores.get("flip") is scores.get("e_warp") is scores.get("temporal_flip") is None
     assert scores["flicker"] == 0.0
 
 
 def test_small_pictures_and_short_streams_are_told() -> None:
-    tools = instruments(cameras(48, 32), frames=1, device=CPU)
-    assert "161 pixels a side, fewer are those of cam00 (32)" in tools.not_available["ms_ssim"]
-    assert {tools.not_available[name] for name in TEMPORAL} == {"the stream has one frame, and this score compares two"}
+    optional_metrics = load_optional_metrics(cameras(48, 32), frames=1, device=CPU)
+    assert "161 pixels a side, fewer are those of cam00 (32)" in optional_metrics.not_available["ms_ssim"]
+    assert {optional_metrics.not_available[name] for name in TEMPORAL} == {
+        "the stream has one frame, and this score compares two"
+    }
 
 
 def test_wrong_weights_are_an_error_not_a_gap(tmp_path: Path) -> None:
     torch.save({"features.0.weight": torch.zeros(3)}, tmp_path / "alexnet.pth")
     with pytest.raises(ConfigError, match="no weights of AlexNet"):
-        instruments(cameras(640, 360), frames=5, device=CPU, lpips_weights=tmp_path)
+        load_optional_metrics(cameras(640, 360), frames=5, device=CPU, lpips_weights=tmp_path)
 
 
 def test_scores_over_time_are_differences_of_distances() -> None:
     alex = seeded_alex()
-    tools = Instruments(features_of, {"alex": alex}, None)
+    optional_metrics = OptionalMetrics(features_of, {"alex": alex}, None)
     truths, pictures = (noise(0), noise(1)), (noise(2), noise(2) // 2)
-    _, before = measured(tools, truth=truths[0], picture=pictures[0], before=None, camera="cam00", index=0)
-    scores, _ = measured(tools, truth=truths[1], picture=pictures[1], before=before, camera="cam00", index=1)
+    _, before = optional_scores(
+        optional_metrics, truth=truths[0], picture=pictures[0], before=None, camera="cam00", index=0
+    )
+    scores, _ = optional_scores(
+        optional_metrics, truth=truths[1], picture=pictures[1], before=before, camera="cam00", index=1
+    )
 
     def lpips(a: np.ndarray, b: np.ndarray) -> float:
         return alex.distance(alex.features(a), alex.features(b))

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from properties import examples
-from structgstream.codec.entropy.bits import fixed, numbers_of, packed_bits
-from structgstream.codec.entropy.coder import Decoder, Encoder, Tables, varint
+from structgstream.codec.entropy.bits import fixed, pack_bits, unpack_numbers
+from structgstream.codec.entropy.section_coder import SectionDecoder, SectionEncoder, Tables, varint
 from structgstream.errors import StreamError
 
 NATURAL = st.one_of(st.integers(0, 20), st.integers(0, 2**31 - 1), st.sampled_from([2**30 - 1, 2**30, 2**31 - 1]))
@@ -19,14 +19,14 @@ def contexts_for(values: list, count: int) -> np.ndarray:
     return (np.arange(len(values)) * 7 % count).astype(np.uint16)
 
 
-def reader(fields: dict[str, bytes]) -> Decoder:
-    return Decoder(Tables(), fields, where="Packet 0")  # type: ignore[arg-type]
+def reader(fields: dict[str, bytes]) -> SectionDecoder:
+    return SectionDecoder(Tables(), fields, where="Packet 0")  # type: ignore[arg-type]
 
 
 @examples(100)
 @given(st.lists(NATURAL, max_size=30), st.lists(RESIDUAL, max_size=30))
 def test_what_is_written_is_read(naturals: list[int], residuals: list[int]) -> None:
-    writer, n = Encoder(Tables()), np.array(naturals, np.int64)
+    writer, n = SectionEncoder(Tables()), np.array(naturals, np.int64)
     r = np.array(residuals, np.int32)
     writer.naturals("one.size", n, contexts_for(naturals, 3), count=3)
     writer.number("one.count", 2**32 - 1)
@@ -42,7 +42,7 @@ def test_what_is_written_is_read(naturals: list[int], residuals: list[int]) -> N
 
 
 def test_what_is_left_over_is_told() -> None:
-    writer = Encoder(Tables())
+    writer = SectionEncoder(Tables())
     writer.number("one.count", 5)
     with pytest.raises(StreamError, match="Packet 0 has more bytes of one than it should"):
         reader(writer.fields).end()
@@ -71,13 +71,13 @@ def test_numbers_have_seven_bits_a_byte() -> None:
 @pytest.mark.parametrize("value", [-1, 2**31])
 def test_a_natural_number_out_of_range(value: int) -> None:
     with pytest.raises(StreamError, match="beyond 31 bits"):
-        Encoder(Tables()).naturals("one.size", np.array([value]), np.zeros(1, np.uint16), count=1)
+        SectionEncoder(Tables()).naturals("one.size", np.array([value]), np.zeros(1, np.uint16), count=1)
 
 
 def test_tables_persist() -> None:
     tables, values = Tables(), np.array([5, 5, 5, -5] * 40, np.int32)
     nothing = np.zeros(len(values), np.uint16)
-    first, again = Encoder(tables), Encoder(tables)
+    first, again = SectionEncoder(tables), SectionEncoder(tables)
     first.residuals("one.step", values, nothing, count=1)
     again.residuals("one.step", values, nothing, count=1)
     assert len(again.fields["one"]) < len(first.fields["one"]), "the table is known by then"
@@ -88,15 +88,15 @@ def test_tables_persist() -> None:
 def test_numbers_are_found_at_any_bit(pairs: list[tuple[int, int]]) -> None:
     values = [value % (1 << width) for width, value in pairs]
     widths = np.array([width for width, _ in pairs], np.int64)
-    data = packed_bits(fixed(value, width) for value, (width, _) in zip(values, pairs) if width)
-    assert numbers_of(data, widths, where="").tolist() == values
+    data = pack_bits(fixed(value, width) for value, (width, _) in zip(values, pairs) if width)
+    assert unpack_numbers(data, widths, where="").tolist() == values
     with pytest.raises(StreamError, match="It has .* bytes for .* bits of numbers"):
-        numbers_of(data + b"\0", widths, where="It")
+        unpack_numbers(data + b"\0", widths, where="It")
 
 
 def test_what_stands_behind_the_last_number_must_be_zero() -> None:
     """Every file that says the same is the same."""
-    assert numbers_of(b"\xa0", np.array([3]), where="").tolist() == [5]
+    assert unpack_numbers(b"\xa0", np.array([3]), where="").tolist() == [5]
     for data in (b"\xa1", b"\xb0", b""):
         with pytest.raises(StreamError, match="damaged"):
-            numbers_of(data, np.array([3]), where="It")
+            unpack_numbers(data, np.array([3]), where="It")

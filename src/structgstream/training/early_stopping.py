@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 
-class Settling:
+class EarlyStopping:
     """Tracks the relative decrease of each view's loss since the view's previous iteration.
 
     Args:
@@ -28,12 +28,12 @@ class Settling:
         if last is not None:
             self._gains.append(1.0 - loss.detach() / last.clamp(min=1e-12))
 
-    def begin_again(self) -> None:
+    def reset(self) -> None:
         """Restart the average, after the scene was changed by patching."""
         self._gains.clear()
 
     @property
-    def settled(self) -> bool:
+    def should_stop(self) -> bool:
         """Whether to stop; evaluated every few views only, because reading losses synchronises with a GPU."""
         full = len(self._gains) == self._gains.maxlen
         if self._least_gain <= 0.0 or not full or self._added % max(1, len(self._gains) // 3):

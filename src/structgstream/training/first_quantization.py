@@ -28,9 +28,9 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, scene_of, state_of
-from structgstream.training.rounding import RoundingConfig, rounded
+from structgstream.training.rounding import RoundingConfig, round_straight_through
 
-MEASURED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
+SENSITIVITY_FIELDS: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
 FINEST, COARSEST = -1, 2
 """Bounds of an anchor's step relative to the mean one, as powers of two: occluded anchors may become visible later."""
 _LEAST_SHARE = 1e-4  # of the largest eigenvalue: features are not scaled by more than 100
@@ -41,7 +41,7 @@ class Sensitivity:
     """Sensitivity of the pictures to a scene, as means over all pixels and channels, full scale 1 (Note [Sensitivity]).
 
     Args:
-        fields: squared derivatives by each value of the :data:`MEASURED` fields, of their shapes.
+        fields: squared derivatives by each value of the :data:`SENSITIVITY_FIELDS` fields, of their shapes.
         features: ``[D, D]``, products of the derivatives by an anchor's features, summed over anchors.
         used: ``[M, K]``, mask of the offsets whose opacity is above zero for some camera.
     """
@@ -51,13 +51,15 @@ class Sensitivity:
     used: Tensor
 
 
-def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int) -> Sensitivity:
+def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int) -> Sensitivity:
     """Sensitivity of the pictures of ``rig``'s training cameras (in the scene's units)."""
     generator = torch.Generator().manual_seed(seed)
     state: dict[FieldName, Tensor] = {name: value.detach() for name, value in state_of(scene).items()}
-    for name in MEASURED:
+    for name in SENSITIVITY_FIELDS:
         state[name] = state[name].clone().requires_grad_()
-    squares: dict[FieldName, Tensor] = {name: torch.zeros_like(state[name], requires_grad=False) for name in MEASURED}
+    squares: dict[FieldName, Tensor] = {
+        name: torch.zeros_like(state[name], requires_grad=False) for name in SENSITIVITY_FIELDS
+    }
     features = state["anchor_features"].shape[1]
     products = torch.zeros(features, features, dtype=torch.float64, device=scene.anchors.positions.device)
     used = torch.zeros(state["anchor_offsets"].shape[:2], dtype=torch.bool, device=products.device)
@@ -67,13 +69,15 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
         structured = open_scene.structured(rig[name], backend)
         used[structured.anchors] |= structured.raw_opacities > 0
         behind = open_scene.background(rig[name])
-        image = draw(open_scene.dressed(structured), rig[name], backend, background=behind).image
+        image = draw(open_scene.with_free_gaussians(structured), rig[name], backend, background=behind).image
         count += image.numel()
         if not image.requires_grad:  # Nothing is drawn.
             continue
         signs = (torch.randint(0, 2, image.shape, generator=generator) * 2 - 1).to(image)
-        found = torch.autograd.grad((image * signs).sum(), [state[field] for field in MEASURED], allow_unused=True)
-        for field, gradient in zip(MEASURED, found, strict=True):
+        found = torch.autograd.grad(
+            (image * signs).sum(), [state[field] for field in SENSITIVITY_FIELDS], allow_unused=True
+        )
+        for field, gradient in zip(SENSITIVITY_FIELDS, found, strict=True):
             if gradient is not None:
                 squares[field] += gradient.square()
                 if field == "anchor_features":
@@ -83,31 +87,31 @@ def sensitivity_of(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int)
     return Sensitivity(squares, products, used)
 
 
-def regauged(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
+def regauge(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
     """An equivalent scene whose values cost fewer bits (Note [Gauges]), and its sensitivity."""
     anchors, fields = scene.anchors, dict(sensitivity.fields)
     lengths = anchors.log_offset_scales.exp()[:, None]
     fields["anchor_offsets"] = fields["anchor_offsets"] / lengths.square()
-    there, back = _independent(anchors.features, sensitivity.features, scene.mlps)
+    forward, inverse = _whitening_matrices(anchors.features, sensitivity.features, scene.mlps)
     features = anchors.features.double()
     mean = features.mean(0) if len(features) else features.new_zeros(features.shape[1])
-    products = back @ sensitivity.features @ back.T
+    products = inverse @ sensitivity.features @ inverse.T
     # Of an anchor's directions together as before, of all anchors together as now.
-    worth = products.diagonal().sum() / sensitivity.features.diagonal().sum().clamp(min=1e-300)
-    fields["anchor_features"] = fields["anchor_features"] * worth.to(fields["anchor_features"])
+    scaling = products.diagonal().sum() / sensitivity.features.diagonal().sum().clamp(min=1e-300)
+    fields["anchor_features"] = fields["anchor_features"] * scaling.to(fields["anchor_features"])
     return replace(
         scene,
         anchors=replace(
             anchors,
-            features=((features - mean) @ there).to(anchors.features).contiguous(),
+            features=((features - mean) @ forward).to(anchors.features).contiguous(),
             offsets=torch.where(sensitivity.used[..., None], anchors.offsets * lengths, 0.0),
             log_offset_scales=torch.zeros_like(anchors.log_offset_scales),
         ),
-        mlps=MLPWeights(*(_seeing(head, mean, back) for head in scene.mlps)),
+        mlps=MLPWeights(*(_fold_into_mlp(head, mean, inverse) for head in scene.mlps)),
     ), Sensitivity(fields, products, sensitivity.used)
 
 
-def _independent(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[Tensor, Tensor]:
+def _whitening_matrices(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[Tensor, Tensor]:
     """Matrix ``[D, D]`` to uncorrelated features of equal sensitivity, by decreasing variance, and its inverse."""
     values, vectors = torch.linalg.eigh(products)
     if not len(features) or not float(values.max()) > 0.0:
@@ -116,22 +120,22 @@ def _independent(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[
     stretched = vectors * values.clamp(min=_LEAST_SHARE * float(values.max())).sqrt()
     centred = features.double() - features.double().mean(0)
     turn = torch.linalg.eigh((centred @ stretched).T @ (centred @ stretched)).eigenvectors.flip(1)
-    there = stretched @ turn
-    back = torch.linalg.inv(there)
+    forward = stretched @ turn
+    inverse = torch.linalg.inv(forward)
     # The scale is free: it keeps the magnitude of the weights, for which steps and learning rates are tuned.
     seen = torch.cat([head.w1[:, : len(products)] for head in mlps]).double()
-    scale = ((seen @ back.T).square().sum() / seen.square().sum().clamp(min=1e-300)).sqrt().clamp(min=1e-30)
-    return there * scale, back / scale
+    scale = ((seen @ inverse.T).square().sum() / seen.square().sum().clamp(min=1e-300)).sqrt().clamp(min=1e-30)
+    return forward * scale, inverse / scale
 
 
-def _seeing(head: HeadWeights, mean: Tensor, back: Tensor) -> HeadWeights:
-    """The MLP whose first layer undoes the change of features: minus ``mean``, times the inverse of ``back``."""
+def _fold_into_mlp(head: HeadWeights, mean: Tensor, inverse: Tensor) -> HeadWeights:
+    """The MLP whose first layer undoes the change of features: minus ``mean``, times the inverse of ``inverse``."""
     seen, rest = head.w1[:, : len(mean)].double(), head.w1[:, len(mean) :]
-    w1 = torch.cat([(seen @ back.T).to(rest), rest], dim=1)
+    w1 = torch.cat([(seen @ inverse.T).to(rest), rest], dim=1)
     return head._replace(w1=w1, b1=(head.b1.double() + seen @ mean).to(head.b1))
 
 
-def first_bins(
+def quantize_first_frame(
     scene: Scene,
     sensitivity: Sensitivity,
     *,
@@ -142,7 +146,7 @@ def first_bins(
     """Quantizes the fields that the init record codes; returns the dequantized scene and the steps by field.
 
     Args:
-        scene: frame 0, as :func:`regauged` returned it.
+        scene: frame 0, as :func:`regauge` returned it.
         sensitivity: of ``scene``.
         config: allowed error and fixed steps.
         voxel_size: the grid of the anchors.
@@ -152,36 +156,39 @@ def first_bins(
     used = sensitivity.used[..., None].expand_as(state["anchor_offsets"])
     counted = {"anchor_offsets": used}
     numbers = sum(
-        int((worth > 0).logical_and(counted.get(name, worth > 0)).sum()) for name, worth in sensitivity.fields.items()
+        int((sensitivities > 0).logical_and(counted.get(name, sensitivities > 0)).sum())
+        for name, sensitivities in sensitivity.fields.items()
     )
     # A quantization error has the variance step^2 / 12; all values contribute equally.
     most = plain.first_noise_levels / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
     found: dict[FieldName, float] = {"anchor_positions": float32(voxel_size)}
-    state["anchor_positions"] = rounded(state["anchor_positions"], found["anchor_positions"])
+    state["anchor_positions"] = round_straight_through(state["anchor_positions"], found["anchor_positions"])
     shown = state["anchor_positions"]
     if "anchor_positions" in steps:
-        shown = rounded(shown, steps["anchor_positions"])
+        shown = round_straight_through(shown, steps["anchor_positions"])
     lost = (scene.anchors.positions - shown) / scene.anchors.log_offset_scales.exp()
     state["anchor_offsets"] = torch.where(used, state["anchor_offsets"] + lost[:, None], 0.0)
-    for name, worth in sensitivity.fields.items():
-        found[name], state[name] = _coarsened(state[name], worth, most, counted=counted.get(name))
+    for name, sensitivities in sensitivity.fields.items():
+        found[name], state[name] = _quantize_rows(state[name], sensitivities, most, counted=counted.get(name))
     if scene.appearance_basis is not None:
         shortest = float(scene.appearance_basis.norm(dim=1).min())
         found["appearance_basis"] = float32(max(shortest / 64, 1e-9))
-        state["appearance_basis"] = rounded(state["appearance_basis"], found["appearance_basis"])
+        state["appearance_basis"] = round_straight_through(state["appearance_basis"], found["appearance_basis"])
     for name in state.keys() - found.keys():
         row = FIELDS[name]
         if row.init_coding != "uncoded" and (key := row.init_step or row.step) not in (None, "own"):
             step = getattr(plain, key) if row.init_step else steps.get(name, getattr(plain, key))
             found[name] = float32(step)
-            state[name] = rounded(state[name], found[name])
+            state[name] = round_straight_through(state[name], found[name])
     return scene_of(state, distance_input=scene.distance_input), found
 
 
-def _coarsened(values: Tensor, worth: Tensor, most: float, *, counted: Tensor | None) -> tuple[float, Tensor]:
+def _quantize_rows(
+    values: Tensor, sensitivities: Tensor, most: float, *, counted: Tensor | None
+) -> tuple[float, Tensor]:
     """A step, and values ``[M, ...]`` quantized to it times a power of two per row."""
-    counted = worth > 0 if counted is None else counted
-    flat, rows = worth * counted, tuple(range(1, worth.dim()))
+    counted = sensitivities > 0 if counted is None else counted
+    flat, rows = sensitivities * counted, tuple(range(1, sensitivities.dim()))
     mean = float(flat.sum() / counted.sum().clamp(min=1))
     if not mean > 0.0:
         mean = 1.0
