@@ -155,7 +155,7 @@ def test_a_file_full_of_heads_does_not_keep_a_reader_busy(monkeypatch: pytest.Mo
     head = struct.pack("<BBHIId", RecordType.KEY, 0, 0, 10_000, 1, 9.0)
     hostile = data[: offsets[2]] + head * rows + bytes(10_000)
     read, read_record = [], damage_module.read_record
-    monkeypatch.setattr(damage_module, "record_at", lambda *given: read.append(1) or read_record(*given))
+    monkeypatch.setattr(damage_module, "read_record", lambda *given: read.append(1) or read_record(*given))
     assert len(StreamReader(hostile)) == 1
     assert 0 < 10_000 * len(read) <= 4 * len(hostile)
 

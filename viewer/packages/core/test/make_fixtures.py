@@ -17,11 +17,11 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import FREE_STEPS
-from structgstream.codec.scene.compact import CODABLE, quantised
-from structgstream.codec.scene.static_fields import AS_THEY_ARE, on_bins
+from structgstream.codec.scene.bins import FREE_PARAMETERS, dequantize_state, quantize_state, round_to_bins
+from structgstream.codec.scene.compact import CODABLE
+from structgstream.codec.scene.static_fields import UNCODED_FIELDS
 from structgstream.codec.sinks import MemorySink
-from structgstream.scene.order import space_order
+from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 from structgstream.similarity import Similarity
@@ -30,7 +30,7 @@ FOLDER = Path(__file__).parent / "fixtures"
 GROUP = 4
 ROWS: tuple[FieldName, ...] = ("anchor_positions", "offset_scales", "base_scales")
 WEIGHTS: tuple[FieldName, ...] = ("opacity_mlp", "color_mlp", "covariance_mlp")
-STEPS = dict.fromkeys((*ROWS, *WEIGHTS, *FREE_STEPS), 2.0 ** (-9)) | {
+STEPS = dict.fromkeys((*ROWS, *WEIGHTS, *(parameter.name for parameter in FREE_PARAMETERS)), 2.0 ** (-9)) | {
     "offset_scales": float(torch.tensor(0.01)),
     "appearance": 2.0**-5,
 }
@@ -49,7 +49,7 @@ def first_state(
 
     positions = numbers(anchors, 3)
     state: dict[FieldName, Tensor] = {
-        "anchor_positions": positions[space_order(positions, step=STEPS["anchor_positions"])],
+        "anchor_positions": positions[morton_order(positions, step=STEPS["anchor_positions"])],
         "offset_scales": numbers(anchors, 3),
         "base_scales": numbers(anchors, 3),
         "anchor_offsets": numbers(anchors, k, 3),
@@ -92,8 +92,10 @@ def header_for(state: dict[FieldName, Tensor], dynamic: frozenset[FieldName], *,
         K_matrix = torch.tensor([[40.0, 0, 24], [0, 40.25, 16], [0, 0, 1]], dtype=torch.float64)
         cameras[name] = Camera(viewmat, K_matrix, 48, 32, near=0.125)
     reference = dynamic - {"free", "free_births"}
-    init_steps: dict[FieldName, float] = {name: STEPS.get(name, 2.0**-6) for name in state if name not in AS_THEY_ARE}
-    static = on_bins({name: value for name, value in state.items() if name not in dynamic}, init_steps)
+    init_steps: dict[FieldName, float] = {
+        name: STEPS.get(name, 2.0**-6) for name in state if name not in UNCODED_FIELDS
+    }
+    static = round_to_bins({name: value for name, value in state.items() if name not in dynamic}, init_steps)
     return StreamHeader(
         rig=CameraRig(cameras, frozenset({"middle"})),
         similarity=Similarity((0.25, -0.5, 3.0), 0.75),
@@ -106,7 +108,7 @@ def header_for(state: dict[FieldName, Tensor], dynamic: frozenset[FieldName], *,
         metadata={"capture": "fixture"},
         steps=STEPS,
         init_steps=init_steps,
-        reference=quantised(state, STEPS, reference),
+        reference=dequantize_state(quantize_state(state, reference, STEPS), reference, STEPS),
     )
 
 
