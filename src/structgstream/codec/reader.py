@@ -381,7 +381,8 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
         if not complete and search.next(end, expected=frames, after_seconds=-math.inf) is not None:
             raise StreamError(
                 f"Cannot continue {name}: {incomplete_reason(data, end)}, and continuing would overwrite the whole "
-                f"frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them again."
+                f"frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them "
+                "again."
             )
         return end
     reason = incomplete_reason(data, end)
