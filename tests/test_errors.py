@@ -15,7 +15,7 @@ def test_the_drawn_tree_is_the_tree() -> None:
 
 def test_exhausted_memory_is_a_memory_error_too() -> None:
     assert issubclass(errors.OutOfMemoryError, MemoryError)
-    assert str(errors.OutOfMemoryError("to lift flow")).startswith("Memory does not suffice to lift flow; ")
+    assert str(errors.OutOfMemoryError("to lift flow")).startswith("Not enough memory to lift flow; ")
 
 
 def test_a_missing_extra_names_the_command_that_brings_it() -> None:

@@ -66,5 +66,5 @@ def test_where_a_stream_cannot_be_written(tmp_path: Path) -> None:
         check_output(tmp_path / "there.sgs", may_exist=False)
     with pytest.raises(StorageError, match="is a folder"):
         check_output(tmp_path, may_exist=True)
-    with pytest.raises(StorageError, match="cannot be made"):
+    with pytest.raises(StorageError, match="cannot be created"):
         check_output(tmp_path / "there.sgs" / "x" / "y.sgs", may_exist=False)

@@ -173,7 +173,7 @@ def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
 
 
 def test_a_target_rate_for_raw_packets_is_refused() -> None:
-    with pytest.raises(ConfigError, match="codec 'raw', whose packets are as large as they are"):
+    with pytest.raises(ConfigError, match="codec 'raw', which has no rate control"):
         run(MemorySink(), config=replace(CONFIG, codec="raw", rate=RateConfig(1.0)))
 
 

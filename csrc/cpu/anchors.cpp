@@ -168,7 +168,7 @@ void write_rows(const float* rows, int width, const Block& block, float* values)
         for (int l = 0; l < block.count; ++l) values[block.anchors[l] * width + column] = rows[column * kBlock + l];
 }
 
-// Rows of kBlock floats in one piece of memory: what is asked for first lies first.
+// Rows of kBlock floats in one allocation, in the order of requests.
 class Rows {
   public:
     int take(int rows) {
@@ -336,7 +336,7 @@ struct AttributeRows {
           bits(rows.take(s.words)) {}
 };
 
-// What the heads say to attributes: colours through the sigmoid, scales times their base, quaternions of length one.
+// Head outputs to attributes: sigmoid colours, scales times the base scale, unit quaternions.
 void activate(const AttributeRows& at, int k, float* memory) {
     float* color = row_of(memory, at.color);
     const float* base = row_of(memory, at.base);
@@ -354,7 +354,7 @@ void activate(const AttributeRows& at, int k, float* memory) {
     }
 }
 
-// The drawn Gaussians of a block, from active row `begin` on, to where they belong.
+// Writes the drawn Gaussians of a block, from active row `begin` on, to their output rows.
 void write_gaussians(
     const sgs_anchors& a, const sgs_selection& selection, const AttributeRows& at, const float* memory, int begin,
     const Block& block, const sgs_gaussians& out) {
@@ -365,7 +365,7 @@ void write_gaussians(
         const float* raw = selection.raw_opacities + static_cast<size_t>(selection.active[begin + l]) * k;
         const float* position = a.positions + anchor * 3;
         const int64_t start = selection.starts[begin + l], end = selection.starts[begin + l + 1];
-        for (int64_t j = 0, g = start; g < end; ++j) {  // writes what is not drawn too, and then over it
+        for (int64_t j = 0, g = start; g < end; ++j) {  // undrawn ones are overwritten by the next
             out.ids[g] = anchor * k + j;
             g += raw[j] > 0.0f;
         }
@@ -434,7 +434,7 @@ struct GradientRows {
     }
 };
 
-// What a block needs for no longer than itself.
+// Scratch memory of one block.
 struct ScratchRows {
     Rows rows;
     int input_gradient, means, bits;
@@ -457,7 +457,7 @@ struct SumPlaces {
     }
 };
 
-// Everything that the backward pass knows before it starts.
+// Inputs of the backward pass.
 struct Backward {
     const sgs_anchors& a;
     const sgs_selection& selection;
@@ -607,7 +607,7 @@ void block_backward(const Backward& b, int begin, int count, float* rows, float*
     }
 }
 
-// Adds what the blocks of a chunk say of the weights to a group's sums.
+// Adds the weight gradients of a chunk's blocks to a group's sums.
 void add_weights(const Backward& b, const float* rows, int blocks, float* sums) {
     const Sizes& s = b.s;
     const size_t stride = b.at.rows.size();

@@ -36,7 +36,7 @@ struct sgs_anchors {
     int32_t distance_input;          // 0 or 1
 };
 
-// What the first pass finds. An anchor is active when one of its opacities is positive.
+// Results of the first pass. An anchor is active when one of its opacities is positive.
 struct sgs_selection {
     float* raw_opacities;    // [m, K]
     int32_t* relu_bits;      // [m, 3, ceil(hidden / 32)]: which hidden units are on

@@ -84,7 +84,7 @@ struct Arithmetic {
         return byte;
     }
 
-    // In an encoder `low` is where the range begins, in a decoder how far behind that the bytes are.
+    // In an encoder `low` is the start of the range, in a decoder the offset of the code value from it.
     bool decide(bool yes, int chance) {
         const uint32_t bound = (range >> 16) * static_cast<uint32_t>(chance);
         if (!kEncodes) yes = low < bound;
@@ -230,7 +230,7 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
         for (int level = 0; level < 5; ++level) {
             const Pass pass = kPasses[level];
             for (int64_t b = pass.first; b < blocks; b += pass.step) {
-                // What an encoder knows of neighbours that a decoder does not know yet is not looked at.
+                // Neighbours that a decoder has not decoded yet are not used as context.
                 const int beside = level ? has[b - pass.first] + (b + pass.first < blocks ? has[b + pass.first] : 0) : 0;
                 const int32_t contexts[2] = {(last[b + 1] * 3 + beside) * 5 + level,
                                              (bit_length(ever[b], 5) * 11 + last[b] + last[b + 2]) * 3 + beside};

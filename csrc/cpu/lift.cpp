@@ -18,7 +18,7 @@ constexpr float kRobustPixels[] = {4.0f, 2.5f, 1.5f, 1.5f, 1.0f, 1.0f};
 constexpr float kInlierPixels = 1.5f;
 constexpr float kPriorShare = 0.02f, kPriorFloor = 0.05f, kTiny = 1e-12f;
 
-// What one view says of one neighbour: two rows of a Jacobian, the flow, and the weight. One array each, padded with
+// Data of one neighbour in one view: two rows of a Jacobian, the flow, and the weight. One array each, padded with
 // terms of weight zero to whole vectors.
 struct Terms {
     std::vector<float> columns[9];  // J00 J01 J02 J10 J11 J12 fx fy w

@@ -77,7 +77,7 @@ Result decode(const uint16_t* words, int64_t word_count, const uint32_t* initial
     }
     const uint32_t* row_of = rows.row_of.get();
     int64_t i = 0, position = 0;
-    // As long as every lane could take a word, none needs to ask whether one is left.
+    // While at least one word per lane is left, no bounds check is needed.
     for (; i + kLanes <= count && word_count - position >= kLanes; i += kLanes) {
         for (int lane = 0; lane < kLanes; ++lane) {
             uint32_t state = take(states[lane], row_of[contexts[i + lane]], rows, alphabet, symbols + i + lane);

@@ -2,7 +2,7 @@
 // Blending splats over tiles, forward and backward.
 //
 // A vector is a small block of pixels (4 x 4, 4 x 2 or 2 x 2). Backward replays forward front to back: it keeps
-// R = what is still to come of the pixel's colour, dotted with the pixel's gradient, so that
+// R = the remaining part of the pixel's colour (behind), dotted with the pixel's gradient, so that
 // dL/dalpha = T q - R / (1 - alpha) with q = color . gradient, and needs only the finished image.
 
 #include <algorithm>
@@ -98,7 +98,7 @@ struct Front {
     Front() {
         for (float& t : T) t = 1.0f;
     }
-    // What is behind a splat that covered a block with transmittance `before`.
+    // Transmittance behind a splat, from that in front of it, `before`.
     [[gnu::always_inline]] void pass(int block, vf before, const Coverage& c) {
         float* t = T + block * kLanes;
         const vf after = before * (1.0f - c.alpha);
@@ -153,7 +153,7 @@ void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float
     });
 }
 
-// The splat of pair `n`, of those before `end`. Neighbours in depth are far apart in memory: it asks for a later one.
+// The splat of pair `n`, of those before `end`. A later one is prefetched: neighbours in depth are far apart in memory.
 [[gnu::always_inline]] inline const Splat& splat_of(const Raster& raster, int n, int end) {
     __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)]]);
     return raster.splats[raster.pairs[n]];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the stages of the rasteriser share: projected splats, tiles, and the state that backward needs of forward.
+// Types of the rasteriser's stages: projected splats, tiles, and the state kept by forward for backward.
 #pragma once
 
 #include <cstddef>

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the loss compares, and the parts of the picture it is taken over.
+// The arguments of the loss, and the parts of the picture over which it is computed.
 #pragma once
 
 #include <cstdint>

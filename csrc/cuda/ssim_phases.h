@@ -39,7 +39,7 @@ constexpr int kAdjoints = 3;                           // of mean x, of xx + yy,
 constexpr int kAcross = 8;                             // pixels that a thread blurs across in one go
 constexpr int kDown = 4;                               // pixels that a thread blurs down in one go
 constexpr int kThreads = kTileNumbers * (kTile / kDown);
-constexpr int kSumThreads = 256;                       // of the block that adds what the blocks found
+constexpr int kSumThreads = 256;                       // of the block that adds the blocks' sums
 constexpr float kC1 = 0.01f * 0.01f;
 constexpr float kC2 = 0.03f * 0.03f;
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ring of synchronised cameras to a free-viewpoint video stream, frame by frame.
+"""Free-viewpoint video streams from synchronised cameras, reconstructed frame by frame.
 
-:func:`reconstruct` makes a stream of a capture, :func:`open_stream` opens it for looking at, :func:`evaluate` scores it
-and :func:`export` writes it in other formats. Cameras and points are in the units of the capture, except in a
+:func:`reconstruct` makes a stream from a capture, :func:`open_stream` opens it for rendering, :func:`evaluate` scores
+it and :func:`export` writes it in other formats. Cameras and points are in the units of the capture, except in a
 :class:`Scene`, which is normalised (``docs/conventions.md``).
 
-Names are resolved on first use, so that ``import structgstream`` costs nothing and needs no optional package.
+Names are imported on first use, so that ``import structgstream`` is fast and needs no optional package.
 """
 
 import importlib

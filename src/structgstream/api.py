@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a program asks for: a capture as a stream, a stream's scores, and a stream in other formats.
+"""The functions of ``import structgstream``: reconstruct a capture, evaluate a stream, export a stream.
 
-Each function is one command of ``structgstream`` with its defaults, without its display; cameras, points and rates are
-in the units of the capture. The names are those of ``import structgstream``.
+Each does what the command of the same name does by default, without output to the terminal. Cameras and points are in
+the units of the capture.
 """
 
 from collections.abc import Callable
@@ -49,38 +49,37 @@ def reconstruct(
     overwrite: bool = False,
     on_frame: Callable[[FrameReport], object] | None = None,
 ) -> list[FrameReport]:
-    """Turns a capture into a stream file, frame by frame, and returns when the last frame is stored.
+    """Reconstructs a capture to a stream file, frame by frame; returns after the last frame is stored.
 
-    Every frame is on the disk when ``on_frame`` is told of it. Whatever ends the call, Ctrl-C too, whole frames stay,
-    and the same call with ``resume`` goes on after them to the same bytes. Seconds by stage and memory of each frame
-    are in the log beside the stream, ``OUT.log.jsonl``.
+    A frame is on the disk before ``on_frame`` is called. If the call is interrupted, whole frames stay, and the same
+    call with ``resume`` continues after them and gives the same bytes. The log beside the stream, ``OUT.log.jsonl``,
+    has seconds by stage and memory of each frame.
 
     Args:
         capture: the folder of a capture, or an opened one.
         path: the stream file to write.
         preset: name of a preset, or a configuration (``dataclasses.replace`` on one of ``PRESETS``).
-        quality: of compact streams, -6 to 6: 0 is the preset's own, 1 makes every step half as large, -1 twice as
-            large.
-        mbits: of compact streams: the rate to keep to, in Mbit/s; None for constant quality.
-        seed: of everything random; None for the preset's.
+        quality: of compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.
+        mbits: of compact streams: target rate in Mbit/s; None for constant quality.
+        seed: random seed; None for the preset's.
         held_out: names of the cameras to keep from training; None for those that the capture's layout holds out.
         scale: size of the pictures relative to the stored ones, in (0, 1].
         start: first frame to use.
         frames: number of frames; None for all.
-        near: nothing nearer to a camera is drawn, in units of the capture; None for the capture's own.
-        backend: what computes; ``auto`` takes the first of cuda, cpu and reference that there is.
-        resume: go on after the last whole frame of ``path``.
-        overwrite: replace ``path`` when it exists.
-        on_frame: told of each frame.
+        near: distance of the near plane, in units of the capture; None for the capture's own.
+        backend: the compute back-end; ``auto`` takes the first available of cuda, cpu, reference.
+        resume: continue after the last whole frame of ``path``.
+        overwrite: replace ``path`` if it exists.
+        on_frame: called with the report of each frame.
 
     Returns:
         a report of each frame that was reconstructed in this call.
 
     Raises:
         CaptureError: the capture cannot be read, or contradicts itself.
-        ConfigError: arguments that cannot work, or a stream to resume that was made with others.
-        StorageError: ``path`` exists and is neither to be resumed nor to be replaced, or cannot be written.
-        StreamError: what is to be resumed is no stream.
+        ConfigError: invalid arguments, or others than those of the stream to resume.
+        StorageError: ``path`` exists without ``resume`` or ``overwrite``, or cannot be written.
+        StreamError: the file to resume is no stream.
         BackendError: the back-end is not available.
     """
     if resume and overwrite:
@@ -123,15 +122,15 @@ def evaluate(
     lpips_weights: Path | None = None,
     backend: Backend | BackendName = "auto",
 ) -> Report:
-    """Scores a stream file against what cameras took; everything is decoded from the file.
+    """Evaluates a stream file against the capture's pictures; everything is decoded from the file.
 
     Args:
         path: the stream file.
-        capture: the folder of the capture that it was made from, or this capture, opened as it was then.
-        cameras: names of the cameras to score; None for those that training did not see.
-        metrics: ``basic`` leaves out MS-SSIM, FLIP, LPIPS and the scores over time.
-        lpips_weights: folder or file with the weights that LPIPS needs; None for the usual places.
-        backend: what renders.
+        capture: the folder of the capture that it was made from, or that capture, opened with the same arguments.
+        cameras: names of the cameras to score; None for the held-out ones.
+        metrics: ``basic`` leaves out MS-SSIM, FLIP, LPIPS and the temporal metrics.
+        lpips_weights: folder or file with the weights of LPIPS; None for the default places.
+        backend: the compute back-end.
 
     Returns:
         the report, with a mean over all frames and cameras, and scores by frame and by camera.
@@ -172,20 +171,19 @@ def export(
         path: the stream file.
         output: where to write: ``NAME.html`` is one page that plays the stream; ``NAME.ply``, ``NAME.splat`` and
             ``NAME.spz`` are one frame; any other name is a folder. None for a file or a folder beside the stream.
-        format: of what is written; None for what the name of ``output`` says, else ``ply``. ``site`` is a folder for a
-            web server.
+        format: of the output; None for the suffix of ``output``, else ``ply``. ``site`` is a folder for a web server.
         frame: the only frame to write.
         frames: the first and the last frame to write; None for all.
         sh_degree: degree of the spherical harmonics, 0 to 2; None for 1, and 0 in a ``.splat``, which has none.
-        backend: what evaluates the MLPs.
+        backend: evaluates the MLPs.
 
     Returns:
         the file or the folder. Units and axes of plain Gaussians are the capture's own (``.spz``: y up, z back).
 
     Raises:
-        ConfigError: wishes that contradict each other, or a frame that is not there.
-        StreamError: the file is no stream, or nothing of it can be shown.
-        StorageError: something cannot be written.
+        ConfigError: contradictory arguments, or a frame that does not exist.
+        StreamError: the file is no stream, or no frame of it can be decoded.
+        StorageError: a file cannot be written.
         PlayerError: the stream is too long for a page.
         BackendError: the back-end is not available.
     """

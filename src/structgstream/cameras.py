@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pinhole cameras and the rig they stand in.
+"""Pinhole cameras and camera rigs.
 
 OpenCV axes (x right, y down, z forward), ``viewmat`` maps world to camera, ``K`` is in pixels with the centre of the
 top-left pixel at (0.5, 0.5). See ``docs/conventions.md``.
@@ -16,7 +16,7 @@ from structgstream.errors import CalibrationError
 
 
 class Viewport(NamedTuple):
-    """A camera as kernels take it, in the precision and on the device of what is drawn.
+    """A camera as kernels take it, with the dtype and device of the drawn tensors.
 
     Args:
         viewmat: ``[4, 4]`` world to camera.
@@ -24,7 +24,7 @@ class Viewport(NamedTuple):
         center: ``[3]`` position of the camera.
         width: pixels.
         height: pixels.
-        near: distance along z under which nothing is drawn.
+        near: distance of the near plane along z.
     """
 
     viewmat: Tensor
@@ -44,11 +44,11 @@ class Camera:
         K: ``[3, 3]`` float64, pixels.
         width: image width, pixels.
         height: image height, pixels.
-        near: distance along z under which nothing is drawn, in the units of the scene.
+        near: distance of the near plane along z, in the units of ``viewmat``.
 
     Raises:
-        CalibrationError: numbers that are not finite, a matrix that is not a rigid motion, or a focal length that is
-            not positive.
+        CalibrationError: a value is not finite, the view matrix is not rigid, or a focal length or size is not
+            positive.
     """
 
     viewmat: Tensor
@@ -88,7 +88,7 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def viewport(self, like: Tensor) -> Viewport:
-        """The camera in the precision and on the device of ``like``; kept, as a copy to a GPU waits."""
+        """The camera with the dtype and device of ``like``; cached, because a copy to a GPU blocks the host."""
         key = (like.dtype, like.device)
         if key not in self._viewports:
             self._viewports[key] = Viewport(
@@ -109,7 +109,7 @@ class Camera:
 class CameraRig:
     """Named cameras, fixed for the length of a stream, and which of them are held out from training.
 
-    The order of ``cameras`` is the order of everything that is stored per camera.
+    Everything that is stored per camera follows the order of ``cameras``.
     """
 
     cameras: Mapping[str, Camera]
@@ -138,7 +138,7 @@ class CameraRig:
 
     @property
     def training(self) -> tuple[str, ...]:
-        """Names of the cameras that training may see, in rig order."""
+        """Names of the cameras used for training, in rig order."""
         return tuple(name for name in self.cameras if name not in self.held_out)
 
     @property
@@ -156,5 +156,5 @@ class CameraRig:
         return replace(self, held_out=names)
 
     def mapped(self, cameras: Mapping[str, Camera]) -> "CameraRig":
-        """The same names and held-out set with other cameras (resized, normalised)."""
+        """The same names and held-out set with other cameras (for example resized)."""
         return replace(self, cameras=dict(cameras))

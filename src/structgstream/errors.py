@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that the package raises on purpose.
+"""The package's exceptions.
 
 ::
 
     StructGStreamError
     |-- CaptureError            a capture cannot be read, or contradicts itself
-    |   `-- CalibrationError    a camera's numbers are missing, broken or of another convention
-    |-- StreamError             a stream file is not ours, damaged, or of a newer major version
+    |   `-- CalibrationError    a camera's calibration is missing, invalid or of another convention
+    |-- StreamError             a file is not a stream, is damaged, or of another major version
     |-- StorageError            the stream cannot be written (disk full, no permission)
     |-- BackendError            a compute back-end is not available on this machine
-    |-- ConfigError             an option has a value that cannot work
-    |-- OutOfMemoryError        memory does not suffice for a kernel; a MemoryError too
+    |-- ConfigError             an option has an invalid value
+    |-- OutOfMemoryError        a kernel has not enough memory; also a MemoryError
     |-- PlayerError             the player cannot be served, or does not fit in a page
     `-- MissingExtraError       an optional dependency is not installed
 
-Each message is one sentence or two that say what was got, what was expected, and what to do. The command line prints it
-without a traceback and exits with status 1.
+Each message states in one or two sentences what was found, what was expected, and what to do. The command line prints
+it without a traceback and exits with status 1.
 """
 
 
 class StructGStreamError(Exception):
-    """The root of the package's errors: catching it catches everything raised on purpose."""
+    """Base class of the package's exceptions."""
 
 
 class CaptureError(StructGStreamError):
@@ -28,15 +28,15 @@ class CaptureError(StructGStreamError):
 
 
 class CalibrationError(CaptureError):
-    """A camera's calibration is missing, broken, or of another convention."""
+    """A camera's calibration is missing, invalid, or of another convention."""
 
 
 class StreamError(StructGStreamError):
-    """A stream is not one of ours, is damaged, or has a newer major version."""
+    """A file is not a stream of this format, is damaged, or has another major version."""
 
 
 class StorageError(StructGStreamError):
-    """The stream cannot be written; what was written before stays readable."""
+    """The stream cannot be written; packets written before stay readable."""
 
 
 class BackendError(StructGStreamError):
@@ -44,14 +44,14 @@ class BackendError(StructGStreamError):
 
 
 class ConfigError(StructGStreamError):
-    """A configuration value cannot work."""
+    """A configuration value is invalid."""
 
 
 class OutOfMemoryError(StructGStreamError, MemoryError):
-    """Memory does not suffice; the message says for what."""
+    """There is not enough memory; the message says for what."""
 
     def __init__(self, work: str) -> None:
-        super().__init__(f"Memory does not suffice {work}; end other programs, or take smaller pictures (--scale 0.5).")
+        super().__init__(f"Not enough memory {work}; close other programs, or use smaller pictures (--scale 0.5).")
 
 
 class PlayerError(StructGStreamError):
@@ -59,7 +59,7 @@ class PlayerError(StructGStreamError):
 
 
 class MissingExtraError(StructGStreamError):
-    """An optional dependency is missing; the message names the extra that brings it."""
+    """An optional dependency is missing; the message names the extra that installs it."""
 
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optical flow between two pictures of one camera, and where it can be believed."""
+"""Optical flow between two pictures of one camera, and its forward-backward consistency."""
 
 from collections.abc import Callable
 
@@ -11,11 +11,11 @@ from torch.nn.functional import grid_sample
 
 from structgstream.errors import MissingExtraError
 
-RELATIVE, ABSOLUTE = 0.01, 0.5  # of the check for occlusion: a share of the squared lengths, and squared pixels
+RELATIVE, ABSOLUTE = 0.01, 0.5  # thresholds of the consistency check: share of squared lengths; squared pixels
 
 FlowSearch = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32]]
-"""Pictures ``[H, W, 3]`` of one size; gives ``[H, W, 2]``, x and y in pixels: what is at ``p`` in the first picture is
-at ``p + flow[p]`` in the second."""
+"""From two pictures ``[H, W, 3]`` of one size to flow ``[H, W, 2]``, x and y in pixels: pixel ``p`` of the first
+picture corresponds to ``p + flow[p]`` in the second."""
 
 
 def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
@@ -23,9 +23,9 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
 
     Args:
         extra: the extra of this package that a user should install when OpenCV is missing.
-        refined: OpenCV's preset "medium"; else its "fast", down to half the pictures' size and without variational
-            refinement, which takes two fifths of the time and is as good where flow leads back
-            (:func:`consistency_mask`).
+        refined: OpenCV's preset "medium". False: preset "fast", stopped at half resolution and without variational
+            refinement; it takes two fifths of the time and is as accurate at consistent
+            pixels (:func:`consistency_mask`).
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -42,16 +42,17 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
 
     def flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
         one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second))
-        # calc goes on from the flow that it is given, and writes into it.
+        # calc starts from the flow that it is given and overwrites it.
         return np.asarray(search.calc(one, other, np.zeros((*one.shape, 2), np.float32)), np.float32)
 
     return flow
 
 
 def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which pixels ``[H, W]`` lead back to themselves, so that they are not occluded (Sundaram et al., 2010).
+    """Mask ``[H, W]`` of the pixels whose flow is forward-backward consistent, hence not occluded (Sundaram et al.,
+    2010).
 
-    With ``f`` the flow of a picture to another and ``b`` the one of that other back, ``[H, W, 2]``:
+    With ``f`` the forward and ``b`` the backward flow, ``[H, W, 2]``:
     ``|f(p) + b(p + f(p))|^2 <= 0.01 (|f(p)|^2 + |b(p + f(p))|^2) + 0.5``, and ``p + f(p)`` lies in the picture.
     """
     returned = sampled(back, flow)
@@ -61,14 +62,14 @@ def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> ND
 
 
 def inside(offsets: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which pixels ``[H, W]`` lead to a place between the centres of the picture's outermost pixels."""
+    """Mask ``[H, W]`` of the pixels that their offset moves to a position inside the outermost pixel centres."""
     height, width, _ = offsets.shape
     x, y = offsets[..., 0] + np.arange(width), offsets[..., 1] + np.arange(height)[:, None]
     return (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
 
 
 def sampled(values: NDArray[np.float32], offsets: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``values`` ``[H, W, C]`` at each pixel plus its offset, of the same shape: bilinear, border repeated."""
+    """``values`` ``[H, W, C]`` sampled at each pixel plus its offset, same shape: bilinear, border repeated."""
     height, width, _ = offsets.shape
     x = (torch.from_numpy(offsets[..., 0]) + torch.arange(width)) * (2 / max(width - 1, 1)) - 1
     y = (torch.from_numpy(offsets[..., 1]) + torch.arange(height)[:, None]) * (2 / max(height - 1, 1)) - 1

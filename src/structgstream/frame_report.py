@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happened to one frame: its numbers, and the clock and the memory meter that they are read from."""
+"""The report of one frame, and the meter of its seconds and memory."""
 
 import time
 from collections.abc import Iterator, Mapping, Sized
@@ -22,15 +22,14 @@ StateT = TypeVar("StateT", bound=Drawable)
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What happened to one frame.
+    """The report of one frame.
 
-    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors. ``field_bytes`` are those of
-    each field of the packet.
+    ``spawned`` and ``pruned`` count free Gaussians, ``grown`` and ``removed`` anchors. ``field_bytes`` are the packet's
+    bytes by field.
 
-    Peaks of memory are by stage: ``read``, ``fit``, ``store`` for encoding and writing, and ``prepare`` for what frame
-    0 leaves to later frames. ``peak_memory_kind`` says whether they are each stage's own (Note [Peaks]);
-    ``peak_device_bytes`` has the GPU's, when there is one. ``cpu_seconds`` is the time of all the process's threads
-    together, which other processes do not lengthen.
+    Peaks of memory are by stage: ``read``, ``fit``, ``store`` (encoding and writing), and ``prepare`` (computing frame
+    0's data for later frames). ``peak_memory_kind`` states whether they are per stage (Note [Peaks]);
+    ``peak_device_bytes`` are the GPU's, if any. ``cpu_seconds`` is the CPU time of all threads of the process.
     """
 
     index: int
@@ -55,7 +54,7 @@ class FrameReport:
 
 
 class FrameMeter:
-    """Seconds and memory of one frame's stages, which follow one another; the first begins on creation."""
+    """Measures seconds and memory of one frame's consecutive stages; the first starts on creation."""
 
     def __init__(self, device: torch.device) -> None:
         self._peaks = PeakMeter(device)
@@ -64,7 +63,7 @@ class FrameMeter:
         self._seconds: dict[str, float] = {}
 
     def end(self, stage: str, *, peak: str | None = None) -> None:
-        """A stage is over; so is the stage ``peak`` of memory, if that is named."""
+        """Ends a stage of time, and the stage ``peak`` of memory if that is given."""
         if peak is not None:
             self._peaks.end(peak)
         now = time.perf_counter()
@@ -97,7 +96,7 @@ class FrameMeter:
 
 
 def metered(items: Iterator[T], device: torch.device) -> Iterator[tuple[FrameMeter, T]]:
-    """Each item with the meter of its frame, whose stage ``read`` was getting it."""
+    """Each item with the meter of its frame, whose stage ``read`` is the time until the item was there."""
     while True:
         meter = FrameMeter(device)
         found = [*islice(items, 1)]
@@ -108,7 +107,7 @@ def metered(items: Iterator[T], device: torch.device) -> Iterator[tuple[FrameMet
 
 
 def counts(state: Drawable) -> dict[str, int]:
-    """``anchors`` and ``free`` Gaussians; all Gaussians of what has no anchors are free."""
+    """Numbers of ``anchors`` and ``free`` Gaussians; without anchors all Gaussians count as free."""
     if isinstance(state, Scene):
         return {"anchors": len(state.anchors), "free": len(state.free)}
     return {"anchors": 0, "free": len(state) if isinstance(state, Sized) else 0}

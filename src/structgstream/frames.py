@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One instant of a capture."""
+"""The pictures of one time step of a capture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class MultiViewFrame:
-    """The pictures that all cameras took at one instant.
+    """The pictures of all cameras at one time step.
 
     Args:
         index: position in the stream, 0 for the first reconstructed frame.
         pts_seconds: presentation time, 0 for the first reconstructed frame.
-        images: camera name to ``[H, W, 3]`` uint8 sRGB. A mapping, because real rigs mix sizes. Held-out cameras are
-            present when the source delivers them; training never reads them.
+        images: camera name to ``[H, W, 3]`` uint8 sRGB; sizes may differ between cameras. Held-out cameras are
+            included when the source delivers them; training never reads them.
     """
 
     index: int

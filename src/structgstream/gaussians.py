@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renderable Gaussians: what a scene looks like from one camera, ready for a rasteriser."""
+"""Gaussians after activation for one camera: the input of a rasteriser."""
 
 from dataclasses import dataclass, fields
 
@@ -17,7 +17,7 @@ class Gaussians:
         scales: ``[N, 3]`` standard deviations in scene units.
         opacities: ``[N]`` in (0, 1).
         colors: ``[N, 3]`` sRGB.
-        ids: ``[N]`` int64, the stable slot in the scene. See Note [Ids].
+        ids: ``[N]`` int64, identifies a Gaussian of the scene. See Note [Ids].
 
     Note [Ids]
     ~~~~~~~~~~
@@ -37,12 +37,12 @@ class Gaussians:
         return self.means.shape[0]
 
     def select(self, rows: Tensor) -> "Gaussians":
-        """The rows that a mask ``[N]`` or an index ``[n]`` names."""
+        """The rows of a mask ``[N]`` or of indices ``[n]``."""
         return Gaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Both sets in one, ``first`` before ``second``."""
+    """The rows of ``first``, then those of ``second``."""
     return Gaussians(
         means=torch.cat([first.means, second.means]),
         quats=torch.cat([first.quats, second.quats]),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a frame starts that has nothing before it: its seed and its points."""
+"""Seeds of frames, and initial points of frame 0."""
 
 import torch
 
@@ -10,14 +10,14 @@ from structgstream.similarity import Similarity
 
 
 def frame_seed(seed: int, index: int) -> int:
-    """A seed of its own for each frame, so that a frame can be repeated alone."""
+    """The seed of a frame, so that it can be repeated alone."""
     return (seed * 1_000_003 + index) % 2**63
 
 
 def initial_points_of(
     source: FrameSource, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
 ) -> torch.Tensor:
-    """Points ``[P, 3]`` of the capture or made from ``frame``, normalised, after a look at the poses."""
+    """Normalised points ``[P, 3]`` of the capture, or estimated from ``frame``, after checking the poses."""
     from structgstream.data.pose_check import check_poses
 
     check_poses(frame, source.rig)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The next item is made in a thread of its own while the present one is worked on."""
+"""Prefetching: a background thread computes the next item while the current one is processed."""
 
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,10 +10,10 @@ T = TypeVar("T")
 
 
 class Lookahead(Generic[T]):
-    """An iterator over ``items`` that is always one item ahead.
+    """An iterator over ``items`` that prefetches one item.
 
-    What goes wrong with an item is raised when it is asked for, not before. Leaving the ``with`` block waits for the
-    item that is being made, and closes ``items`` if they can be closed.
+    An exception raised by ``items`` surfaces from the ``next`` call that would have returned that item. Leaving the
+    ``with`` block waits for the item being computed, and calls ``items.close`` if it exists.
     """
 
     def __init__(self, items: Iterator[T]) -> None:
@@ -36,7 +36,7 @@ class Lookahead(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        """The item that is ready, or will be next; the one after it is begun.
+        """Returns the prefetched item, waiting for it if necessary, and starts the one after it.
 
         Raises:
             StopIteration: there is none.

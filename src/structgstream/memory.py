@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory the process holds, and the most it held during each stage of its work.
+"""Memory use of the process: now, and its peak during each stage.
 
 Note [Peaks]
 ~~~~~~~~~~~~
-The system keeps one high-water mark of the resident size for the whole process. Linux lets a process set it back
+The system keeps one high-water mark of the resident size for the whole process. Linux lets a process reset it
 (``/proc/self/clear_refs``, proc_pid_clear_refs(5)), so that the mark at the end of a stage (``VmHWM`` of
-``/proc/self/status``) is that stage's own. Elsewhere the mark only rises, and a stage's number means "up to the end of
-this stage". It counts all threads: what a frame decoded ahead holds belongs to the stage that it is decoded in. Whoever
-else reads the mark, ``ru_maxrss`` included, sees it set back.
+``/proc/self/status``) is the peak of that stage. Elsewhere the mark only rises, and a stage's value is the peak since
+the process started. It covers all threads: a prefetched frame counts in the stage during which it is decoded. Other
+readers of the mark, ``ru_maxrss`` included, see the reset value.
 """
 
 import sys
@@ -22,22 +22,22 @@ _RESET_PEAK = "5"
 
 
 class PeakKind(StrEnum):
-    """What the numbers of a :class:`PeakMeter` mean."""
+    """What the values of a :class:`PeakMeter` mean."""
 
     STAGE = "stage"  # the stage's own peak
     PROCESS = "process"  # the process's peak up to the end of the stage
-    NONE = "none"  # the system does not tell
+    NONE = "none"  # not available on this system
 
 
 class PeakMeter:
-    """Takes the peak memory of stages that follow one another (Note [Peaks]); the first begins on creation.
+    """Measures the peak memory of consecutive stages (Note [Peaks]); the first starts on creation.
 
     Args:
-        device: its memory is measured beside the process's when it is a CUDA device; torch's allocations only.
+        device: if it is a CUDA device, torch's allocations on it are measured too.
 
     Attributes:
         kind: what ``process_bytes`` holds.
-        process_bytes: stage to largest resident size; empty where the system does not tell.
+        process_bytes: stage to largest resident size; empty where the system does not report it.
         device_bytes: stage to largest size of allocated tensors; empty without a CUDA device.
     """
 
@@ -48,7 +48,7 @@ class PeakMeter:
         self.kind = self._restart()
 
     def end(self, stage: str) -> None:
-        """Notes the peak of the stage that ends here; the next begins."""
+        """Records the peak of the stage that ends here and starts the next."""
         peak = status_bytes("VmHWM") if self.kind is PeakKind.STAGE else process_peak_bytes()
         if peak is not None:
             self.process_bytes[stage] = peak
@@ -70,12 +70,12 @@ class PeakMeter:
 
 
 def resident_bytes() -> int | None:
-    """What the process holds in memory now; None where the system does not tell."""
+    """Resident size of the process now; None where the system does not report it."""
     return status_bytes("VmRSS")
 
 
 def status_bytes(name: str) -> int | None:
-    """A size of ``/proc/self/status``; None where there is no such line."""
+    """The size of that name in ``/proc/self/status``, in bytes; None where there is no such line."""
     try:
         lines = _STATUS.read_text().splitlines()
     except OSError:
@@ -86,7 +86,7 @@ def status_bytes(name: str) -> int | None:
 
 
 def process_peak_bytes() -> int | None:
-    """The process's largest resident size so far, or since Linux was told to set it back; None where unknown."""
+    """Largest resident size of the process, on Linux since the last reset; None where unknown."""
     try:
         import resource
     except ImportError:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The player in a notebook: ``structgstream.notebook.Player("ball.sgs")`` as the last line of a cell.
 
-Needs the extra ``notebook``. The stream travels with the widget, so a notebook that is saved with its widgets' state
-plays on without Python.
+Needs the extra ``notebook``. The stream is part of the widget's state, so a notebook saved with that state plays
+without Python.
 """
 
 from pathlib import Path
@@ -17,8 +17,8 @@ try:
 except ModuleNotFoundError as error:
     raise MissingExtraError(error.name or "anywidget", "notebook") from None
 
-# What stands behind the bundle, which defines the element: how a notebook shows one, and takes it away. A player opens
-# streams while it is in a page, and a notebook may put what is rendered there later.
+# Appended to the bundle, which defines the element: creates and removes it. A player opens streams only while it is in
+# the document, and a notebook may insert the rendered element later.
 _WIDGET = """
 export default {
   render({ model, el }) {
@@ -54,14 +54,14 @@ class Player(anywidget.AnyWidget):
     """A player as the output of a notebook's cell.
 
     Args:
-        stream: a stream file, as long as it is now, or a stream's bytes.
+        stream: a stream file, read at its present length, or a stream's bytes.
         height_pixels: of the player; it is as wide as the cell.
 
     Attributes:
-        stream: the bytes that are shown; assigning others shows those.
+        stream: the bytes of the shown stream; assigning others replaces it.
 
     Raises:
-        StreamError: nothing of the stream can be shown.
+        StreamError: no frame of the stream can be decoded.
         PlayerError: the installation lacks the player.
     """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes a stream of a capture: a method that fits frames, and a codec that stores them.
+"""Protocols of a pipeline: a method that fits frames, and a codec that stores them.
 
-Struct-GStream with its two codecs is one pipeline (``struct_gstream.py``), every peer is another (``peers/``);
+Struct-GStream with its two codecs is a pipeline (``struct_gstream.py``), every peer is another (``peers/``);
 ``session.py`` runs them all.
 """
 
@@ -27,25 +27,25 @@ from structgstream.training.pictures import FramePictures
 from structgstream.training.result import FitResult, StepListener
 
 State = TypeVar("State", bound=Drawable)
-"""A frame as a receiver holds it; it may have a length, its number of Gaussians."""
+"""A decoded frame; it may have a length, its number of Gaussians."""
 State_co = TypeVar("State_co", bound=Drawable, covariant=True)
 Memory = TypeVar("Memory")
-"""What the encoder alone keeps from frame 0 on."""
+"""Data of frame 0 that the encoder keeps and a receiver does not have."""
 
 
 @dataclass(frozen=True)
 class FrameTask:
-    """What a method is given to fit one frame; everything in normalised units.
+    """Input of a method for one frame, in normalised units.
 
     Args:
         frame: its pictures and its time.
-        pictures: those of the training cameras, as the method observed them.
-        rig: all cameras; held-out ones are not looked at.
-        points: makes initial points ``[P, 3]`` of the frame, which may take a while.
-        backend: what computes.
-        seed: all randomness comes from it, so a frame can be repeated alone.
-        steps: of what the codec sends rounded, by name; empty in frame 0.
-        pressure: how hard bytes must be saved (``rate_control``, Note [Pressure]).
+        pictures: of the training cameras, preprocessed by :meth:`Method.observe`.
+        rig: all cameras; held-out ones are not used.
+        points: computes initial points ``[P, 3]`` of the frame, which may take a while.
+        backend: the compute back-end.
+        seed: of all random numbers, so that a frame can be repeated alone.
+        steps: the codec's quantization steps by name; empty in frame 0.
+        pressure: of the rate control (``rate_control``, Note [Pressure]).
         on_step: called after every optimisation step.
     """
 
@@ -62,12 +62,12 @@ class FrameTask:
 
 @dataclass(frozen=True)
 class Past(Generic[State, Memory]):
-    """What a frame is fitted after.
+    """The state from which a frame is fitted.
 
     Args:
-        state: the decoded frame before it (``codec.encoder``, Note [Closed loop]).
+        state: the previous decoded frame (``codec.encoder``, Note [Closed loop]).
         memory: see :meth:`Method.prepare`.
-        older: the decoded frame before that, for methods that ask for it.
+        older: the decoded frame before that, if the method needs it.
     """
 
     state: State
@@ -76,22 +76,22 @@ class Past(Generic[State, Memory]):
 
 
 class Method(Protocol[State, Memory]):
-    """How frames are fitted. A frame depends on its task and its past alone, so that a resumed stream is the same."""
+    """Fits frames. A frame depends only on its task and its past, so that a resumed stream is identical."""
 
     @property
     def needs_before(self) -> bool:
-        """Whether :meth:`observe` looks at the pictures of the frame before."""
+        """Whether :meth:`observe` needs the pictures of the previous frame."""
         ...
 
     @property
     def needs_older(self) -> bool:
-        """Whether a frame is fitted after the two decoded frames before it, instead of one."""
+        """Whether a frame depends on the two decoded frames before it, instead of one."""
         ...
 
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        """What the pictures tell by themselves; called while the frame before is fitted, in a thread of its own."""
+        """Preprocesses pictures independently of the scene; called in a thread while the previous frame is fitted."""
         ...
 
     def first(self, task: FrameTask) -> FitResult[State]:
@@ -99,7 +99,7 @@ class Method(Protocol[State, Memory]):
         ...
 
     def prepare(self, state: State, task: Callable[[], FrameTask]) -> Memory:
-        """What later frames need of the decoded frame 0 and, if the method asks, of its task."""
+        """The data that later frames need of the decoded frame 0 and, if ``task`` is called, of its pictures."""
         ...
 
     def next(self, past: Past[State, Memory], task: FrameTask) -> FitResult[State]:
@@ -109,7 +109,7 @@ class Method(Protocol[State, Memory]):
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """What the header says of a run, and what a run must share with the stream that it continues.
+    """Facts of a run for the header, which must be equal in a run that continues the stream.
 
     Args:
         codec: name of the codec.
@@ -129,7 +129,7 @@ class StreamFacts:
 
 
 class StoredStream(Protocol[State_co]):
-    """What a file holds already: ``StreamReader`` is one."""
+    """The existing frames of a file, such as a ``StreamReader``."""
 
     @property
     def header(self) -> StreamHeader: ...
@@ -152,23 +152,23 @@ class StoredStream(Protocol[State_co]):
 
 
 class FrameCoder(Protocol[State]):
-    """Encodes and decodes the frames of one stream, in order; ``SceneEncoder`` is one."""
+    """Encodes and decodes the frames of one stream in order, such as a ``SceneEncoder``."""
 
     def encode(self, state: State, /, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[State]:
-        """The packet of a frame, and what the decoder makes of it."""
+        """The packet of a frame, and its reconstruction."""
         ...
 
     def replay(self, packet: Packet) -> State:
-        """Decode a packet that is there already, and go on after it."""
+        """Decode an existing packet, and continue after it."""
         ...
 
 
 class StreamCodec(Protocol[State]):
-    """How frames are stored."""
+    """Stores frames."""
 
     @property
     def name(self) -> str:
-        """What the header's ``codec`` says."""
+        """The value of the header's ``codec``."""
         ...
 
     def key_interval(self, fps: float) -> int:
@@ -176,30 +176,30 @@ class StreamCodec(Protocol[State]):
         ...
 
     def file(self, path: Path, *, frames: int, resume: bool) -> tuple[PacketSink, StoredStream[State] | None]:
-        """The file that the stream goes to, ``frames`` long in the end, and what it holds, if it is to be resumed."""
+        """A sink to the file, which will have ``frames`` frames, and its existing frames if it is resumed."""
         ...
 
     def prepare(self, fitted: State, task: FrameTask, facts: StreamFacts) -> tuple[State, StreamHeader]:
-        """Frame 0 as the frames after it start from it, and the header of the stream."""
+        """Frame 0 as later frames and receivers get it, and the header of the stream."""
         ...
 
     def coder(self, header: StreamHeader, device: torch.device) -> FrameCoder[State]:
-        """What encodes and decodes the stream of this header; states that it decodes may lie on ``device``."""
+        """The coder of the stream of this header; decoded states may be on ``device``."""
         ...
 
 
 @dataclass(frozen=True)
 class Pipeline(Generic[State, Memory]):
-    """A method and a codec, with what decides their result.
+    """A method and a codec with their configuration.
 
     Args:
-        method: fits.
-        codec: stores.
+        method: fits frames.
+        codec: stores frames.
         config: the resolved configuration as plain JSON values: the header's ``config``.
-        seed: of everything random.
+        seed: of all random numbers.
         normalised_radius: largest distance of a training camera to their mean after normalisation.
-        points: how initial points are made when the capture brings none.
-        rate: a rate to keep to.
+        points: configuration of initial points, for captures without points.
+        rate: rate control.
         metadata: plain JSON values for every header.
     """
 

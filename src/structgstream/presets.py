@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configurations as values. Paper mode is a preset, not a fork; the paper's ablations are edits of one."""
+"""Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
 from collections.abc import Mapping
@@ -29,23 +29,25 @@ MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """Everything that decides what a reconstruction gives, apart from the capture and the machine."""
+    """Everything that determines a reconstruction, apart from the capture and the machine."""
 
     initial: InitialConfig = field(default_factory=InitialConfig)
     online: OnlineConfig = field(default_factory=OnlineConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
-    """How initial points are made from frame 0 when the capture brings none."""
+    """Initial points from frame 0, for captures without points."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
-    """What is drawn where no camera saw anything."""
+    """Background of unobserved directions."""
     normalised_radius: float = 1.0
-    """Largest distance of a training camera to their mean after normalisation; rates and voxel sizes refer to it."""
+    """Largest distance of a training camera to their mean in normalised units, to which learning rates and voxel sizes
+    refer (paper: not stated)."""
     key_interval_seconds: float = 1.0
-    """A key packet, from which a viewer can start, comes this often in media time."""
+    """Interval of key packets, at which a viewer can start, in seconds of media time."""
     codec: Literal["raw", "compact"] = "raw"
-    """How frames are coded: as float32, or rounded (``online.rounding``) and entropy coded."""
+    """Coding of frames: ``raw`` float32, or ``compact``, quantized (``online.rounding``) and entropy coded."""
     rate: RateConfig = field(default_factory=RateConfig)
-    """A rate to keep to; only with the codec ``compact``."""
+    """Rate control; only with the codec ``compact``."""
     seed: int = 0
+    """Random seed."""
 
 
 def to_json(config: StreamConfig) -> dict[str, Any]:
@@ -75,16 +77,16 @@ def preset_named(name: str) -> StreamConfig:
 
 
 def with_budget(config: StreamConfig, *, name: str | None, quality: float | None, mbits: float | None) -> StreamConfig:
-    """``config`` with another quality, and with a rate to keep to, as far as they are given.
+    """``config`` with another quality and a target rate, if they are given.
 
     Args:
         config: of a compact stream.
-        name: its preset's, for messages.
-        quality: of compact streams, 0 is the preset's own, and 1 more makes every step half as large.
-        mbits: of compact streams, the rate in Mbit/s.
+        name: of its preset, for messages.
+        quality: every quantization step is multiplied by 2^-quality; 0 is the preset's own.
+        mbits: target rate in Mbit/s.
 
     Raises:
-        ConfigError: the stream's codec has neither, or the value is out of range.
+        ConfigError: the codec is not ``compact``, or a value is out of range.
     """
     if quality is None and mbits is None:
         return config
@@ -111,7 +113,7 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
 
 
 def with_decay(rates: InitialRates, share: float) -> InitialRates:
-    """The same first rates, every one of them falling to ``share`` of itself over the schedule."""
+    """The same initial learning rates, each decaying to ``share`` of itself over the schedule."""
     return InitialRates(
         **{name: LearningRate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
     )
@@ -125,16 +127,16 @@ Section Implementations gives one set of them for all data sets; what differs is
 
 @dataclass(frozen=True)
 class PaperData:
-    """What the paper says of one data set (section Datasets): all that differs between its experiments.
+    """The paper's properties of one data set (section Datasets), which are all that differs between its experiments.
 
     Args:
-        width: of the pictures that are trained on and scored, in pixels, after whatever reduction.
+        width: of the pictures that are trained on and scored, pixels, after reduction.
         height: the same.
-        cameras: of the rig.
-        held_out: how many of them are for testing; None where the paper does not say.
-        held_out_camera: which one published results keep from training.
-        scale: of the pictures to those that the data set stores; ``--scale`` of ``reconstruct``.
-        undistorted: whether pictures of fisheye lenses were made rectilinear first.
+        cameras: number of cameras of the rig.
+        held_out: number of held-out cameras; None if the paper does not state it.
+        held_out_camera: the camera that published results hold out.
+        scale: of the pictures relative to the stored ones; ``--scale`` of ``reconstruct``.
+        undistorted: whether fisheye pictures were undistorted first.
     """
 
     width: int
@@ -153,11 +155,11 @@ PAPER_DATA: Mapping[str, PaperData] = {
         1280, 960, cameras=46, held_out=1, held_out_camera="camera_0001", scale=0.5, undistorted=True
     ),
 }
-"""By the preset that is named after it. They belong to the capture, so no configuration can hold them."""
+"""By the preset named after the data set. They are properties of the capture, so they are not in the configuration."""
 
 
 def departures(preset: str, rig: CameraRig) -> list[str]:
-    """In what a rig is not that of the paper's data set, a few words each; nothing for presets of no data set."""
+    """Differences of a rig to that of the paper's data set, a few words each; empty for presets of no data set."""
     data = PAPER_DATA.get(preset)
     if data is None:
         return []
@@ -165,8 +167,8 @@ def departures(preset: str, rig: CameraRig) -> list[str]:
     sizes = sorted({(rig[name].width, rig[name].height) for name in rig})
     if sizes != [(data.width, data.height)]:
         theirs = ", ".join(f"{width}x{height}" for width, height in sizes)
-        scaled = "" if data.scale == 1.0 else f" (--scale {data.scale:g} of those stored)"
-        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}{scaled}")
+        reduced = "" if data.scale == 1 else f" (--scale {data.scale:g} of the stored)"
+        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}{reduced}")
     if len(rig.cameras) != data.cameras:
         found.append(f"{len(rig.cameras)} cameras instead of {data.cameras}")
     if data.held_out is not None and len(rig.testing) != data.held_out:
@@ -189,14 +191,14 @@ RIG = StreamConfig(
     ),
     online=OnlineConfig(patching=PatchingConfig(max_free=100_000)),
 )
-"""The paper's online method on any rig: exposures are equalised, frame 0 is annealed and starts on small pictures, and
-the free set, which the paper lets grow without end, is bounded."""
+"""The paper's online method on any rig: exposures are equalised, frame 0's learning rates decay and it starts on
+reduced pictures, and the number of free Gaussians, unbounded in the paper, is bounded."""
 
 MOTION = replace(
     RIG,
     online=replace(RIG.online, motion=MotionConfig(enabled=True)),
 )
-"""As RIG, but only what moves is fitted. F_Sigma stays as it is: what stands still depends on it."""
+"""As RIG, but only movers are trained. F_Sigma is held, because still anchors depend on it."""
 
 COMPACT = replace(
     MOTION,
@@ -238,9 +240,9 @@ COMPACT = replace(
         rounding=RoundingConfig(free_priced=True),
     ),
 )
-"""As MOTION, in small packets: what moves is sent rounded, against the frame before, and may change its looks. Frame 0
-starts from few seeds and grows where gradients are strong, its surfaces are made solid, it is disturbed while it is
-fitted, so that it does not learn its cameras by heart, and it stands before an environment."""
+"""As MOTION, with small packets: dynamic fields are quantized and predicted from the previous frame, and appearance is
+dynamic. Frame 0 starts from few seeds and grows where gradients are large, with dropout and perturbation against
+overfitting, the depth regulariser, and an environment."""
 
 FAST = replace(
     COMPACT,
@@ -260,7 +262,7 @@ FAST = replace(
         ),
     ),
 )
-"""A try in minutes on a laptop: as COMPACT, after a shorter frame 0."""
+"""As COMPACT with a shorter frame 0, for a first result in minutes on a laptop."""
 
 TINY = replace(
     FAST,
@@ -273,7 +275,7 @@ TINY = replace(
     ),
     online=replace(FAST.online, iterations=10, patching=replace(FAST.online.patching, iteration=5)),
 )
-"""Seconds, for tests: the same code, results of no quality."""
+"""As FAST with few iterations, for tests; low quality."""
 
 PRESETS: dict[str, StreamConfig] = {
     "paper-n3dv": PAPER,
@@ -287,5 +289,5 @@ PRESETS: dict[str, StreamConfig] = {
 }
 DEFAULT_PRESET = "compact"
 PAPER_METHOD_PRESET = "rig"
-"""What the paper's ablations are edits of, and what others are compared with."""
+"""The preset that the paper's ablations edit, and that is compared with other methods."""
 DEMO_PRESET = "fast"

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How hard bytes must be saved so that a stream keeps to a rate.
+"""Rate control: adapts the price of bits so that a stream keeps to a target rate.
 
 Note [Pressure]
 ~~~~~~~~~~~~~~~
-The steps of a stream are in its header and stay. What can change from frame to frame is the price of a bit while it
-is fitted, and how readily free Gaussians are born. Both follow one number, the pressure: 1 is what the configuration
-says. It follows from the packets so far alone, so a resumed stream goes on as it would have.
+The quantization steps of a stream are fixed in its header. Rate control changes the price of a bit in the loss, and the
+gradient threshold for spawning free Gaussians, by one factor, the pressure; 1 leaves the configuration's values. It is
+a function of the sizes of earlier packets only, so that a resumed stream is identical.
 
 Note [Windows]
 ~~~~~~~~~~~~~~
-The room of a delta packet comes from the window that ends a third of its length from now: what its past part has cost
-is known, what a key packet in its future part will cost is foretold, and the rest is for the delta packets there. A
-key packet is thus saved for before it comes. It says everything since frame 0, and takes a delta packet times the root
-of its frame's number (0.98 to 1.13 of that in 3 streams of 2 captures, frames 1 to 19).
+The budget of a delta packet is taken from the window that ends a third of its length in the future: the sizes of its
+past packets are known, the size of a key packet in its future part is predicted, and the remainder is shared by the
+delta packets there. So bytes are saved before a key packet comes. A key packet has all changes since frame 0; its size
+is predicted as that of a delta packet times the square root of its frame number (0.98 to 1.13 times that in 3 streams
+of 2 captures, frames 1 to 19).
 """
 
 import logging
@@ -27,35 +28,36 @@ _log = logging.getLogger(__name__)
 
 LEAST, MOST = 1.0 / 16.0, 1024.0
 _AHEAD = 1.0 / 3.0
-"""Of the window: it ends so far ahead."""
+"""Share of the window that lies in the future."""
 _FALL, _RISE = 0.5, 4.0
-"""From frame to frame the pressure falls and rises at most so far."""
+"""Bounds of the factor by which the pressure changes per frame."""
 _MISSED = 1.1
-"""A window that costs so many times its budget has missed the target."""
+"""A window above this multiple of its budget has missed the target."""
 
 
 @dataclass(frozen=True)
 class RateConfig:
-    """What a stream may cost."""
+    """Target of the rate control."""
 
     target_mbits: float | None = None
-    """Megabits a second of media time; None: constant quality, whatever it costs."""
+    """Target rate in megabits per second of media time; None: constant quality without rate control."""
     window_seconds: float = 1.0
-    """The target holds over this long, the header left aside. At least the interval of key packets, which are large."""
+    """Window, in seconds of media time, over which the target holds, without the header; at least the interval of key
+    packets."""
 
 
 class RateController:
-    """Told of every packet in order, it knows the pressure for the next frame.
+    """Computes the pressure of the next frame from the sizes of all packets in order.
 
-    The price of a bit grows by what the last delta packet was over the room that the next one has; since bytes fall
-    with about the cube root of the price, that answers a third of the excess.
+    The pressure is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
+    about the cube root of the price, so each step corrects about a third of the excess.
 
     Args:
         config: the target.
         fps: frames per second of the media.
         key_interval: frames from one key packet to the next.
 
-    A target that is missed is logged as a warning when it begins to be.
+    A warning is logged when the target starts to be missed.
 
     Raises:
         ConfigError: a target or window that is not positive, or a window shorter than a group.
@@ -88,7 +90,7 @@ class RateController:
         self._said = False
 
     def add(self, size: int, kind: PacketKind) -> None:
-        """A packet of ``size`` bytes was written."""
+        """Record a written packet of ``size`` bytes."""
         if self._budget is None:
             return
         self._last.append(size)
@@ -96,7 +98,7 @@ class RateController:
         if kind is PacketKind.DELTA:
             self._usual = size if self._delta is None else 0.8 * self._usual + 0.2 * size
             self._delta = size, self.pressure
-        elif self._count > 1:  # The first one has only free Gaussians, if any.
+        elif self._count > 1:  # The first key packet is nearly empty: the header has its fields.
             self._key = size, self._count - 1
         if self._delta is not None:
             last, pressure = self._delta
@@ -115,7 +117,7 @@ class RateController:
         self._said = self.missed
 
     def _room(self, budget: float) -> float:
-        """Bytes of the next delta packet (Note [Windows])."""
+        """Budget of the next delta packet in bytes (Note [Windows])."""
         assert self._last.maxlen is not None, "a window has a length"
         keys = sum(1 for frame in range(self._count, self._count + self._ahead) if frame % self._interval == 0)
         past = [*self._last][max(len(self._last) - (self._last.maxlen - self._ahead), 0) :]
@@ -123,21 +125,21 @@ class RateController:
         return min(max(left / max(self._ahead - keys, 1), budget / 4.0), 3.0 * budget)
 
     def _next_key(self) -> float:
-        """What the next key packet will take (Note [Windows])."""
+        """Predicted size of the next key packet in bytes (Note [Windows])."""
         frame = -(-self._count // self._interval) * self._interval
         size, known = (self._usual, 1) if self._key is None else self._key
         return size * (frame / known) ** 0.5
 
     @property
     def rate_mbits(self) -> float | None:
-        """What the last window has cost; None without a target."""
+        """Rate of the last window; None without a target."""
         if self._budget is None or not self._last:
             return None
         return sum(self._last) * 8e-6 * self._fps / len(self._last)
 
     @property
     def missed(self) -> bool:
-        """Whether a whole window has cost clearly more than its budget."""
+        """Whether a complete window exceeds its budget by more than :data:`_MISSED` allows."""
         return (
             self._budget is not None
             and len(self._last) == self._last.maxlen
@@ -146,7 +148,7 @@ class RateController:
 
 
 def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
-    """``config`` under a pressure: a bit costs so many times as much, a birth asks for the root of it more gradient."""
+    """``config`` with the price of a bit times ``pressure``, and the spawning threshold times its square root."""
     if pressure == 1.0:
         return config
     rounding, patching = config.rounding, config.patching

@@ -19,7 +19,7 @@ from structgstream.session import Session
 from structgstream.training.result import StepListener
 
 LogExtras = Callable[[FrameReport], Mapping[str, Any]]
-"""What a frame's line of the log holds beside its report."""
+"""Further entries of a frame's line in the log."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,8 @@ class Run:
     """A reconstruction into a file.
 
     Args:
-        done: how many frames the file held before.
-        reports: of the frames that are not there yet; each comes as the generator is advanced, when the frame is stored
-            and noted in the log.
+        done: number of frames that the file had before.
+        reports: of the further frames; advancing the generator fits, stores and logs a frame.
     """
 
     done: int
@@ -49,22 +48,22 @@ def record(
 ) -> Run:
     """Reconstructs a capture into a file, with a log beside it.
 
-    What is there is checked and the log begun in the call; the file is written as the reports are taken.
+    The call checks an existing file and starts the log; the file is written as the reports are consumed.
 
     Args:
-        path: the file; what is there is replaced unless it is resumed.
+        path: the file; an existing one is replaced unless it is resumed.
         source: the capture; its frames are read ahead.
-        pipeline: how frames are fitted and stored.
-        backend: what computes.
-        resume: go on after the last whole frame of what is there.
-        metadata: plain JSON values for the header, the same in every run that is to be resumed.
+        pipeline: fits and stores frames.
+        backend: the compute back-end.
+        resume: continue after the last whole frame of an existing file.
+        metadata: plain JSON values for the header, equal in all runs of a stream.
         on_step: called after every optimisation step.
         remarks: see :data:`LogExtras`.
 
     Raises:
-        ConfigError: what is to be resumed was made with another configuration or from another capture.
-        StreamError: what is to be resumed is no stream, or damaged where nothing can be saved.
-        StorageError: the file or the log cannot be written; whole frames are in the file.
+        ConfigError: the file to resume was made with another configuration or from another capture.
+        StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
+        StorageError: the file or the log cannot be written; whole frames stay in the file.
     """
     sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
     session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
@@ -75,12 +74,12 @@ def record(
 def log_reports(
     reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
-    """The reports of a session, each noted in the log beside ``path`` before it is passed on.
+    """The reports of a session, each written to the log beside ``path`` before it is yielded.
 
     Args:
         reports: closed with the result.
         path: the file that the session writes.
-        done: how many frames it holds already, whose lines of the log stay.
+        done: number of existing frames, whose lines of the log are kept.
         remarks: see :data:`LogExtras`.
 
     Raises:
@@ -101,10 +100,10 @@ def _append_reports(
 
 
 def check_output(path: Path, *, may_exist: bool) -> None:
-    """Whether the stream can be written is found out before the first frame takes its minutes.
+    """Check that the stream can be written, before frame 0 is fitted for minutes.
 
     Raises:
-        StorageError: the file exists, its folder cannot be made, or nothing may be written there.
+        StorageError: the file exists, its folder cannot be created, or there is no permission to write.
     """
     if path.is_dir():
         raise StorageError(f"{path} is a folder; give the name of a file, such as {path / 'scene.sgs'}.")
@@ -115,6 +114,6 @@ def check_output(path: Path, *, may_exist: bool) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StorageError(f"The folder {path.parent} cannot be made ({error.strerror}).") from None
+        raise StorageError(f"The folder {path.parent} cannot be created ({error.strerror}).") from None
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise StorageError(f"{path} cannot be written (no permission).")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a stream can be continued: only by the same run, or its frames would not fit together."""
+"""Checks whether a stream can be continued, which needs the same configuration and capture."""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,7 +10,7 @@ from structgstream.pipeline import StreamFacts
 
 
 def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
-    """Refuses to continue a stream with another method, configuration or capture.
+    """Check that a stream was made with the same method, configuration and capture.
 
     Raises:
         ConfigError: naming what differs.
@@ -36,7 +36,7 @@ def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
 
 
 def _capture_facts(rig: CameraRig, fps: float, metadata: Mapping[str, object]) -> dict[str, object]:
-    """What two captures must have in common for their frames to fit into one stream, as plain values."""
+    """The properties of a capture that must be equal to continue a stream, as plain values."""
     cameras = {
         name: {
             "viewmat": rig[name].viewmat.tolist(),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two codecs of scenes: ``raw`` and ``compact``, with the header that each begins a stream with."""
+"""The two codecs of scenes, ``raw`` and ``compact``, and their headers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -26,11 +26,11 @@ from structgstream.training.rounding import pixel_size
 
 @dataclass(frozen=True)
 class QuantizationSteps:
-    """What numbers of a stream are multiples of, as the header states it; nothing with codec ``raw``.
+    """Quantization steps of a stream, as stored in the header; empty with codec ``raw``.
 
     Args:
-        steps: of what packets carry, by name.
-        init_steps: of what the header carries, by field.
+        steps: of packets, by parameter.
+        init_steps: of the init record, by field.
     """
 
     steps: Mapping[str, float] = field(default_factory=dict)
@@ -39,13 +39,13 @@ class QuantizationSteps:
 
 @dataclass(frozen=True)
 class SceneCodec(ABC):
-    """What both codecs share: the file, the coder and the header."""
+    """Common part of both codecs: the file, the coder and the header."""
 
     config: StreamConfig
 
     @property
     def name(self) -> str:
-        """What the header's ``codec`` says."""
+        """The value of the header's ``codec``."""
         return self.config.codec
 
     def key_interval(self, fps: float) -> int:
@@ -53,19 +53,19 @@ class SceneCodec(ABC):
         return max(1, round(fps * self.config.key_interval_seconds))
 
     def file(self, path: Path, *, frames: int, resume: bool) -> tuple[FileSink, StreamReader | None]:
-        """The file, which is replaced unless it is resumed; ``frames`` are not counted.
+        """A sink to the file, which is replaced unless it is resumed; ``frames`` is not used.
 
         Raises:
-            StreamError: what is to be resumed is no stream, or damaged where nothing can be saved.
+            StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
         """
         return FileSink.resume(path) if resume else (FileSink(path, overwrite=True), None)
 
     def coder(self, header: StreamHeader, device: torch.device) -> SceneEncoder:
-        """What encodes and decodes, on the CPU."""
+        """The encoder of the stream, on the CPU."""
         return SceneEncoder(header)
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
-        """Frame 0 as the frames after it start from it, and the header of the stream."""
+        """Frame 0 as later frames and receivers get it, and the header of the stream."""
         scene, step_sizes = self._initialize_stream(fitted, task)
         state, dynamic = state_of(scene), self.config.online.dynamic
         reference = dynamic.difference(fields_of("free")) if step_sizes.steps else ()
@@ -87,10 +87,10 @@ class SceneCodec(ABC):
 
     @abstractmethod
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
-        """Frame 0 with the numbers that a receiver will have."""
+        """The reconstruction of frame 0, as a receiver gets it, and its steps."""
 
     def _with_dynamic_fields(self, scene: Scene) -> Scene:
-        """``scene`` with every field that may change; appearance has the directions in which features may."""
+        """``scene`` with all dynamic fields; dynamic appearance gets its basis."""
         online = self.config.online
         if "appearance" in online.dynamic:
             scene = with_appearance(scene, online.appearance_rank)
@@ -107,7 +107,7 @@ class RawCodec(SceneCodec):
 
 @dataclass(frozen=True)
 class CompactCodec(SceneCodec):
-    """Every number is a bin (``training/rounding.py``, Note [Bins]): frame 0 is rounded, and in space order."""
+    """All values are quantized (``training/rounding.py``, Note [Bins]); anchors are in Z-order."""
 
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
@@ -127,5 +127,5 @@ class CompactCodec(SceneCodec):
 
 
 def scene_codec(config: StreamConfig) -> SceneCodec:
-    """The codec that the configuration names."""
+    """The codec of the configuration."""
     return RawCodec(config) if config.codec == "raw" else CompactCodec(config)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop: frames in, packets out, and the decoded frame is where the next one starts (Note [Closed loop]).
+"""The frame loop: fit, encode, write; the next frame starts from the decoded one (Note [Closed loop]).
 
-While a frame is fitted, the next one is read and its pictures are observed (``lookahead``).
+While a frame is fitted, the next one is read and its pictures preprocessed (``lookahead``).
 """
 
 from collections import deque
@@ -34,9 +34,9 @@ class Session(Generic[State, Memory]):
         source: the capture.
         sink: where packets go.
         pipeline: how frames are fitted and stored, such as ``stream_pipeline(PRESETS["compact"])``.
-        backend: what computes.
-        resumed: the reader of what the sink already holds, to continue after it.
-        metadata: plain JSON values for the header (nothing that differs between runs: resuming is exact).
+        backend: the compute back-end.
+        resumed: a reader of the frames that the sink already has, to continue after them.
+        metadata: plain JSON values for the header; equal in all runs of a stream, because resuming is exact.
         on_step: called after every optimisation step.
 
     Raises:
@@ -79,10 +79,10 @@ class Session(Generic[State, Memory]):
             check_resumable(resumed.header, self._facts)
 
     def run(self) -> Generator[FrameReport, None, None]:
-        """Fit, encode and write every frame that the sink does not hold yet; yields a report for each.
+        """Fit, encode and write every frame that the sink does not have yet; yields a report for each.
 
-        A stream that is whole and complete is not touched. Otherwise the sink is closed, with its index, however the
-        loop ends; only a sink that could not write gets no index.
+        A complete stream is not changed. Otherwise the sink is closed, with its index, however the loop ends; after a
+        failed write there is no index.
         """
         resumed = self._resumed
         if resumed is not None and resumed.complete and len(resumed) >= len(self._source):
@@ -95,7 +95,7 @@ class Session(Generic[State, Memory]):
                 if len(resumed) < len(self._source):
                     yield from self._frames(self._restore_past(resumed), len(resumed))
         except BaseException:
-            with suppress(StorageError):  # What went wrong first is what the user must see.
+            with suppress(StorageError):  # The first error is the one to report.
                 self._sink.close()
             raise
         self._sink.close()
@@ -115,9 +115,9 @@ class Session(Generic[State, Memory]):
                 yield meter.report(fit, encoded, size)
 
     def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
-        """Each frame from ``start`` on and what its pictures tell by themselves."""
+        """Each frame from ``start`` on with its preprocessed pictures."""
         method = self._pipeline.method
-        # What moves shows against the frame before, so a resumed stream reads that one once more.
+        # Changes are relative to the previous frame, so a resumed stream reads that one again.
         again = start > 0 and method.needs_before
         frames = self._source.frames(start - again)
         before = next(frames) if again else None
@@ -126,7 +126,7 @@ class Session(Generic[State, Memory]):
             before = frame if method.needs_before else None
 
     def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
-        """The tasks of frames; each is made when the frame before is written, on which its pressure depends."""
+        """The tasks of frames; each is made after the previous frame is written, on which its pressure depends."""
         for frame, pictures in observed:
             yield self._task(frame, pictures)
 
@@ -153,7 +153,7 @@ class Session(Generic[State, Memory]):
         )
 
     def _encode(self, fitted: State, task: FrameTask) -> Encoded[State]:
-        """The packet of a frame; frame 0 begins the stream."""
+        """The packet of a frame; for frame 0 the header is written first."""
         if self._coder is None:
             fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
             self._coder = self._open(header)
@@ -173,20 +173,20 @@ class Session(Generic[State, Memory]):
         return coder
 
     def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
-        """What the next frame is fitted after."""
+        """The state from which the next frame is fitted."""
         method = self._pipeline.method
         if past is None:
             return Past(state, method.prepare(state, lambda: task))
         return Past(state, past.memory, past.state if method.needs_older else None)
 
     def _reopen(self, resumed: StoredStream[State]) -> None:
-        """Go on with what is there."""
+        """Continue an existing stream."""
         self._coder = self._open(resumed.header)
         for info in resumed.packets:
             self._controller.add(info.bytes, info.kind)
 
     def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
-        """What the next frame is fitted after, from what is there."""
+        """The state from which the next frame is fitted, decoded from the existing stream."""
         assert self._coder is not None, "reopened before"
         method, count = self._pipeline.method, len(resumed)
         state = deque(map(self._coder.replay, resumed.group(count - 1)), maxlen=1).pop()
@@ -194,6 +194,6 @@ class Session(Generic[State, Memory]):
         return Past(state, method.prepare(resumed.scene(0), self._first_task), older)
 
     def _first_task(self) -> FrameTask:
-        """Frame 0's, read once more."""
+        """The task of frame 0, whose pictures are read again."""
         frame = next(self._source.frames(0))
         return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))

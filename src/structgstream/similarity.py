@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The similarity that brings every capture to a common scale, and back.
+"""The similarity transform between a capture's units and the normalised units of a scene.
 
 Learning rates and voxel sizes are stated for scenes of one size (paper, section Implementations). Training therefore
-runs in a normalised frame; the stream header keeps the transform and every output is given in the capture's own units.
+runs in normalised units. The stream header stores the transform.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from structgstream.cameras import Camera, CameraRig
 
 @dataclass(frozen=True)
 class Similarity:
-    """``normalised = (world - center) * scale``; no rotation, so axes keep their names."""
+    """``normalised = (world - center) * scale``, without rotation."""
 
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0
@@ -29,7 +29,7 @@ class Similarity:
         return points / self.scale + torch.tensor(self.center, dtype=points.dtype)
 
     def camera(self, camera: Camera) -> Camera:
-        """A camera of the capture, seen from the normalised scene: same pictures, other units."""
+        """A camera of the capture in normalised units; it shows the same picture."""
         viewmat = camera.viewmat.clone()
         center = torch.tensor(self.center, dtype=torch.float64)
         viewmat[:3, 3] = (camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]) * self.scale
@@ -47,7 +47,7 @@ def rig_radius(rig: CameraRig) -> float:
 
 
 def normalizing_similarity(rig: CameraRig, *, radius: float) -> Similarity:
-    """The similarity that puts the training cameras' mean at the origin and their radius at ``radius``."""
+    """The similarity that moves the training cameras' mean to the origin and makes the rig's radius ``radius``."""
     centers = torch.stack([rig[name].center for name in rig.training])
     center = centers.mean(0)
     return Similarity(center=(float(center[0]), float(center[1]), float(center[2])), scale=radius / rig_radius(rig))

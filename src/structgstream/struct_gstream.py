@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Struct-GStream: frame 0 from scratch, every later frame from the decoded one before it."""
+"""The method Struct-GStream: frame 0 from initial points, each later frame from the decoded previous one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,12 +24,12 @@ from structgstream.training.result import FitResult
 
 @dataclass(frozen=True)
 class StructGStream:
-    """The method. Its memory is what frame 0 missed, where later frames ask for that.
+    """The method. Its memory is the residual floor of frame 0, if later frames use it.
 
     Args:
-        config: everything that decides the result.
-        fitted: gives frame 0 as it was fitted before, with the same capture, seed and ``config.initial``; variants that
-            differ in later frames alone can share it. None: it is fitted.
+        config: of the stream.
+        fitted: returns an earlier fit of frame 0 with the same capture, seed and ``config.initial``, which variants
+            that differ in later frames only can share. None: frame 0 is fitted.
     """
 
     config: StreamConfig
@@ -37,7 +37,7 @@ class StructGStream:
 
     @property
     def needs_before(self) -> bool:
-        """Whether what moves is looked for in the pictures."""
+        """Whether motion segmentation is enabled."""
         return self.config.online.motion.enabled
 
     @property
@@ -48,12 +48,12 @@ class StructGStream:
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        """The training pictures, and what has changed in them."""
+        """The training pictures and their changes."""
         online = self.config.online
         return pictures_of(frame, rig, before=before, motion=online.motion, start=online.start, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
-        """Frame 0, before its environment if it has one."""
+        """Fit frame 0, with its environment if enabled."""
         config, backend = self.config, task.backend
         if self.fitted is not None:
             fit = self.fitted()
@@ -74,7 +74,7 @@ class StructGStream:
         return replace(fit, scene=replace(fit.scene, environment=found))
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> ResidualFloor | None:
-        """What frame 0 missed, if residuals tell what moves."""
+        """The residual floor of frame 0, if residuals are used."""
         motion = self.config.online.motion
         if motion.residual_threshold <= 0.0:
             return None
@@ -83,7 +83,7 @@ class StructGStream:
         return residual_floor(scene, first.pictures.views, scale=motion.picture_scale, backend=backend)
 
     def next(self, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
-        """A later frame."""
+        """Fit a later frame."""
         device = task.backend.device
         return fit_next_frame(
             on_device(past.state, device),
@@ -106,12 +106,12 @@ def stream_pipeline(
     """The pipeline of a configuration; see :class:`StructGStream`.
 
     Raises:
-        ConfigError: a rate to keep to for a stream whose packets are as large as they are.
+        ConfigError: a target rate for a codec without rate control.
     """
     if config.rate.target_mbits is not None and config.codec != "compact":
         raise ConfigError(
             f"A target of {config.rate.target_mbits:g} Mbit/s was given for a stream with codec {config.codec!r}, "
-            "whose packets are as large as they are; take --preset compact, or leave the target out."
+            "which has no rate control; take --preset compact, or leave the target out."
         )
     return Pipeline(
         StructGStream(config, fitted),

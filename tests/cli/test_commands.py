@@ -288,7 +288,7 @@ def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: p
     new = str(tmp_path / "new.sgs")
     assert "does not exist" in error_of(["reconstruct", str(tmp_path / "no"), "-o", new], capsys, status=1)
     assert "is a folder" in error_of(["reconstruct", CLIP, "-o", str(tmp_path)], capsys, status=1)
-    assert "cannot be made" in error_of(["reconstruct", CLIP, "-o", str(stream / "x" / "y")], capsys, status=1)
+    assert "cannot be created" in error_of(["reconstruct", CLIP, "-o", str(stream / "x" / "y")], capsys, status=1)
     assert str(tmp_path / "no") in error_of(["inspect", str(tmp_path / "no")], capsys, status=1)
     (tmp_path / "text").write_text("hello, this is no stream at all")
     assert "text" in error_of(["evaluate", str(tmp_path / "text"), CLIP], capsys, status=1)

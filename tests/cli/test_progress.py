@@ -54,7 +54,7 @@ def test_a_line_tells_which_pictures_were_not_believed() -> None:
         shown.frame(replace(REPORT, counts=counts))
         shown.frame(replace(REPORT, counts={"lifted": 40, "views left out": 0}))
     odd, usual = text(out).splitlines()
-    assert "[2 views left out: their pictures changed alone, or not at all]  [births refused" in odd
+    assert "[2 views left out: only their pictures changed, or theirs did not]  [no births" in odd
     assert usual.endswith("2,301 free (+5 -1)")
 
 

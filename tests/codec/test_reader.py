@@ -122,9 +122,9 @@ def test_another_major_version_is_refused_and_a_newer_minor_is_not() -> None:
         ([packet_record(0, PacketKind.KEY), packet_record(0, PacketKind.KEY)], "packet 0 where packet 1 belongs"),
         (
             [packet_record(0, PacketKind.KEY), packet_record(1, PacketKind.DELTA, pts_seconds=0.0)],
-            "packet 1 is not presented after",
+            "presentation time of packet 1 does not increase",
         ),
-        ([packet_record(0, PacketKind.KEY, pts_seconds=float("nan"))], "which is no time"),
+        ([packet_record(0, PacketKind.KEY, pts_seconds=float("nan"))], "it is damaged"),
         ([packed(RecordType.KEY, b"short")], "too short"),
         ([packed(RecordType.INIT, b"")], "second init record"),
     ],

@@ -17,7 +17,7 @@ def test_frames_after_a_damaged_one_are_not_thrown_away(tmp_path: Path) -> None:
     data[packet.offset + 20] ^= 1
     path = tmp_path / "damaged.sgs"
     path.write_bytes(data)
-    with pytest.raises(StreamError, match="whole frames follow"):
+    with pytest.raises(StreamError, match="continuing would overwrite the whole frames"):
         FileSink.resume(path)
     assert path.read_bytes() == data
 

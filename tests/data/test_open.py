@@ -92,7 +92,7 @@ def test_folders_that_hold_no_capture(tmp_path: Path) -> None:
         open_capture(tmp_path)
     assert LAYOUTS in str(caught.value)
     (tmp_path / "holiday.jpg").write_bytes(b"")
-    with pytest.raises(CaptureError, match=r"no layout that is known here; it holds holiday\.jpg") as caught:
+    with pytest.raises(CaptureError, match=r"no supported layout; it holds holiday\.jpg") as caught:
         open_capture(tmp_path)
     assert LAYOUTS in str(caught.value)
     with pytest.raises(CaptureError, match="is a file"):

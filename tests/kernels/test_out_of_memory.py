@@ -93,7 +93,7 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
 def test_no_memory(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module, function, result, call = CALLS[name]
     monkeypatch.setattr(module, "native_library", lambda: SimpleNamespace(**{function: lambda *_: result}))
-    with pytest.raises(OutOfMemoryError, match="^Memory does not suffice"):
+    with pytest.raises(OutOfMemoryError, match="^Not enough memory"):
         call()
 
 

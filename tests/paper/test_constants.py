@@ -89,7 +89,7 @@ def test_what_published_loaders_do_where_the_paper_is_silent() -> None:
 def test_another_rig_than_the_papers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = arc_rig(4)
     assert departures("paper-immersive", rig) == [
-        "pictures of 48x32 instead of 1280x960 (--scale 0.5 of those stored)",
+        "pictures of 48x32 instead of 1280x960 (--scale 0.5 of the stored)",
         "4 cameras instead of 46",
     ]
     assert departures("rig", rig) == []

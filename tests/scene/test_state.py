@@ -62,7 +62,7 @@ def test_a_dynamic_field_that_nothing_begins_is_refused() -> None:
     scene = random_scene()
     assert with_dynamic_fields(scene, PAPER_DYNAMIC) is scene
     for name in ("appearance", "environment"):
-        with pytest.raises(ConfigError, match=f"dynamic set has {name}, which the scene does without"):
+        with pytest.raises(ConfigError, match=f"dynamic set has {name}, which the scene lacks"):
             with_dynamic_fields(scene, {*PAPER_DYNAMIC, name})
 
 

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: ``structgstream COMMAND``. Importing it is free; a command imports what it needs when it
-runs.
-"""
+"""The command line: ``structgstream COMMAND``. Commands import their modules when they run."""
 
 from structgstream.cli.app import main
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the command, runs it, and turns what goes wrong into one sentence and an exit status.
+"""Finds the command, runs it, and reports errors as one sentence and an exit status.
 
-Only the standard library is imported here, so that ``structgstream --help`` answers at once.
+Only the standard library is imported here, so that ``structgstream --help`` is fast.
 """
 
 import difflib
@@ -16,33 +16,33 @@ from types import ModuleType
 from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
-    "demo": "reconstruct the bundled clip and show everything there is to see",
+    "demo": "reconstruct, evaluate and export the bundled clip",
     "reconstruct": "turn a capture into a stream, frame by frame",
-    "evaluate": "score a stream against the cameras that training did not see",
+    "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .splat, .spz",
-    "inspect": "show what a stream file holds",
-    "doctor": "show what this machine has, what is missing, and how to mend it",
+    "inspect": "show the content of a stream file",
+    "doctor": "show available back-ends and packages, and how to install missing ones",
 }
 ENTRY_POINTS = "structgstream.commands"
-"""What other distributions call their packages of commands: with ``COMMANDS`` and, for each, a module with ``main``."""
+"""Entry-point group for other distributions' commands: packages with ``COMMANDS`` and a module with ``main`` each."""
 STUDIES = ("ablate", "compare")
-"""Commands of the distribution structgstream-studies, which not everybody installs."""
+"""Commands of the distribution structgstream-studies, which is installed separately."""
 DONE, PROBLEM, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
 class UsageError(Exception):
-    """The command line asks for something that does not exist or does not go together."""
+    """The command line has an unknown or contradictory option."""
 
 
 class Interrupted(Exception):
-    """The user pressed Ctrl-C; the message says what is stored and how to go on."""
+    """The user pressed Ctrl-C; the message states what is stored and how to continue."""
 
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """What the options ask for is checked here: a value that cannot work is wrong usage.
+    """Converts ``ConfigError`` to ``UsageError`` while options are checked.
 
     Raises:
         UsageError: in place of a ``ConfigError``.
@@ -54,9 +54,9 @@ def usage_errors() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; the exit status is 0 done, 1 a problem, 2 wrong usage, 130 interrupted."""
-    # Two threads that spin while they wait for each other are slower than one on a machine that does anything else.
-    # OpenMP reads this once, when torch is loaded, so it is set before any command imports it.
+    """Runs one command and returns the exit status: 0 done, 1 an error, 2 wrong usage, 130 interrupted."""
+    # Spinning OpenMP threads slow each other down on a machine with other load. OpenMP reads this once, when torch is
+    # loaded, so it is set before any command imports it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         _run(given[0], given[1:])
-    except SystemExit as ending:  # the parser's own, after it has printed help or what is wrong
+    except SystemExit as ending:  # from the parser, after it has printed help or an error
         return ending.code if isinstance(ending.code, int) else DONE if ending.code is None else PROBLEM
     except UsageError as error:
         _say(f"structgstream: {error}")
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(f"\nInterrupted. {error}".rstrip())
         return INTERRUPTED
     except BrokenPipeError:
-        # The reader of our output left (`| head`). Python would complain again while it closes stdout.
+        # The reader of our output has exited (`| head`). Python would raise again while it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PROBLEM
     except StructGStreamError as error:
@@ -92,16 +92,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if debug:
             traceback.print_exc()
         said = f" ({error})" if str(error) else ""
-        _say(
-            f"structgstream: memory does not suffice{said}; end other programs, or take smaller pictures (--scale 0.5)."
-        )
+        _say(f"structgstream: not enough memory{said}; close other programs, or use smaller pictures (--scale 0.5).")
         return PROBLEM
     except Exception as error:
         if debug:
             traceback.print_exc()
         _say(
-            f"structgstream: an error that should not happen, {type(error).__name__}: {error}. "
-            "Run the command again with --debug and report what it prints."
+            f"structgstream: unexpected error, {type(error).__name__}: {error}. "
+            "Run the command again with --debug and report the output."
         )
         return PROBLEM
     return DONE
@@ -113,7 +111,7 @@ def overview() -> str:
     commands = "\n".join(f"  {name:<12} {text}" for name, text in {**COMMANDS, **further}.items())
     return f"""usage: structgstream COMMAND [options]
 
-A ring of synchronised cameras to a free-viewpoint video stream, frame by frame.
+Free-viewpoint video streams from synchronised cameras, reconstructed frame by frame.
 
 commands:
 {commands}
@@ -148,7 +146,7 @@ def _run(command: str, arguments: list[str]) -> None:
 
 
 def _packages() -> list[ModuleType]:
-    """Packages of commands that other distributions bring."""
+    """Packages of commands of other distributions."""
     from importlib.metadata import entry_points
 
     return [point.load() for point in entry_points(group=ENTRY_POINTS)]

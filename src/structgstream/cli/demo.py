@@ -13,19 +13,19 @@ from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, parse_known_options, resolve_config
 from structgstream.cli.tables import quality_text, report_tables
 
-SLOWED = 0.2  # twelve frames would be over in 0.4 s
+SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Reconstructs the bundled clip, scores it, and writes pictures, videos and a page that plays it from any angle:
-    minutes on two processor cores.
+    """Reconstructs the bundled clip, scores it, and writes pictures, videos and a page with a player; takes minutes on
+    two processor cores.
 
     Example: structgstream demo --output demo
     """
 
     output: Annotated[Path, tyro.conf.arg(metavar="FOLDER", aliases=["-o"])] = Path("demo")
-    """Where everything goes; what an earlier demo left there is replaced."""
+    """Output folder; files of an earlier demo are replaced."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Number of frames. Default: all twelve."""
     scale: float = 1.0
@@ -37,7 +37,7 @@ class Demo:
 
 
 def main(arguments: list[str]) -> None:
-    """Shows everything there is to see."""
+    """Runs the demo."""
     options, rest = parse_known_options(Demo, "demo", arguments=arguments)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")

@@ -17,6 +17,7 @@ OPTIONAL = (
     ("av", "av", "capture", "read and write video"),
     ("cv2", "opencv-python-headless", "capture", "read pictures, initial points"),
     ("scipy", "scipy", "capture", "initial points"),
+    ("yaml", "pyyaml", "capture", "read calibrations of Kalibr"),
     ("matplotlib", "matplotlib", "report", "plots, contact sheets"),
     ("starlette", "starlette", "serve", "command play"),
     ("uvicorn", "uvicorn", "serve", "command play"),
@@ -27,17 +28,17 @@ OPTIONAL = (
 
 @dataclass(frozen=True)
 class Doctor:
-    """Shows what this machine has: back-ends, why one is missing, and the command that mends it.
+    """Shows the back-ends and optional packages of this machine, and how to install missing ones.
 
     Example: structgstream doctor
     """
 
     json: JsonPath = None
-    """Write what is found to this file."""
+    """Write the result to this file."""
 
 
 def main(arguments: list[str]) -> None:
-    """Looks around and prints."""
+    """Examines the machine and prints the result."""
     options = parse_options(Doctor, "doctor", arguments=arguments)
     from structgstream.evaluation.report import write_json
 
@@ -57,9 +58,7 @@ def main(arguments: list[str]) -> None:
 
 
 def diagnose() -> dict[str, Any]:
-    """Machine, back-ends and optional packages as plain values: ``environment``, ``backends``,
-    ``packages``.
-    """
+    """Machine, back-ends and optional packages as plain values: ``environment``, ``backends``, ``packages``."""
     from structgstream.evaluation.environment import environment
     from structgstream.kernels.backend import backend_reasons, backend_remarks
 

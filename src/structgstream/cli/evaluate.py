@@ -23,9 +23,9 @@ SHEET_COLUMNS = 5
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Scores a stream file against the cameras that training did not see.
+    """Scores a stream file against the held-out cameras.
 
-    Everything is decoded from the file; the trainer is not asked. Definitions: docs/evaluation.md.
+    Everything is decoded from the file. Definitions of the metrics: docs/evaluation.md.
 
     Example: structgstream evaluate ball.sgs basketball --json ball.json --report ball-report
     """
@@ -37,17 +37,17 @@ class Evaluate:
     cameras: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
         None
     )
-    """Cameras to score. Default: those that were held out."""
+    """Cameras to score. Default: the held-out ones."""
     json: JsonPath = None
     """Write every number to this file (keys: docs/evaluation.md)."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """Write report.json, plots over time and a contact sheet into this folder."""
     metrics: Literal["all", "basic"] = "all"
-    """Scores: "basic" leaves out MS-SSIM, FLIP, LPIPS and those over time, which take longer than rendering."""
+    """Metrics: "basic" leaves out MS-SSIM, FLIP, LPIPS and temporal ones, which take longer than rendering."""
     lpips_weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")] = None
     """Folder or file with the networks' weights for LPIPS. Default: $STRUCTGSTREAM_LPIPS_WEIGHTS, torch's hub cache."""
     device: Device = "auto"
-    """What renders."""
+    """Back-end that renders."""
 
 
 def main(arguments: list[str]) -> None:
@@ -89,7 +89,7 @@ def run_evaluation(
     metrics: "MetricSelection" = "all",
     lpips_weights: Path | None = None,
 ) -> "Report":
-    """Evaluates with a word about the progress, and writes the report into ``folder`` (None: nowhere)."""
+    """Evaluates with a progress display, and writes the report into ``folder`` (None: nowhere)."""
     from structgstream.evaluation.evaluate import Compared, evaluate
     from structgstream.evaluation.pictures import contact_sheet, spread_indices
     from structgstream.evaluation.plots import write_plots

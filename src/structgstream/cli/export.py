@@ -19,12 +19,12 @@ from structgstream.exporters.formats import Format, PageFormat
 class Export:
     """Writes the stream as a page with a player, or frames as plain 3D Gaussians for other programs.
 
-    OUT.html is one page that opens from a disk and plays the whole stream from any angle. --format site gives a folder
-    for any web server, from which a viewer fetches only what is played.
+    OUT.html is one page with a player and the whole stream, which opens without a server. --format site gives a folder
+    for any web server, from which a viewer fetches only the played packets.
 
     OUT.ply, OUT.splat or OUT.spz is one frame for other programs, any other name a folder of frame_000000.ply and so
-    on. What depends on the camera is averaged over the training cameras; colours are spherical harmonics fitted to what
-    they see. Units and axes are the capture's own (.spz: y up, z back). What is lost: docs/export.md.
+    on. View-dependent opacity and shape are averaged over the training cameras; colours are spherical harmonics fitted
+    to their views. Units and axes are the capture's own (.spz: y up, z back). Losses: docs/export.md.
 
     Example: structgstream export ball.sgs -o ball.html
 
@@ -36,21 +36,21 @@ class Export:
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """Where to write. Default: a file (with --frame) or a folder beside the stream."""
+    """Output file or folder. Default: a file (with --frame) or a folder beside the stream."""
     format: Annotated[Format | PageFormat | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Format of the files. Default: what the name of OUT says, else ply."""
+    """Format of the files. Default: the suffix of OUT, else ply."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """This frame only."""
+    """Export only this frame."""
     frames: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="FIRST LAST", help_behavior_hint="")] = None
-    """From this frame to that, both included. Default: all."""
+    """First and last frame to export. Default: all."""
     sh_degree: Annotated[int | None, tyro.conf.arg(metavar="0..2", help_behavior_hint="")] = None
     """Degree of the spherical harmonics. Default: 1; .splat has none."""
     device: Device = "auto"
-    """What evaluates the MLPs."""
+    """Back-end that evaluates the MLPs."""
 
 
 def main(arguments: list[str]) -> None:
-    """Exports and says where the result is."""
+    """Exports and prints the path of the result."""
     options = parse_options(Export, "export", arguments=arguments)
     from structgstream.exporters.request import check_degree, check_page, choose_frames, destination
 

@@ -24,7 +24,7 @@ PICTURES = (".png", ".svg", ".pdf")
 
 @dataclass(frozen=True)
 class Inspect:
-    """Shows what a stream file holds: header and packets, bytes by field, whether it is whole.
+    """Shows the content of a stream file: header and packets, bytes by field, whether it is complete.
 
     Example: structgstream inspect ball.sgs --plot ball-bytes.png
 
@@ -34,11 +34,11 @@ class Inspect:
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH.png", help_behavior_hint="")] = None
-    """Draw the bytes of every packet by field, and what header, key and delta packets consist of."""
+    """Plot the bytes of every packet by field, and the composition of header, key and delta packets."""
     json: JsonPath = None
-    """Write all of it to this file, with the keys "header" and "packets"."""
+    """Write everything to this file, with the keys "header" and "packets"."""
     all_packets: bool = False
-    """List every packet. Otherwise a long stream is listed in even steps."""
+    """List every packet. Default: evenly spaced packets of a long stream."""
     config: bool = False
     """Print the resolved configuration of the run."""
 
@@ -99,7 +99,8 @@ def describe_stream(
 ) -> dict[str, Any]:
     """The file as plain values: ``header`` and ``packets`` (``kind``, ``index``, ``bytes``, ``fields``, ...).
 
-    ``changes`` of a packet are the anchors and free Gaussians that came and went, as far as the run's ``log`` says so.
+    ``changes`` of a packet are the numbers of added and removed anchors and free Gaussians, if the run's ``log`` has
+    them.
     """
     from structgstream.evaluation.byte_count import REST
 

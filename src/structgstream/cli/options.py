@@ -23,7 +23,7 @@ STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.Disa
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Which part of a capture is used, and how."""
+    """Options that select the part of a capture, and its picture size."""
 
     held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
         None
@@ -36,23 +36,23 @@ class CaptureOptions:
     frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
     near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Nothing nearer to a camera is drawn, in units of the capture. Default: the capture's own."""
+    """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 rig radii."""
 
 
 def parse_options(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
-    """The options of a command; prints and exits when the user asks for help or made a mistake."""
+    """The options of a command; prints and exits on ``--help`` or wrong usage."""
     return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE)
 
 
 def parse_known_options(kind: type[Options], command: str, *, arguments: list[str]) -> tuple[Options, list[str]]:
-    """As :func:`parse_options`, with the arguments that are no option of the command itself."""
+    """As :func:`parse_options`, and the arguments that are no options of the command itself."""
     return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True)
 
 
 def resolve_config(
     preset: str | None, overrides: list[str], *, command: str, seed: int | None
 ) -> tuple["StreamConfig", str]:
-    """The preset with the fields that the command line sets by their path (``--online.iterations 50``), and its name.
+    """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name.
 
     Raises:
         UsageError: there is no such preset.
@@ -75,7 +75,7 @@ def resolve_config(
 
 
 def open_selected_capture(scene: Path, options: CaptureOptions) -> "FrameSource":
-    """The part of a capture that the options name."""
+    """The part of a capture that the options select."""
     from structgstream.data.open import open_capture
 
     return open_capture(

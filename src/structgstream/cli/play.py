@@ -25,8 +25,8 @@ LOOK_AGAIN_SECONDS = 0.5
 class Play:
     """Shows a stream in the browser, from any angle.
 
-    Serves on this machine's loopback address only, until Ctrl-C. A file that reconstruct is still writing is followed:
-    each frame appears when it is written.
+    Serves on this machine's loopback address only, until Ctrl-C. If reconstruct is still writing the file, each frame
+    appears when it is written.
 
     Example: structgstream play ball.sgs --capture basketball
 
@@ -36,13 +36,13 @@ class Play:
     stream: tyro.conf.Positional[StreamPath]
     """The stream file."""
     capture: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """The capture that it was made from, to compare with what the cameras took."""
+    """The capture that it was made from, to compare with the cameras' pictures."""
     port: Annotated[int, tyro.conf.arg(help_behavior_hint="")] = 0
     """Port to listen on. Default: one that is free."""
     browser: bool = True
     """Do not open a browser."""
     wait: bool = False
-    """Wait until the file is there: it comes when frame 0 is done."""
+    """Wait until the file exists: it is created when frame 0 is done."""
 
 
 def main(arguments: list[str]) -> None:

@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     from structgstream.frame_report import FrameReport
     from structgstream.training.result import Step
 
-QUIET_SECONDS = 15.0  # without a terminal, a word this often while one frame takes long
+QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a frame
 
 
 class Display(AbstractContextManager["Display"], Protocol):
-    """Follows a reconstruction."""
+    """Displays the progress of a reconstruction."""
 
     def step(self, step: "Step") -> None:
-        """An iteration of the running frame is done."""
+        """Called after each iteration."""
         ...
 
     def frame(self, report: "FrameReport") -> None:
-        """A frame is stored."""
+        """Called after a frame is stored."""
         ...
 
 
@@ -55,19 +55,19 @@ def summary(report: "FrameReport", frames: int) -> str:
 
 
 def change(came: int, went: int) -> str:
-    """How many came and went, in brackets; nothing when none did."""
+    """Numbers of added and removed items, in brackets; empty if both are 0."""
     return f" (+{came:,} -{went:,})" if came or went else ""
 
 
 def remarks(counts: Mapping[str, int]) -> str:
-    """What a user should know of a frame's pictures: which were not believed (``training/trust.py``)."""
+    """Remarks on a frame's pictures: outlier views and refused births (``training/trust.py``)."""
     found = []
     if counts.get("views left out"):
-        found.append(f"{counts['views left out']} views left out: their pictures changed alone, or not at all")
+        found.append(f"{counts['views left out']} views left out: only their pictures changed, or theirs did not")
     if counts.get("jumps"):
-        found.append("the pictures changed everywhere: motion not followed")
+        found.append("the pictures changed everywhere: motion segmentation skipped")
     if counts.get("births refused"):
-        found.append("births refused: too much is missing at once")
+        found.append("no births: too many pixels are missing at once")
     return "".join(f"  [{remark}]" for remark in found)
 
 
@@ -96,7 +96,7 @@ class Lines:
         return None
 
     def step(self, step: "Step") -> None:
-        """Speaks up when the frame takes long."""
+        """Prints a line if the frame takes long."""
         if time.monotonic() - self._spoken > QUIET_SECONDS:
             self._print(
                 f"frame {self._current + 1}/{self._frames}: iteration {step.iteration}/{step.iterations}, "
@@ -144,12 +144,12 @@ class Bars:
         self._live.stop()
 
     def step(self, step: "Step") -> None:
-        """Moves the bar of iterations."""
+        """Advances the bar of iterations."""
         note = f"loss {step.loss:.4f}  {step.anchors:,} anchors  {step.free:,} free"
         self._progress.update(self._one, completed=step.iteration, total=step.iterations, note=note)
 
     def frame(self, report: "FrameReport") -> None:
-        """Moves the bar of frames and begins the next frame's."""
+        """Advances the bar of frames and resets that of iterations."""
         note = f"{report.seconds['total']:.1f} s a frame"
         self._progress.update(self._all, completed=report.index + 1, note=note)
         self._progress.reset(self._one, total=None, description=f"frame {report.index + 2}", note="")

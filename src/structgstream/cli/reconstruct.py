@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 class Reconstruct:
     """Turns a capture into a stream, one frame after the other.
 
-    The file can be read while it grows: structgstream play OUT.sgs --wait shows each frame as it comes. Ctrl-C keeps
-    the frames that are done; --resume goes on after them. Seconds by stage and memory of each frame go to
+    The file can be read while it grows: structgstream play OUT.sgs --wait shows each frame when it is done. After
+    Ctrl-C, --resume continues after the last whole frame. Seconds by stage and memory of each frame are written to
     OUT.log.jsonl. Any field of the configuration is an option by its path: --online.iterations 50 (see --help-config).
 
     Example: structgstream reconstruct basketball -o ball.sgs --frames 20 --held-out 0 10 15 30
@@ -47,19 +47,18 @@ class Reconstruct:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """compact (default: small packets), rig (the paper on any rig), motion (rig, fits only what moves), fast (a try in
-    minutes), paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
+    """compact (default: small packets), rig (the paper on any rig), motion (as rig, trains only movers), fast (compact
+    in minutes), paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
-    """Of compact streams: 0 is the preset's own quality, 1 makes every step half as large, -1 twice as large."""
+    """Compact streams only: 0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
     mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
-    """Of compact streams: keep to R Mbit/s over every second, the header left aside. Default: constant quality,
-    whatever it costs."""
+    """Compact streams only: target rate in Mbit/s over every second, without the header. Default: constant quality."""
     device: Device = "auto"
-    """What computes; auto takes the first of cuda, cpu, reference that is there."""
+    """Compute back-end; auto takes the first available of cuda, cpu, reference."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Seed of everything random. Default: the preset's."""
+    """Random seed. Default: the preset's."""
     resume: bool = False
-    """Go on after the last whole frame of OUT.sgs. The same options give the same file as an uninterrupted run."""
+    """Continue after the last whole frame of OUT.sgs. The same options give the file of an uninterrupted run."""
     overwrite: bool = False
     """Replace OUT.sgs when it exists."""
     help_config: bool = False
@@ -121,11 +120,11 @@ def run_reconstruction(
     """Reconstructs ``source`` into the file ``output``, replacing what is there unless it is resumed.
 
     Returns:
-        the largest peak of memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
+        the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
 
     Raises:
-        Interrupted: the user pressed Ctrl-C; whole frames are in the file.
-        StructGStreamError: whatever goes wrong; whole frames are in the file.
+        Interrupted: the user pressed Ctrl-C; whole frames stay in the file.
+        StructGStreamError: any other error; whole frames stay in the file.
     """
     from structgstream.recorder import record
     from structgstream.struct_gstream import stream_pipeline
@@ -137,7 +136,7 @@ def run_reconstruction(
         backend,
         resume=resume,
         metadata=metadata,
-        on_step=lambda step: progress.step(step),  # Made below: it begins with the frames that are there.
+        on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
     )
     done = run.done
     peaks: dict[str, int] = {}
@@ -150,7 +149,7 @@ def run_reconstruction(
                 progress.frame(report)
                 done = report.index + 1
     except KeyboardInterrupt:
-        kept = f"{output} has {done} of {len(source)} frames; go on with the same command and --resume."
+        kept = f"{output} has {done} of {len(source)} frames; continue with the same command and --resume."
         raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None
     return peaks
 

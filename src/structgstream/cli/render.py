@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
     from structgstream.scene.scene import Scene
 
-LEAST_PATH_SECONDS = 4.0  # a shorter stream runs forth and back, slowed, while the camera moves
+LEAST_PATH_SECONDS = 4.0  # a shorter stream is played slowed, forward and backward, while the camera moves
 
 
 @dataclass(frozen=True)
 class Render:
     """Renders a camera of the rig, or a camera path, to a video or to pictures.
 
-    OUT.mp4 gives a video, OUT.png one picture (with --frame), any other name a folder of PNGs. With --compare
-    the capture is needed, and each picture holds truth, rendering, and their difference times four.
+    OUT.mp4 gives a video, OUT.png one picture (with --frame), any other name a folder of PNGs. With --compare, which
+    needs the capture, each picture shows truth, rendering, and their difference times four.
 
     Example: structgstream render ball.sgs --path orbit -o ball.mp4
 
@@ -42,25 +42,25 @@ class Render:
     scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FOLDER]", help_behavior_hint="")] = None
     """The capture, for --compare."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """Where to write. Default: a video beside the stream, named after the camera or the path."""
+    """Output file or folder. Default: a video beside the stream, named after the camera or the path."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")] = None
     """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
     path: Annotated[Literal["orbit", "arc"] | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """A camera that moves: around one camera, or from one camera to another."""
+    """Camera path: an orbit around one camera, or an arc from one camera to another."""
     between: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="CAMERA CAMERA", help_behavior_hint="")] = None
     """Ends of the arc. Default: two cameras well apart on the same side."""
     seconds: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Length of a path. Default: that of the stream, at least 4 s. A shorter stream runs forth and back, slowed."""
+    """Duration of the path. Default: the stream's, at least 4 s; a shorter stream is played slowed, back and forth."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """This frame only; on a path, time stands still. Default: all frames."""
+    """Render only this frame; a path then shows a fixed time. Default: all frames."""
     compare: bool = False
     """Truth, rendering and difference side by side."""
     device: Device = "auto"
-    """What renders."""
+    """Back-end that renders."""
 
 
 def main(arguments: list[str]) -> None:
-    """Renders and says where the result is."""
+    """Renders and prints the path of the result."""
     options = parse_options(Render, "render", arguments=arguments)
     if options.compare and (options.scene is None or options.path is not None):
         raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
@@ -96,7 +96,7 @@ def main(arguments: list[str]) -> None:
 
 
 def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
-    """Pictures as a video, one PNG or a folder of PNGs, as the name of ``output`` says.
+    """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``.
 
     Raises:
         StorageError: something cannot be written.
@@ -119,7 +119,7 @@ def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps
 def camera_pictures(
     reader: "StreamReader", backend: "Backend", *, camera: str, frame: int | None = None
 ) -> "Iterator[NDArray[np.uint8]]":
-    """What a camera of the rig sees, frame by frame."""
+    """Renderings of a camera of the rig, frame by frame."""
     from structgstream.evaluation.evaluate import rendered
     from structgstream.scene.state import on_device
 
@@ -138,7 +138,7 @@ def path_pictures(
     seconds: float | None = None,
     frame: int | None = None,
 ) -> "Iterator[NDArray[np.uint8]]":
-    """What a moving camera sees while time runs; forth and back, slowed, when the path takes longer than the stream."""
+    """Renderings of a moving camera; a stream shorter than the path is played slowed, forward and backward."""
     from structgstream.evaluation.camera_path import arc, orbit
     from structgstream.evaluation.evaluate import rendered
     from structgstream.scene.state import on_device
@@ -215,7 +215,7 @@ def _ping_pong(reader: "StreamReader", frame: int | None, *, count: int) -> "Ite
     if frame is None and len(reader.packets) >= count:
         yield from islice(scenes_of(reader, None), count)
         return
-    # A stream shorter than the path is short enough to keep: scenes share what does not change.
+    # A stream shorter than the path fits in memory: its scenes share static fields.
     scenes = list(scenes_of(reader, frame))
     for number in range(count):
         yield scenes[round((len(scenes) - 1) * (1.0 - abs(1.0 - 2.0 * number / count)))]

@@ -14,12 +14,12 @@ from structgstream.cli.tables import SHOWN_FRAMES, compact_table, literal_cells,
 if TYPE_CHECKING:
     from structgstream.evaluation.byte_count import Row
 
-SMALL_BYTES = 100_000  # when all packets are below, their bytes are told one by one
+SMALL_BYTES = 100_000  # if all packets are smaller, sizes are printed in bytes
 SHORT = {"anchor_positions": "positions", "covariance_mlp": "cov. mlp", "the rest": "rest"}  # 80 characters a line
 
 
 def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence[Mapping[str, Any]]) -> Table:
-    """What the stream is: where it comes from, its length, size and rate, what came and went, whether it is whole."""
+    """Facts of the stream: source, length, size, rate, added and removed items, whether it is complete."""
     cameras = header["cameras"]
     held_out = [name for name, camera in cameras.items() if camera["held_out"]]
     sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
@@ -53,13 +53,13 @@ def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Se
 
 
 def bit_rate_text(rows: "Sequence[Row]", fps: float) -> str:
-    """What all packets together need of a line, in words; there is at least one."""
+    """The mean rate of at least one packet, as text."""
     mean = sum(row.bytes for row in rows) / len(rows)
     return f"{8e-6 * mean * fps:.2f} Mbit/s without the header"
 
 
 def header_table(header: Mapping[str, Any]) -> Table:
-    """What the init record carries, the largest first."""
+    """The fields of the init record, largest first."""
     table = compact_table()
     table.title = "header"
     table.add_column("field")
@@ -78,7 +78,7 @@ def header_table(header: Mapping[str, Any]) -> Table:
 
 
 def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
-    """A line for each packet, or for :data:`SHOWN_FRAMES` of them, and below them means; the largest field first."""
+    """A row per packet, or for :data:`SHOWN_FRAMES` of them, and the means below; largest field first."""
     from structgstream.evaluation.byte_count import FIRST, groups_of, occurring_fields
 
     names = occurring_fields(row.sizes for row in rows)
@@ -101,7 +101,7 @@ def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
         table.title += f"; 1 in {step} is listed (--all-packets: every one)"
     titles = [SHORT.get(name, name.replace("_", " ")) for name in names]
     for title in ("frame", "kind", "all", *titles):
-        # A word a line: titles break between words, never inside one.
+        # One word per line, so that titles do not break inside words.
         table.add_column(title.replace(" ", "\n"), justify="left" if title == "kind" else "right", no_wrap=True)
     for line in lines:
         table.add_row(*line)

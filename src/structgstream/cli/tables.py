@@ -13,10 +13,10 @@ from structgstream.cli.progress import human_bytes
 if TYPE_CHECKING:
     from structgstream.evaluation.report import Report, Scores
 
-SHOWN_FRAMES = 24  # a longer stream is shown in even steps
+SHOWN_FRAMES = 24  # of a longer stream evenly spaced frames are shown
 
 BASIC = ("PSNR", "colour", "SSIM", "changed", "still")
-"""Heads of the scores that every table of them begins with; colour is PSNR after frame 0's colour fit."""
+"""Titles of the first columns of every table of scores; colour is PSNR after frame 0's colour fit."""
 
 FURTHER = (  # title, key, digits
     ("MS-SSIM", "ms_ssim", 4),
@@ -51,12 +51,12 @@ def name_value_table() -> Table:
 
 
 def literal_cells(*cells: str) -> tuple[Text, ...]:
-    """Cells whose square brackets are letters, not markup: names and paths come from the user."""
+    """Cells without markup, because names and paths may contain square brackets."""
     return tuple(Text(cell) for cell in cells)
 
 
 def compact_table() -> Table:
-    """A table that ten columns of numbers fit into on a terminal of 80 characters."""
+    """A table whose ten columns of numbers fit into 80 characters."""
     return Table(box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False)
 
 
@@ -168,7 +168,7 @@ def _scores(scores: "Scores") -> list[str]:
 
 
 def quality_text(report: "Report") -> str:
-    """The headline, with what is left of its error once each camera's colour is set aside."""
+    """The mean PSNR as text, with that after frame 0's colour fit."""
     held = report.mean.psnr_camera_color
     beside = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"
     return f"{report.mean.psnr:.2f} dB{beside}"

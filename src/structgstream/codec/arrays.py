@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arrays of whole numbers that the codec passes on."""
+"""Types of the codec's integer arrays."""
 
 import numpy as np
 from numpy.typing import NDArray

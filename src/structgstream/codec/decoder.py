@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A packet to a scene: everything a receiver needs besides a renderer."""
+"""Decodes packets to scenes."""
 
 from collections.abc import Set
 
@@ -18,10 +18,10 @@ from structgstream.scene.state import FieldName, scene_of
 class SceneDecoder:
     """Decodes the packets of one stream, in order: a delta packet follows the packet before it.
 
-    With the ``raw`` codec every packet stands alone, and so does every key packet.
+    Key packets, and with the ``raw`` codec all packets, can be decoded without the one before.
 
     Raises:
-        StreamError: the stream has a codec that this version does not know, or its header does not fit it.
+        StreamError: the codec is unknown to this version, or the header is inconsistent with it.
     """
 
     def __init__(self, header: StreamHeader) -> None:
@@ -30,15 +30,15 @@ class SceneDecoder:
 
     @property
     def state(self) -> CompactState | None:
-        """What the ``compact`` codec goes on from."""
+        """The ``compact`` codec's state after the last packet."""
         return None if self._compact is None else self._compact.state
 
     def decode(self, packet: Packet) -> Scene:
         """The scene of one frame, on the CPU, in normalised units.
 
         Raises:
-            StreamError: the packet's fields are not the header's dynamic ones, their shapes contradict each other, or
-                it needs a packet that has not been decoded.
+            StreamError: the packet's fields are not the header's dynamic ones, their shapes are inconsistent, or the
+                packet before it has not been decoded.
         """
         header, where = self._header, f"Packet {packet.index}"
         if self._compact is None:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene to a packet, and what the receiver will make of it.
+"""Encodes scenes to packets, with the decoder's reconstruction.
 
 Note [Closed loop]
 ~~~~~~~~~~~~~~~~~~
-The scene that the next frame starts from is the one the decoder will hold, bit for bit: :meth:`SceneEncoder.encode`
-decodes the bytes it has just made and returns that. Without it trainer and viewers drift apart.
+Prediction is closed-loop: :meth:`SceneEncoder.encode` decodes the bytes it has just made and returns the
+reconstruction, from which the trainer starts the next frame. It equals the decoder's scene bit for bit; otherwise
+trainer and viewers would drift apart.
 """
 
 import math
@@ -25,7 +26,7 @@ SceneT = TypeVar("SceneT", covariant=True)
 
 @dataclass(frozen=True)
 class Encoded(Generic[SceneT]):
-    """A packet and the scene a decoder makes of it."""
+    """A packet and its reconstruction: the scene that a decoder gets."""
 
     packet: Packet
     reconstruction: SceneT
@@ -41,7 +42,7 @@ class SceneEncoder:
         self._last_pts_seconds = -math.inf
 
     def replay(self, packet: Packet) -> Scene:
-        """Go on after ``packet``, which another encoder made, with what it says; needed after every packet of a group.
+        """Continue after ``packet`` of another encoder, and return its scene; call it for every packet of the group.
 
         Raises:
             StreamError: it does not follow the packet before it, or is damaged.
@@ -56,8 +57,8 @@ class SceneEncoder:
         """The packet of one frame.
 
         Raises:
-            StreamError: the scene's shapes are not those that the header's static fields have, or the frame is not
-                presented after the one before it.
+            StreamError: the scene's shapes differ from the header's, or the presentation time is not after the
+                previous frame's.
         """
         if not self._last_pts_seconds < pts_seconds < math.inf:
             raise StreamError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of decoded frames; the last frame's scene is kept, for a frame is often shown from several cameras."""
+"""Renders decoded frames; keeps the last scene, because a frame is often rendered for several cameras."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from structgstream.scene.state import on_device
 
 
 class FrameRenderer:
-    """Renders frames of one stream; one scene and one back-end are kept between calls."""
+    """Renders frames of one stream; keeps the last scene and back-end between calls."""
 
     def __init__(self) -> None:
         self._asked: BackendName | Backend | None = None
@@ -28,9 +28,9 @@ class FrameRenderer:
 
         Args:
             index: the frame.
-            view: where from, in the scene's units.
-            decode: gives the scene of a frame.
-            backend: what renders.
+            view: the camera, in the scene's units.
+            decode: returns the scene of a frame.
+            backend: the compute back-end.
 
         Raises:
             BackendError: the back-end is not available.
@@ -38,6 +38,6 @@ class FrameRenderer:
         if self._backend is None or backend != self._asked:
             self._backend, self._asked, self._last = select_backend(backend), backend, None
         if self._last is None or self._last[0] != index:
-            self._last = None  # Two scenes need not be in memory at once.
+            self._last = None  # So that two scenes are not in memory at once.
             self._last = index, on_device(decode(index), self._backend.device)
         return to_8bit_image(render(self._last[1], view, self._backend).image)

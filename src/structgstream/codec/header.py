@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The init record: what a receiver knows before the first frame (docs/bitstream.md, section Init record)."""
+"""Packing and unpacking of the init record (docs/bitstream.md, section Init record)."""
 
 import math
 from collections.abc import Mapping, Set
@@ -27,7 +27,7 @@ def pack_header(header: StreamHeader) -> bytes:
     """The payload of an init record.
 
     Raises:
-        StreamError: the description is too long, or, with codec ``compact``, a field is not made of bins.
+        StreamError: the description is too long, or, with codec ``compact``, a field is not quantized.
     """
     description = {
         "cameras": [
@@ -67,7 +67,7 @@ def unpack_header(payload: bytes) -> StreamHeader:
     """The header of an init record's payload.
 
     Raises:
-        StreamError: the payload contradicts the format.
+        StreamError: the payload violates the format.
     """
     values, coded = unpack_blocks(payload, first_block(payload), where="The init record")
     try:
@@ -76,7 +76,7 @@ def unpack_header(payload: bytes) -> StreamHeader:
     except (ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, CalibrationError) as error:
         raise StreamError(f"The init record does not follow the format ({error or type(error).__name__}).") from error
     if not _complete(header.dynamic | header.static.keys()) or (header.reference and header.codec == "raw"):
-        raise StreamError("The init record does not hold every field that packets leave out, and only those.")
+        raise StreamError("The init record must hold exactly the fields that packets do not carry.")
     check_shapes(
         {**header.static, **header.reference},
         distance_input=header.distance_input,
@@ -96,10 +96,10 @@ def _fields(
 ) -> dict[FieldName, Tensor]:
     if description["codec"] != "compact":
         if coded:
-            raise StreamError(f"The init record holds field {next(iter(coded))} coded, which its codec does not know.")
+            raise StreamError(f"The init record holds field {next(iter(coded))} coded; codec 'raw' has no coding.")
         return values
     if plain := sorted(values.keys() - UNCODED_FIELDS):
-        raise StreamError(f"The init record holds field {plain[0]} as it is, where it should be coded.")
+        raise StreamError(f"The init record holds field {plain[0]} raw; expected coded.")
     return values | decode_fields(coded, _steps(description.get("init_steps", {})))
 
 
@@ -137,7 +137,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
 
 
 def _step(value: object) -> float:
-    # Within these bounds the product of a step and a bin is neither infinite nor denormal.
+    # Within these bounds the product of step and bin is neither infinite nor denormal.
     if not _LEAST_STEP <= (step := _positive(value)) <= 1 / _LEAST_STEP or float(np.float32(step)) != step:
         raise ValueError(f"the step {value!r}; it must be a float32 number from 2^-64 to 2^64")
     return step
@@ -157,7 +157,7 @@ def _camera(entry: dict[str, Any]) -> Camera:
 
 
 def _number(value: object) -> float:
-    """A finite number; JSON readers differ in what else they let through."""
+    """Checks for a finite number; JSON readers differ in what else they accept."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{value!r} where a finite number belongs")
     return float(value)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nouns of a stream: its header, its packets, and where packets go."""
+"""The parts of a stream: header, packets, and the protocol of packet sinks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,22 +16,22 @@ from structgstream.similarity import Similarity
 
 @dataclass(frozen=True)
 class StreamHeader:
-    """What a receiver knows before the first frame: the init record.
+    """The content of the init record, which a receiver reads before the first frame.
 
     Args:
         rig: every camera of the capture, in the capture's own units, with the held-out set of the training run.
         similarity: from the capture's units to the scene's.
-        fps: frames per second of the media.
-        codec: how fields are coded: ``raw`` or ``compact``.
+        fps: frames per second.
+        codec: coding of the fields: ``raw`` or ``compact``.
         dynamic: the fields that packets carry; all others are in ``static``.
-        static: the fields that hold for the whole stream, exactly as the decoder uses them.
-        distance_input: whether the MLPs see the distance.
+        static: the fields that are constant over the stream, exactly as the decoder uses them.
+        distance_input: whether the distance to the camera is an input of the MLPs.
         config: the resolved configuration of the run, as plain JSON values.
         metadata: capture name, creator, start frame and the like, as plain JSON values.
-        steps: of the ``compact`` codec, by name (``bins.py``); each is a float32 number.
-        reference: of the ``compact`` codec, the dynamic fields that key packets change: those of anchors and MLPs.
-        init_steps: of the ``compact`` codec, by field: of what ``static`` and ``reference`` are multiples
-            (``static_fields.py``); each is a float32 number.
+        steps: ``compact`` only: quantization steps by parameter (``bins.py``), each a float32 number.
+        reference: ``compact`` only: the dynamic fields of anchors and MLPs from which key packets are predicted.
+        init_steps: ``compact`` only: quantization steps by field of ``static`` and ``reference``
+            (``static_fields.py``), each a float32 number.
     """
 
     rig: CameraRig
@@ -48,7 +48,7 @@ class StreamHeader:
     init_steps: Mapping[FieldName, float] = field(default_factory=dict)
 
     def camera(self, camera: Camera | str) -> Camera:
-        """A camera as the decoded scenes need it: the same pictures, in the scenes' normalised units.
+        """A camera in the normalised units of the decoded scenes; it shows the same picture.
 
         Args:
             camera: the name of one of the rig, or any camera in the units of the capture.
@@ -64,7 +64,7 @@ class StreamHeader:
 
 
 class PacketKind(IntEnum):
-    """A key packet stands alone beside the header; a delta packet needs the packet before it."""
+    """A key packet needs only the header; a delta packet also needs the packet before it."""
 
     KEY = 1
     DELTA = 2
@@ -72,7 +72,7 @@ class PacketKind(IntEnum):
 
 @dataclass(frozen=True)
 class Packet:
-    """One frame on the wire.
+    """One coded frame.
 
     Args:
         kind: key or delta.
@@ -93,7 +93,7 @@ class Packet:
 
 
 class PacketSink(Protocol):
-    """Where a stream goes. ``write`` returns the number of bytes that the packet took in the sink."""
+    """Receives a stream. ``write`` returns the number of bytes that the packet takes in the sink."""
 
     def open(self, header: StreamHeader) -> int: ...
 

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a stream: header, packets, scenes; whole files and files that were cut anywhere.
+"""Reading a stream: header, packets, scenes; complete files and files truncated anywhere.
 
 Note [Nothing is kept]
 ~~~~~~~~~~~~~~~~~~~~~~
-A stream is as long as the event. A reader keeps the header and eight bytes a packet, and reads everything else when it
-is asked for: what a packet is, from the heads of its record and fields; a scene, from its record, whose checksum is
-verified then. Only the scene that was rendered last stays. With the ``raw`` codec every packet stands alone, so any
-frame is as near as any other.
+Streams can be long, so a reader keeps only the header, eight bytes per packet and the scene rendered last. Everything
+else is read on demand: the facts of a packet from the heads of its record and fields, a scene from its record, whose
+checksum is verified then. With the ``raw`` codec packets are independent, so random access costs one packet.
 """
 
 import math
@@ -52,14 +51,14 @@ from structgstream.scene.scene import Scene
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
 
 
-NOTHING = -2  # no frame follows it
+NOTHING = -2  # index of the last decoded frame if there is none: no frame follows it
 LOST = 2**64 - 1
-"""In the place of the offset of a packet that is not there."""
+"""Offset of a packet that is lost."""
 
 
 @dataclass(frozen=True)
 class PacketInfo:
-    """One packet's place in a stream: ``bytes`` counts the whole record, ``field_bytes`` the fields' parts."""
+    """Facts of one packet: ``bytes`` is the length of its record, ``field_bytes`` that of each field's part."""
 
     kind: PacketKind
     index: int
@@ -70,15 +69,15 @@ class PacketInfo:
 
 
 class Packets(Sequence[PacketInfo]):
-    """The packets of a stream in order, up to the first that is lost. Only their offsets are in memory; asking for one
-    reads its heads.
+    """The packets of a stream in order, up to the first lost one. Only offsets are in memory; indexing reads the heads
+    of the packet's record and fields.
 
     Attributes:
-        offsets: of all packets, also those after what is lost, which has :data:`LOST`.
-        whole: how many there are before the first that is lost.
+        offsets: of all packets, including those after a lost one; :data:`LOST` for lost ones.
+        whole: number of packets before the first lost one.
 
     Raises:
-        StreamError: on asking for a packet that was damaged after the stream was opened.
+        StreamError: on indexing a packet that was damaged after the stream was opened.
     """
 
     def __init__(self, data: ByteSource, name: str) -> None:
@@ -102,7 +101,7 @@ class Packets(Sequence[PacketInfo]):
         return self.at(range(len(self))[index])
 
     def at(self, index: int) -> PacketInfo:
-        """The packet of a frame that is not lost."""
+        """Facts of the packet of a frame that is not lost."""
         offset = self.offsets[index]
         head = read_head(self._data, offset)
         if head is None or head[0] not in _KINDS or head[1] < FRAME.size:
@@ -115,7 +114,7 @@ class Packets(Sequence[PacketInfo]):
         try:
             blocks = [*iterate_blocks(payload, FRAME.size, where=f"Packet {index}")]
         except StreamError as error:
-            if read_record(self._data, offset) is None:  # Nothing in it is what was written.
+            if read_record(self._data, offset) is None:  # The record was damaged after opening.
                 raise self.damaged(index) from error
             raise
         field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
@@ -123,36 +122,36 @@ class Packets(Sequence[PacketInfo]):
         return PacketInfo(_KINDS[RecordType(head[0])], index, pts_seconds, offset, size, field_bytes)
 
     def damaged(self, index: int) -> StreamError:
-        """What to raise when a packet is not what it was at opening."""
+        """The error for a packet that was damaged after opening."""
         return StreamError(f"Packet {index} of {self._name}, at byte {self.offsets[index]}, is damaged.")
 
 
 class StreamReader:
-    """A stream in memory or in a file; memory does not grow with its length (Note [Nothing is kept]).
+    """A stream in memory or in a file; nearly constant memory (Note [Nothing is kept]).
 
-    Every record's checksum is verified once, on opening, one record at a time. Where one is damaged, the stream goes on
-    at the next whole packet: :meth:`scene` gives every frame of :attr:`runs`, while :attr:`packets`, the length and
-    :meth:`scenes` end before the first frame that is lost, so that no frame is taken for another. With ``by_index``
-    the index tells where packets are, if it agrees with their records' heads, and a checksum is verified when its
-    record is read; without a good index that is the same as without the argument.
+    Opening verifies every record's checksum, one record at a time. After a damaged record reading continues at the next
+    whole packet: :meth:`scene` decodes every frame of :attr:`runs`, while :attr:`packets`, the length and
+    :meth:`scenes` end before the first lost frame, so that positions equal frame numbers. With ``by_index`` the offsets
+    are taken from the index, if it agrees with the records' heads, and a checksum is verified when its record is read;
+    without a valid index the argument has no effect.
 
     Args:
         data: the bytes, or an open file, which the reader then closes.
-        name: what messages call it.
+        name: of the stream, for messages.
         by_index: open without reading every byte.
 
     Attributes:
-        header: what the init record says.
-        header_bytes: where the first packet begins.
-        header_field_bytes: of these, what each field takes.
-        packets: every whole packet before the first that is lost, in order.
-        runs: the frames that can be shown, all that follow each other as one range.
-        damage: the damaged records that others follow, and what each costs.
-        complete: whether the stream is whole: the index was written, so that the run that made it had come to its end.
-        cut_reason: what it is otherwise.
+        header: content of the init record.
+        header_bytes: offset of the first packet.
+        header_field_bytes: bytes of each field in the init record.
+        packets: every whole packet before the first lost one, in order.
+        runs: the frames that can be decoded, as ranges of consecutive frames.
+        damage: the damaged records that whole records follow, with the frames lost to each.
+        complete: whether the stream ends with its index, which is written when a reconstruction finishes.
+        cut_reason: why the stream is not complete; None if it is.
 
     Raises:
-        StreamError: not a stream, another major version, no whole init record, or records that contradict each other.
+        StreamError: not a stream, another major version, no whole init record, or inconsistent records.
     """
 
     def __init__(self, data: ByteSource, *, name: str = "The stream", by_index: bool = False) -> None:
@@ -166,7 +165,7 @@ class StreamReader:
         self.damage: list[Damage] = []
         init = read_record(data, PREFIX.size)
         if init is None:
-            raise StreamError(f"Nothing of {name} can be shown: {incomplete_reason(data, PREFIX.size)}.")
+            raise StreamError(f"No frame of {name} can be decoded: {incomplete_reason(data, PREFIX.size)}.")
         if init.type != RecordType.INIT:
             raise StreamError(f"{name} begins with a record of type {init.type}; an init record was expected.")
         self.header = unpack_header(init.payload)
@@ -186,10 +185,10 @@ class StreamReader:
         self._renderer = FrameRenderer()
 
     def _scan(self, end: int) -> int:
-        """Verify every record from byte ``end`` on; returns where the last whole one ends."""
+        """Verify every record from byte ``end`` on; returns the end of the last whole one."""
         search, seconds = PacketSearch(self._data), -math.inf
         offsets = self.packets.offsets
-        found: list[tuple[int, int]] = []  # damaged records and the frames that should have been there
+        found: list[tuple[int, int]] = []  # damaged records and the frames expected there
         ended = False
         while not ended:
             for record in scan_records(self._data, end):
@@ -209,16 +208,16 @@ class StreamReader:
         return end
 
     def _run(self, index: int) -> int:
-        """Which of :attr:`runs` is the first that does not end before ``index``."""
+        """Index of the first of :attr:`runs` that does not end before frame ``index``."""
         return bisect_right(self.runs, index, key=lambda run: run.stop)
 
     def _shown_from(self, index: int) -> int:
-        """The first frame from ``index`` on that can be shown, or the number of frames."""
+        """The first frame from ``index`` on that can be decoded, or the number of frames."""
         place = self._run(index)
         return max(self.runs[place].start, index) if place < len(self.runs) else len(self.packets.offsets)
 
     def _reason(self, end: int) -> str:
-        """Why the stream, read up to byte ``end``, is not whole."""
+        """Why the stream, read up to byte ``end``, is not complete."""
         if not self.damage:
             return incomplete_reason(self._data, end)
         reason = f"the record at byte {self.damage[0].offset} of {self.total_bytes} is damaged"
@@ -235,7 +234,7 @@ class StreamReader:
         return f"{reason}; {lost} of {len(self.packets.offsets)} frames are lost, the first is {first}, {again}"
 
     def _add(self, record: Record, before_seconds: float) -> float:
-        """Note a packet's place; returns when it is presented, or the time of the one before for another record."""
+        """Record a packet's offset; returns its presentation time, or ``before_seconds`` for another record."""
         if record.type == RecordType.INIT:
             raise StreamError(f"{self._name} has a second init record, at byte {record.offset}.")
         if record.type not in _KINDS:
@@ -247,7 +246,7 @@ class StreamReader:
         if packet.index == 0 and packet.kind is not PacketKind.KEY:
             raise StreamError(f"{self._name} begins with a delta packet; the first must be a key packet.")
         if packet.index and packet.pts_seconds <= before_seconds:
-            raise StreamError(f"In {self._name} packet {packet.index} is not presented after the one before it.")
+            raise StreamError(f"In {self._name} the presentation time of packet {packet.index} does not increase.")
         offsets.append(record.offset)
         if self.runs and self.runs[-1].stop == packet.index:
             self.runs[-1] = range(self.runs[-1].start, packet.index + 1)
@@ -267,7 +266,7 @@ class StreamReader:
         self.close()
 
     def close(self) -> None:
-        """Closes the file, if there is one; what is asked for later raises. Unneeded before the reader is dropped."""
+        """Closes the file, if there is one; later reads raise. Optional: dropping the reader closes it too."""
         if isinstance(self._data, FileBytes):
             self._data.close()
 
@@ -285,17 +284,17 @@ class StreamReader:
         scene: Scene | None = None
         for packet in [self._packet(index)] if follows else self.group(index):
             scene = self._decoder.decode(packet)
-        assert scene is not None, "a group holds the frame that was asked for"
+        assert scene is not None, "a group ends with its frame"
         self._decoded = index
         return scene
 
     def render(self, index: int, camera: Camera | str, *, backend: BackendName | Backend = "auto") -> NDArray[np.uint8]:
-        """What a camera sees of one frame, ``[H, W, 3]`` in 8-bit sRGB; its scene is kept for the next picture.
+        """Renders one frame: ``[H, W, 3]`` 8-bit sRGB. The scene is kept for further pictures of the same frame.
 
         Args:
             index: the frame.
             camera: the name of a camera of the stream's rig (``header.rig``), or any, in the units of the capture.
-            backend: what renders.
+            backend: the compute back-end.
 
         Raises:
             StreamError: there is no such frame, or it has been damaged.
@@ -316,10 +315,10 @@ class StreamReader:
         return StreamError(f"{self._name} has {have}; there is no frame {index}.")
 
     def group(self, index: int) -> Iterator[Packet]:
-        """The packets that frame ``index`` needs, from a key packet to its own; with ``raw`` its own alone.
+        """The packets needed to decode frame ``index``, from the key packet to its own; with ``raw`` only its own.
 
         Raises:
-            StreamError: one has been damaged.
+            StreamError: one of them is damaged.
         """
         first = index
         while self.header.codec != "raw" and self.packets.at(first).kind is not PacketKind.KEY:
@@ -337,7 +336,7 @@ class StreamReader:
         return packet
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
-        """Every frame from ``start`` on, one at a time, up to the first that is lost."""
+        """Every frame from ``start`` on, one at a time, up to the first lost one."""
         for index in range(*slice(start, None).indices(len(self))):
             scene = self.scene(index)
             yield self.packets[index], scene
@@ -345,11 +344,11 @@ class StreamReader:
 
 
 def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
-    """Read a stream file, which stays open as long as the reader is used (it closes itself, also in a ``with`` block).
+    """Open a stream file. It is closed at the end of a ``with`` block, by ``close()``, or with the reader.
 
     Args:
         path: the file.
-        by_index: find packets by the file's index instead of verifying every byte first, as :class:`StreamReader`.
+        by_index: find packets by the file's index instead of verifying every byte first, see :class:`StreamReader`.
 
     Raises:
         StreamError: there is no such file, or it is not a stream.
@@ -361,11 +360,11 @@ def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
 
 
 def readable_part(data: ByteSource, *, name: str) -> int | None:
-    """Where the last whole packet ends, the index and what follows left out; None when the init record was cut.
+    """End of the last whole packet, before the index; None if the file is truncated within the init record.
 
     Raises:
-        StreamError: not a stream, another major version, or an init record that is there and damaged: starting again
-            would throw away what follows it.
+        StreamError: not a stream, another major version, or a damaged init record, after which restarting would
+            destroy frames.
     """
     if prefix().startswith(bytes(data[: PREFIX.size + 1])):
         return None  # Cut within the prefix, or empty.
@@ -377,12 +376,13 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
         end = record.end
         frames += record.type in _KINDS
     if end > PREFIX.size:
-        # No crash leaves whole frames after a damaged one, only a medium that forgets.
+        # A crash cannot leave whole frames after a damaged one; a failing disk can.
         search = PacketSearch(data)
         if not complete and search.next(end, expected=frames, after_seconds=-math.inf) is not None:
             raise StreamError(
-                f"Cannot continue {name}: {incomplete_reason(data, end)}, and whole frames follow it that continuing "
-                f"would throw away. Keep a copy, then cut the file to {end} bytes and use --resume to fit them anew."
+                f"Cannot continue {name}: {incomplete_reason(data, end)}, and continuing would overwrite the whole "
+                f"frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them "
+                "again."
             )
         return end
     reason = incomplete_reason(data, end)

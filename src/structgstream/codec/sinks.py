@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where packets go: a file that is never left damaged, or memory."""
+"""Packet sinks: a file, crash-safe, or memory."""
 
 import io
 import os
@@ -21,19 +21,19 @@ _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 class _Writer:
     """Appends records to an unbuffered binary file and keeps the index.
 
-    ``_end`` moves only once a record is whole and on the disk, in one step, so that an exception at any instant,
-    Ctrl-C included, leaves at most bytes behind it, which the next write or :meth:`finish` replaces.
+    ``_end`` advances in one step, after a record is completely on the disk. An exception at any time, Ctrl-C included,
+    leaves at most extra bytes after ``_end``, which the next write or :meth:`finish` replaces.
     """
 
     def __init__(self, file: BinaryIO, name: str) -> None:
         self._file = file
         self._name = name
         self._end = 0
-        self._entries = bytearray()  # INDEX_ENTRY after INDEX_ENTRY; those that say _end or more did not come to be
+        self._entries = bytearray()  # packed INDEX_ENTRYs; those with an offset of _end or more were interrupted
         self._failed = False
 
     def continue_at(self, end: int, reader: StreamReader) -> None:
-        """Go on after byte ``end`` of a file that holds the packets of ``reader``."""
+        """Continue after byte ``end`` of a file with the packets of ``reader``."""
         entries = (INDEX_ENTRY.pack(info.index, _TYPES[info.kind], info.offset) for info in reader.packets)
         self._entries = bytearray(b"".join(entries))
         self._end = end
@@ -48,14 +48,14 @@ class _Writer:
         return self._append(packed(kind, packet.payload))
 
     def finish(self) -> None:
-        """Write index and footer and cut what an interrupted write left; nothing after a failed write."""
+        """Write index and footer and truncate the rest of an interrupted write; does nothing after a failed write."""
         if self._failed:
             return
         self._append(pack_index(self._written().values(), self._end))
         self._file.truncate(self._end)
 
     def _written(self) -> dict[int, tuple[int, int, int]]:
-        """Offset to index entry of every whole packet; of a write that was interrupted and repeated, the later."""
+        """Offset to index entry of every whole packet; of an interrupted and repeated write the later entry."""
         entries = INDEX_ENTRY.iter_unpack(self._entries)
         return {offset: (index, kind, offset) for index, kind, offset in entries if offset < self._end}
 
@@ -69,7 +69,7 @@ class _Writer:
                 os.fsync(self._file.fileno())
         except OSError as error:
             self._failed = True
-            with suppress(OSError):  # If even this fails, readers stop at the record that is not whole.
+            with suppress(OSError):  # If this fails too, readers stop at the incomplete record.
                 self._file.truncate(self._end)
             raise StorageError(
                 f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). "
@@ -81,7 +81,7 @@ class _Writer:
 
 
 class FileSink:
-    """A stream file. Every packet is on the disk when ``write`` returns; a failed write is cut off again."""
+    """A stream file. Every packet is on the disk when ``write`` returns; a failed write is truncated."""
 
     def __init__(self, path: Path | str, *, overwrite: bool = False) -> None:
         self.path = Path(path)
@@ -92,13 +92,13 @@ class FileSink:
 
     @classmethod
     def resume(cls, path: Path | str) -> tuple["FileSink", StreamReader | None]:
-        """A sink that continues a file after its last whole packet, and the reader of what is there.
+        """A sink that continues a file after its last whole packet, and a reader of the existing packets.
 
-        The reader is None when there is no whole packet: the stream then starts again from nothing, because the static
-        fields of frame 0 are good only beside its dynamic ones. The file stays as it is until :meth:`open`.
+        The reader is None if there is no whole packet: the stream then restarts at frame 0, because the static fields
+        in the init record match only the lost dynamic fields of frame 0. The file is not changed before :meth:`open`.
 
         Raises:
-            StreamError: the file is something else, or damaged where nothing can be saved.
+            StreamError: the file is no stream, or is damaged so that it cannot be continued.
         """
         sink = cls(path, overwrite=True)
         data: ByteSource = FileBytes(path) if sink.path.exists() else b""
@@ -110,7 +110,7 @@ class FileSink:
         return sink, reader
 
     def open(self, header: StreamHeader) -> int:
-        """Create the file and write the init record, or go on with a resumed one, which holds its header already.
+        """Create the file and write the init record, or continue a resumed file, which already has one.
 
         Raises:
             StorageError: it exists and may not be overwritten, or cannot be written.
@@ -136,13 +136,13 @@ class FileSink:
         """Append one packet; returns the bytes it took.
 
         Raises:
-            StorageError: the disk is full or gone; what was written before stays.
+            StorageError: the packet cannot be written; earlier packets stay.
         """
         assert self._writer is not None, "open() comes before write()"
         return self._writer.write(packet)
 
     def close(self) -> None:
-        """Write the index, unless a write had failed, and close the file. A second call does nothing.
+        """Write the index, unless a write has failed, and close the file. A second call does nothing.
 
         Raises:
             StorageError: no room for the index; all frames are safe.
@@ -156,7 +156,7 @@ class FileSink:
 
 
 class MemorySink:
-    """The same bytes in memory; :attr:`data` is what a file would hold."""
+    """A stream in memory; :attr:`data` equals the content of a file."""
 
     def __init__(self) -> None:
         self._buffer = io.BytesIO()

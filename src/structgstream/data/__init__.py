@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures: readers of the usual layouts behind one protocol, resizing, prefetch."""
+"""Captures: readers of common layouts with one protocol, resizing, prefetching."""
 
 from structgstream.data.clip import bundled_clip
 from structgstream.data.open import open_capture

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a model of the same cameras, in another frame of reference."""
+"""Points of a COLMAP model of the same cameras, transformed to the rig's coordinates."""
 
 import logging
 from pathlib import PurePosixPath
@@ -14,13 +14,13 @@ log = logging.getLogger(__name__)
 
 LEAST_CAMERAS = 3
 MOST_OFF = 0.03
-"""Of the rig's extent: how far cameras of the two may lie apart after the best similarity."""
+"""Largest residual of a camera position after alignment, as a share of the rig's extent."""
 
 
 def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | None:
-    """The points ``[P, 3]`` of ``model`` in the frame of ``rig``, by the similarity that carries its cameras there.
+    """The points ``[P, 3]`` of ``model`` in the coordinates of ``rig``, by the similarity that aligns its cameras.
 
-    None, with a warning, when too few cameras have the same name or their positions do not agree.
+    None, with a warning, if too few cameras match by name or their positions do not agree.
     """
     if model.points is None:
         return None

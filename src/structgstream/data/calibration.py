@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a file's numbers to a rig, with errors that name the camera and the file."""
+"""Checked construction of rigs from calibration files; errors name the camera and the file."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -28,8 +28,7 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         where: the file that the numbers come from.
 
     Raises:
-        CalibrationError: broken numbers (see :class:`Camera`), or a principal point that belongs to a picture
-            of another size.
+        CalibrationError: invalid values (see :class:`Camera`), or a principal point for a picture of another size.
     """
     try:
         extrinsics = np.array(viewmat, dtype=np.float64)
@@ -76,7 +75,7 @@ def with_near(rig: CameraRig, near: float) -> CameraRig:
 
 
 def check_names(calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path) -> None:
-    """Every calibrated camera must have pictures, and the reverse.
+    """Check that the calibrated cameras are those with pictures.
 
     Raises:
         CalibrationError: pictures of a camera without calibration.

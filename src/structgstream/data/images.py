@@ -65,7 +65,7 @@ def opencv() -> ModuleType:
 
 
 def common_pictures(files: Mapping[str, Mapping[str, Path]], *, where: Path) -> dict[str, tuple[Path, ...]]:
-    """The pictures of the instants that all cameras have.
+    """The pictures of the time steps that all cameras have.
 
     Args:
         files: camera name to its pictures, by the name of the instant.

@@ -39,13 +39,13 @@ def recognizes_immersive(path: Path) -> bool:
 
 
 def open_immersive(path: Path) -> FrameSource:
-    """The capture at ``path``, undistorted.
+    """The capture at ``path``, undistorted; a video without calibration, which some takes have, is left out.
 
     Raises:
-        CaptureError: a video cannot be read, or a camera has none.
+        CaptureError: a video cannot be read.
         CalibrationError: a broken file, or videos of other proportions than it says.
     """
-    return open_posed(path, read_models(path / MODELS), target=_as_published)
+    return open_posed(path, read_models(path / MODELS), target=_as_published, complete=False)
 
 
 def _as_published(filmed: LensCamera) -> Camera:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lens models as values: where a lens puts what a pinhole would put somewhere else.
+"""Lens distortion models.
 
-Points are normalised: where a ray meets the plane one unit before the camera, ``[..., 2]`` float64. Each lens has
+Points are in normalised coordinates, on the plane one unit in front of the camera, ``[..., 2]`` float64. Each lens has
 
-- ``reach``: how far from the axis, normalised, it is one to one;
-- ``distort``: where it puts points; NaN beyond its reach;
-- ``undistort``: the inverse; NaN where nothing within its reach comes to lie.
+- ``reach``: radius, in normalised coordinates, up to which the model is invertible;
+- ``distort``: from undistorted to distorted points; NaN beyond the reach;
+- ``undistort``: the inverse; NaN outside the image of the reach.
 
 Intrinsics follow the package's convention, the top-left pixel's centre at (0.5, 0.5); :func:`from_integer_centers`
-converts those of tools that have it at (0, 0), which OpenCV is one of.
+converts those of tools that have it at (0, 0), such as OpenCV.
 """
 
 import math
@@ -45,8 +45,8 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class RadialTangential:
-    """OpenCV's model: a radius is multiplied by ``(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``,
-    and ``p1``, ``p2`` add what a tilted lens does (Brown, Decentering Distortion of Lenses, 1966)."""
+    """OpenCV's model: radial factor ``(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`` and tangential
+    distortion ``p1``, ``p2`` (Brown, Decentering Distortion of Lenses, 1966)."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -89,7 +89,7 @@ class RadialTangential:
         return points * (over(radii) / under(radii)) + tilt
 
     def undistort(self, points: Floats) -> Floats:
-        """By Newton's method from the radius that the radial part alone has."""
+        """Newton's method, started from the inverse of the radial part."""
         wanted, points = points, np.nan_to_num(points)
         radii, reach = _radii(points), self.reach
         over, under = self._polynomials
@@ -116,7 +116,7 @@ class RadialTangential:
 
 @dataclass(frozen=True)
 class Fisheye:
-    """OpenCV's equidistant model: an angle ``t`` to the axis comes to lie at the radius
+    """OpenCV's equidistant model: a ray at angle ``t`` to the axis has the distorted radius
     ``t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`` (Kannala and Brandt, 2006)."""
 
     k1: float = 0.0
@@ -126,7 +126,7 @@ class Fisheye:
 
     @property
     def widest_angle(self) -> float:
-        """The angle to the axis, radians, up to which the model is one to one; at most a right angle."""
+        """The angle to the axis, radians, up to which the model is invertible; at most a right angle."""
         grows = self._radius.deriv()
         return min(_first_root(grows), math.pi / 2 - 1e-6)
 
@@ -155,31 +155,31 @@ Lens = Pinhole | RadialTangential | Fisheye
 
 @dataclass(frozen=True)
 class LensCamera:
-    """A camera as it films: ``camera`` holds intrinsics, pose and size of its pictures, ``lens`` what bends rays."""
+    """A camera with distortion: ``camera`` holds intrinsics, pose and picture size, ``lens`` the distortion."""
 
     camera: Camera
     lens: Lens
 
     def pixels(self, points: Floats) -> Floats:
-        """Where the camera sees points ``[..., 3]`` of the world; NaN beyond the reach of the lens and behind."""
+        """Pixels of world points ``[..., 3]``; NaN beyond the reach of the lens and behind the camera."""
         viewmat = self.camera.viewmat.numpy()
         local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
         depths = np.where(local[..., 2:] > 0, local[..., 2:], np.nan)
         return self.to_pixels(local[..., :2] / depths)
 
     def to_pixels(self, normalised: Floats) -> Floats:
-        """The pixels ``[..., 2]`` of normalised points, through the lens."""
+        """Distorted pixels ``[..., 2]`` of normalised points."""
         K = self.camera.K.numpy()
         return self.lens.distort(normalised) @ K[:2, :2].T + K[:2, 2]
 
     def to_normalized(self, pixels: Floats) -> Floats:
-        """The points ``[..., 2]`` that a pinhole would see in the direction of pixels."""
+        """Undistorted normalised points ``[..., 2]`` of pixels."""
         K = self.camera.K.numpy()
         return self.lens.undistort((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
 
 
 def from_integer_centers(K: ArrayLike) -> Floats:
-    """Intrinsics ``[3, 3]`` of a tool that has the top-left pixel's centre at (0, 0), in the package's convention."""
+    """Converts intrinsics ``[3, 3]`` with the top-left pixel's centre at (0, 0) to the package's convention."""
     moved = np.array(K, dtype=np.float64)
     moved[:2, 2] += 0.5
     return moved
@@ -201,7 +201,7 @@ def opencv_lens(coefficients: Sequence[float]) -> Lens:
 
 
 def fisheye_lens(coefficients: Sequence[float]) -> Fisheye:
-    """From OpenCV's vector ``k1, k2, k3, k4`` of its fisheye module; what is left out is 0.
+    """From the vector ``k1, k2, k3, k4`` of OpenCV's fisheye module; missing ones are 0.
 
     Raises:
         ValueError: more than four numbers that are not 0.
@@ -224,7 +224,7 @@ def _first_root(polynomial: Polynomial) -> float:
 
 
 def _inverse(grows: Callable[[Floats], Floats], values: Floats, *, most: float) -> Floats:
-    """Where a function that grows from 0 to ``most`` takes ``values``, by bisection; NaN where it does not."""
+    """Inverse, by bisection, of a function that increases on [0, ``most``]; NaN for values outside its range."""
     low, high = np.zeros_like(values), np.full_like(values, most)
     if math.isinf(most):
         high = np.maximum(values, 1.0)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cameras see the same things, and which of their pixels are the same point.
+"""Neighbouring views and keypoint matches between them, for known poses.
 
-Everything rests on known poses: neighbours are chosen by the cameras' geometry, and a keypoint is only
-compared with keypoints near its epipolar line (Hartley and Zisserman, Multiple View Geometry, chapters 9
-and 12). Pixels follow the package's convention, the top-left pixel's centre at (0.5, 0.5).
+Neighbours are chosen by the cameras' geometry, and a keypoint is only compared with keypoints near its epipolar line
+(Hartley and Zisserman, Multiple View Geometry, chapters 9 and 12). Pixels follow the package's convention, the top-left
+pixel's centre at (0.5, 0.5).
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ def sift_features(image: NDArray[np.uint8], *, count: int, contrast: float = 0.0
         MissingExtraError: cv2 is not installed.
     """
     cv2 = load_cv2()
-    # Without the precise upscale every keypoint would sit a quarter of a pixel off.
+    # Without the precise upscale every keypoint would be off by a quarter of a pixel.
     sift = cv2.SIFT.create(
         nfeatures=count,
         nOctaveLayers=3,
@@ -72,7 +72,7 @@ def load_cv2() -> ModuleType:
 
 
 def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
-    """Pixels ``[P, 2]`` and depths ``[P]`` of points ``[P, 3]``; pixels behind the camera mean nothing."""
+    """Pixels ``[P, 2]`` and depths ``[P]`` of points ``[P, 3]``; pixels of points behind the camera are invalid."""
     viewmat, K = camera.viewmat.numpy(), camera.K.numpy()
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depths = local[:, 2]
@@ -92,10 +92,10 @@ def inside(camera: Camera, pixels: Floats, depths: Floats, *, near: float) -> ND
 
 
 def viewing_distance(cameras: Mapping[str, Camera]) -> float:
-    """Typical distance from a camera to what the rig looks at, from the poses alone.
+    """Typical distance from a camera to the scene, estimated from the poses.
 
-    The point nearest to all optical axes, if it lies in front of most cameras; for axes that do not meet (a
-    flat forward-facing array), five times the rig's radius.
+    It is the distance to the point nearest to all optical axes, if that lies in front of most cameras; for nearly
+    parallel axes (a flat forward-facing array) five times the rig's radius.
     """
     centers = np.stack([camera.center.numpy() for camera in cameras.values()])
     axes = np.stack([camera.viewmat.numpy()[2, :3] for camera in cameras.values()])
@@ -109,10 +109,10 @@ def viewing_distance(cameras: Mapping[str, Camera]) -> float:
 
 
 def level_normal(cameras: Mapping[str, Camera]) -> Floats:
-    """The unit normal ``[3]`` of level planes, pointing up: square to the cameras' horizontal axes.
+    """The unit normal ``[3]`` of horizontal planes, pointing up: perpendicular to the cameras' x axes.
 
-    Holds for cameras that are not rolled. Where their horizontal axes are all parallel, the mean up of the
-    pictures decides among the directions square to them.
+    Assumes cameras without roll. If all x axes are parallel, the perpendicular direction nearest to the pictures' mean
+    up direction is taken.
     """
     axes = np.stack([camera.viewmat.numpy()[0, :3] for camera in cameras.values()])
     upwards = -np.mean([camera.viewmat.numpy()[1, :3] for camera in cameras.values()], axis=0)
@@ -125,8 +125,8 @@ def level_normal(cameras: Mapping[str, Camera]) -> Floats:
 def neighbor_views(cameras: Mapping[str, Camera], *, count: int, distance: float) -> dict[str, tuple[str, ...]]:
     """For each camera the ``count`` others that see most of its volume under a useful parallax, best first.
 
-    The volume is sampled around ``distance`` (see :func:`viewing_distance`); too small a parallax measures no
-    depth, too large a one changes the look of things.
+    The volume is sampled around ``distance`` (see :func:`viewing_distance`). Too small a parallax gives no depth, too
+    large a one changes appearance.
     """
     low, high = _BEST_ANGLES_DEGREES
     chosen: dict[str, tuple[str, ...]] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The door: a folder in, a capture out."""
+"""Opens a capture from a folder of any supported layout."""
 
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def open_capture(
 
     Raises:
         CaptureError: the folder is missing, empty or of an unknown layout, or its content is broken.
-        ConfigError: an argument cannot work.
+        ConfigError: an argument is invalid.
     """
     source = _recognized(Path(path))
     rig = source.rig
@@ -89,4 +89,4 @@ def _recognized(path: Path) -> FrameSource:
     if not content:
         raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS}")
     shown = ", ".join(content[:6]) + (", ..." if len(content) > 6 else "")
-    raise CaptureError(f"The folder {path} has no layout that is known here; it holds {shown}.\n{LAYOUTS}")
+    raise CaptureError(f"The folder {path} has no supported layout; it holds {shown}.\n{LAYOUTS}")

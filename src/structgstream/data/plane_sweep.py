@@ -19,25 +19,25 @@ from structgstream.data.matching import Floats, back_project, inside, load_cv2, 
 
 FloatImage = NDArray[np.float32]
 
-# Far below any grey value, so that a pixel blended with the least bit of what is outside the picture shows.
+# Far below any grey value, so that interpolation with a pixel outside the picture is detectable.
 _OUTSIDE = -1e6
 
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """How the plane sweep looks for depth, and what it believes.
+    """Sampling and acceptance thresholds of the plane sweep.
 
     Args:
         width: width the pictures are reduced to, pixels.
         planes: fewest and most planes; between them, one per pixel of disparity.
         window: side of the correlation window, reduced pixels.
-        noise: grey-level noise (of 1) added to the variances: flat windows then correlate with nothing.
-        min_score: least correlation.
-        min_margin: least lead of the best plane over any other that is not its neighbour.
-        agreement: largest disagreement with another view's depth, in planes and as a share of depth; the
-            looser of the two counts.
-        views: further views that must agree.
-        level_planes: also sweep level planes, for floors and tables seen at a slant.
+        noise: grey-level noise (full scale 1) added to the variances, so that textureless windows correlate with none.
+        min_score: least correlation of an accepted pixel.
+        min_margin: least difference between the score of the best plane and that of any non-adjacent one.
+        agreement: largest difference to another view's depth, in planes and as a share of depth; the looser one
+            applies.
+        views: number of other views that must agree.
+        level_planes: also sweep horizontal planes, for floors and tables seen at a slant.
     """
 
     width: int = 240
@@ -51,8 +51,8 @@ class SweepConfig:
     level_planes: bool = False
 
 
-# Fine windows for texture and outlines; then wide ones, of pictures so reduced that their noise is averaged
-# away, for what is nearly plain.
+# Small windows for texture and outlines, then large ones, on pictures reduced until their noise averages out, for
+# surfaces with little texture.
 DEFAULT_LEVELS = (
     SweepConfig(),
     SweepConfig(width=96, window=7, noise=0.001, min_margin=0.03, level_planes=True),
@@ -61,7 +61,7 @@ DEFAULT_LEVELS = (
 
 @dataclass(frozen=True)
 class SweepBounds:
-    """Where one camera looks for depth.
+    """The range of depths that one camera sweeps.
 
     Args:
         depth_range: nearest and farthest depth along z.
@@ -76,13 +76,13 @@ class SweepBounds:
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth seen by one reduced camera.
+    """Depth map of one camera at reduced resolution.
 
     Args:
         camera: the camera at the size of the map.
         inverse_depth: ``[H, W]`` float64, 1 / z.
         step: distance of two planes in inverse depth.
-        believed: ``[H, W]``, which pixels scored high and without a rival.
+        believed: ``[H, W]`` mask of the pixels with a high score and a sufficient margin.
     """
 
     camera: Camera
@@ -122,7 +122,7 @@ def sweep_depth(
     step = (limits[1] - limits[0]) / (len(families[0].inverse_offsets) - 1)
     inverse, peak, lead = searches[0]
     for other_inverse, other_peak, other_lead in searches[1:]:
-        # Two families that find different depths are each other's rivals; the same depth twice is no rivalry.
+        # Margins compare the families only where their depths differ.
         apart = np.abs(other_inverse - inverse) > 2 * step
         better = other_peak > peak
         gap = np.where(apart, np.abs(other_peak - peak), np.inf)
@@ -135,10 +135,10 @@ def sweep_depth(
 def consistent_pixels(
     depth_map: DepthMap, others: Sequence[DepthMap], *, config: SweepConfig
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """The points ``[P, 3]`` of the believed pixels on whose depth enough of the other maps agree.
+    """The points ``[P, 3]`` of the believed pixels whose depth enough other maps confirm.
 
-    A point is the mean of its own estimate and of those of the views that agree. The mask ``[H, W]`` names
-    the points' pixels, in row order.
+    A point is the mean of its own estimate and those of the agreeing views. The mask ``[H, W]`` has the points' pixels
+    in row order.
     """
     row, column = np.nonzero(depth_map.believed)
     pixels = np.stack([column, row], 1).astype(np.float64) + 0.5
@@ -150,7 +150,7 @@ def consistent_pixels(
         agreeing[seen] += 1
         total[seen] += estimate
         looking += inside(other.camera, *project(other.camera, points), near=0.0)
-    # At the edge of the common volume, where a single other camera looks, it suffices.
+    # At the edge of the common volume, where only one other camera sees the point, that one suffices.
     kept = agreeing >= np.clip(looking, 1, config.views)
     mask = np.zeros(depth_map.believed.shape, bool)
     mask[row[kept], column[kept]] = True
@@ -168,7 +168,7 @@ def sweep_points(
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8.
 
-    A later level adds only what the earlier ones left blank around its pixels: wide windows grow over
+    A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
 
     Raises:
@@ -210,7 +210,7 @@ def sweep_points(
 def _agreement(
     points: Floats, own: DepthMap, pixels: Floats, other: DepthMap, config: SweepConfig
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Which of ``points`` the other map confirms, and its own estimates of them."""
+    """Indices of the ``points`` that the other map confirms, and its estimates of them."""
     projected, depths = project(other.camera, points)
     seen = np.flatnonzero(inside(other.camera, projected, depths, near=0.0))
     column, row = projected[seen].astype(np.intp).T
@@ -272,7 +272,7 @@ def _search(
     limits: tuple[float, float],
     config: SweepConfig,
 ) -> tuple[Floats, Floats, Floats]:
-    """Inverse depth, score and lead over the best rival ``[H, W]`` of one family; lead -1 without a peak.
+    """Inverse depth, score and margin over the best non-adjacent plane ``[H, W]`` of one family; -1 without a peak.
 
     The plane is refined by a parabola through the scores around it.
     """

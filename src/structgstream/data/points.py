@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial points from the first frame with known poses, for captures that bring none.
+"""Initial points from the first frame with known poses, for captures without points.
 
-Points from nothing but chance overfit: the scene they grow into has floaters that held-out cameras see.
-Matched keypoints are precise but sparse, the plane sweep covers floors, walls and people; both are kept
-only where further views agree.
+Random initial points lead to overfitting, with floaters visible in held-out views. Matched keypoints are precise but
+sparse; the plane sweep covers floors, walls and people. Both are kept only where further views agree.
 """
 
 import logging
@@ -38,12 +37,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PointsConfig:
-    """How initial points are found.
+    """Configuration of the initial points.
 
     Args:
         max_points: most points returned.
-        min_points: fewer found points than this are replaced by random ones.
-        random_points: how many random ones.
+        min_points: if fewer points are found, random ones replace them.
+        random_points: number of random points.
         features: SIFT keypoints per picture.
         neighbours: cameras that each camera is matched with.
         line_pixels: largest distance of a match to its epipolar line.
@@ -51,11 +50,11 @@ class PointsConfig:
         confirm_pixels: largest reprojection error in a third view.
         near_share: near limit of matching and sweep, as a share of the viewing distance.
         far_share: far limit of matching, as a multiple of the viewing distance.
-        cell_share: side of the cells, as a share of the viewing distance, that keep one point each
-            (grown where that leaves more than ``max_points``).
-        isolation_share: side of the cells, as a share of the viewing distance, in which a point needs
-            company.
-        sweep_levels: the plane sweeps, fine to coarse; none leaves the sweep out.
+        cell_share: side of the cells that keep one point each, as a share of the viewing distance (enlarged if more
+            than ``max_points`` remain).
+        isolation_share: side of the cells of the isolation test, as a share of the viewing distance; points with too
+            few neighbours are removed.
+        sweep_levels: the plane sweeps, fine to coarse; empty for none.
     """
 
     max_points: int = 60_000
@@ -80,7 +79,7 @@ class InitialPoints:
     Args:
         positions: ``[P, 3]`` float64, in the capture's units.
         colors: ``[P, 3]`` uint8 sRGB.
-        counts: how many came from ``"sift"``, ``"sweep"`` or ``"random"``.
+        counts: number of points from ``"sift"``, ``"sweep"`` and ``"random"``.
     """
 
     positions: Floats
@@ -89,7 +88,7 @@ class InitialPoints:
 
     @property
     def random(self) -> bool:
-        """Whether too little was found and the points only fill the volume that the cameras see."""
+        """Whether the points are random, because too few were found."""
         return self.counts.get("random", 0) > 0
 
 
@@ -98,7 +97,7 @@ def initial_points(
 ) -> InitialPoints:
     """Points of one frame from the training cameras' pictures and poses; held-out pictures are never read.
 
-    The result does not depend on the number of threads; ``seed`` only matters when random points stand in.
+    The result does not depend on the number of threads; ``seed`` is used for random points only.
 
     Raises:
         MissingExtraError: cv2 is not installed.
@@ -178,7 +177,7 @@ def _confirm_points(
     *,
     tolerance: float,
 ) -> tuple[Floats, NDArray[np.intp], Floats]:
-    """Points that two matches of one keypoint, in two other views, agree on.
+    """Points of keypoints whose matches in two other views agree.
 
     Returns the points ``[P, 3]``, and the camera (index) and pixel ``[P, 2]`` of their keypoint.
     """
@@ -213,7 +212,7 @@ def _confirm_points(
 def _sweep_bounds(
     cameras: Mapping[str, Camera], points: Floats, *, distance: float, config: PointsConfig
 ) -> dict[str, SweepBounds]:
-    """Depths and heights that the points span, with some room around them."""
+    """Ranges of depth and height of the points, with a margin."""
     up = level_normal(cameras)
     low, high = np.percentile(points @ up, [1, 99]) if len(points) >= 30 else (0.0, 0.0)
     room = 0.1 * distance
@@ -228,7 +227,7 @@ def _sweep_bounds(
 
 
 def _depth_range(camera: Camera, points: Floats, distance: float, config: PointsConfig) -> tuple[float, float]:
-    """Nearest and farthest depth to sweep: what the points in the picture span and some room around it."""
+    """Nearest and farthest depth to sweep: the range of the points in the picture, with a margin."""
     near = max(config.near_share * distance, camera.near)
     pixels, depths = project(camera, points)
     depths = depths[inside(camera, pixels, depths, near=near)]
@@ -239,7 +238,7 @@ def _depth_range(camera: Camera, points: Floats, distance: float, config: Points
 
 
 def _has_neighbors(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.bool_]:
-    """Which points ``[P]`` have at least ``least`` others in the 27 cells around them."""
+    """Mask ``[P]`` of the points with at least ``least`` others in the 27 cells around them."""
     if len(points) == 0:
         return np.zeros(0, bool)
     keys, strides = _cells(points, cell)
@@ -254,8 +253,8 @@ def _has_neighbors(points: Floats, *, cell: float, least: int = 3) -> NDArray[np
 def _thin_out(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:
     """Indices of one point per cell, of cells grown until at most ``count`` points remain.
 
-    Cells rather than a random subset: plain places, where points are few, keep theirs. The earlier point of a
-    cell stays, so a keypoint before a fine window and a fine window before a wide one.
+    Unlike a random subset, cells keep points in sparse, textureless regions. The first point of a cell is kept, so
+    keypoints take precedence over small windows, and these over large ones.
     """
     if len(points) == 0:
         return np.zeros(0, np.intp)
@@ -282,7 +281,7 @@ def _random_points(
     rng: np.random.Generator,
     config: PointsConfig,
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Points spread over the cameras' views, even in inverse depth, in the colour its camera sees there."""
+    """Random points in the cameras' views, uniform in inverse depth, with the colours of their pixels."""
     positions: list[Floats] = []
     colors: list[NDArray[np.uint8]] = []
     each = -(-config.random_points // len(cameras))

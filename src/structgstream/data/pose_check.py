@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do the pictures agree with the poses that came with them?
+"""Checks the given poses against the pictures.
 
-Camera-to-world matrices given as world-to-camera are rigid motions too, and nothing but the pictures can
-tell. Matches found without the poses, which agree on some epipolar geometry among themselves, are held
-against the geometry of the poses (Hartley and Zisserman, Multiple View Geometry, chapter 11).
+Inverted or flipped pose matrices are valid rigid motions, so only the pictures reveal them. Matches that were found
+without the poses, and are inliers of some epipolar geometry, are tested against the epipolar geometry of the poses
+(Hartley and Zisserman, Multiple View Geometry, chapter 11).
 """
 
 import logging
@@ -39,20 +39,20 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PoseCheckConfig:
-    """What counts as a violation, and when poses are refused.
+    """Thresholds of the pose check.
 
     Args:
         features: SIFT keypoints per picture.
-        pairs: most pairs of neighbours looked at.
+        pairs: most pairs of neighbours tested.
         ratio: largest ratio of the best to the second-best descriptor distance.
-        inlier_pixels: largest epipolar distance of matches that agree among themselves.
-        min_inliers: agreeing matches that a pair needs to be heard.
-        min_inlier_share: and their share of the pair's matches.
-        violation_share: distance to the epipolar line, as a share of the picture's width, that violates the
-            poses; a match that meets behind a camera violates them too.
-        min_parallax_degrees: smallest angle of the rays at which being behind a camera is not noise.
-        max_share: poses are refused when a larger share of the good matches violates them.
-        min_matches: below this many good matches nothing is said.
+        inlier_pixels: largest epipolar distance of inliers of a pair's own epipolar geometry.
+        min_inliers: least number of inliers of a pair that is used.
+        min_inlier_share: least share of inliers among the matches of a pair that is used.
+        violation_share: distance to the epipolar line of the poses, as a share of the picture's width, above which a
+            match violates them; a match triangulated behind a camera violates them too.
+        min_parallax_degrees: smallest angle between the rays at which a point behind a camera counts.
+        max_share: poses are rejected if a larger share of the good matches violates them.
+        min_matches: least number of good matches for a verdict.
     """
 
     features: int = 1500
@@ -69,14 +69,14 @@ class PoseCheckConfig:
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """How the good matches sit in the geometry of the poses.
+    """Result of the pose check.
 
     Args:
-        median_epipolar_error_pixels: median distance to the epipolar line; nan without matches.
-        share_violating: share of the matches that violate the poses; nan without matches.
-        matches: how many good matches there were.
-        pairs: from how many pairs of cameras.
-        conclusive: whether there were enough of them to judge by.
+        median_epipolar_error_pixels: median distance to the epipolar line of the poses; nan without matches.
+        share_violating: share of the good matches that violate the poses; nan without matches.
+        matches: number of good matches.
+        pairs: number of pairs of cameras they come from.
+        conclusive: whether ``min_matches`` is reached.
     """
 
     median_epipolar_error_pixels: float
@@ -87,7 +87,7 @@ class PoseCheck:
 
 
 def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfig = PoseCheckConfig()) -> PoseCheck:
-    """Hold matches of neighbouring training cameras against the given poses; held-out pictures stay unread.
+    """Test matches of neighbouring training cameras against the given poses; held-out pictures are never read.
 
     Raises:
         CalibrationError: most good matches violate the epipolar geometry of the poses.
@@ -98,8 +98,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
     check = _judge(given, matcher.matches(_pairs(given, config)), config)
     if check.conclusive and check.share_violating <= config.max_share:
         return check
-    # Under wrong poses the chosen pairs are no neighbours and hardly match: ask for the neighbours of each
-    # mistake that is often made, too.
+    # Pairs chosen by wrong poses hardly match, so pairs chosen after undoing each common mistake are tested too.
     readings = {name: _reinterpret(given, change) for name, change in _MISTAKES.items()}
     pairs = dict.fromkeys(pair for cameras in (given, *readings.values()) for pair in _pairs(cameras, config))
     matches = matcher.matches(list(pairs))
@@ -153,7 +152,7 @@ def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[tuple
 
 
 class _Matcher:
-    """Good matches of pairs of pictures, whatever the poses; every picture and pair is worked on once."""
+    """Good matches of pairs of pictures, independent of the poses; results per picture and pair are cached."""
 
     def __init__(self, frame: MultiViewFrame, config: PoseCheckConfig) -> None:
         self._frame = frame

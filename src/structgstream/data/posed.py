@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every file of cameras comes to, whoever wrote it: lens, intrinsics and pose by name."""
+"""The common result of reading calibration files: lens, intrinsics and pose by camera name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -17,6 +17,7 @@ import logging
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
 
@@ -40,12 +41,17 @@ REDUCED = ("images_2", "images_4", "images_8")
 # In the order in which they are looked through; the last but one are those of the CMU Panoptic toolbox.
 ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "", *REDUCED)
 
+Of = TypeVar("Of")
 Pictures = Mapping[str, Mapping[str, Path]]  # camera, then instant
 Sizes = Mapping[str, tuple[int, int]]
 
 
 def open_posed(
-    path: Path, calibration: Calibration, *, target: Callable[[LensCamera], Camera] = rectilinear
+    path: Path,
+    calibration: Calibration,
+    *,
+    target: Callable[[LensCamera], Camera] = rectilinear,
+    complete: bool = True,
 ) -> FrameSource:
     """The capture at ``path`` with these cameras; the calibration's points come along.
 
@@ -53,6 +59,7 @@ def open_posed(
         path: the folder with pictures or videos.
         calibration: its cameras.
         target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
+        complete: whether every video must be calibrated; else the others are left out with a warning.
 
     Raises:
         CaptureError: no pictures or videos, or not of the calibrated cameras.
@@ -60,22 +67,30 @@ def open_posed(
     """
     for root in (path / name for name in ROOTS):
         if videos := _videos(root):
+            videos = videos if complete else _posed(videos, calibration, root)
             return undistort(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := _folders(root):
             files, poses = _layout(folders, calibration, root)
             return undistort(*of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
     for root in (path / name for name in ("images", *REDUCED, "")):
         if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
+            stills = _posed(stills, calibration, root)  # structure from motion often leaves out some photos
             poses = _poses(calibration, stills)
-            if poses and (unknown := sorted(stills.keys() - poses.keys(), key=natural)):
-                # Structure from motion often leaves out some photos; videos without a pose are a mistake.
-                log.warning("%s has no pose of %s of %s; left out", calibration.where, listed(unknown), root)
-                stills = {name: stills[name] for name in poses}
             return undistort(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."
     )
+
+
+def _posed(files: Mapping[str, Of], calibration: Calibration, root: Path) -> Mapping[str, Of]:
+    """Those that the calibration has a pose for, with a warning; all when it has none of them."""
+    poses = _poses(calibration, files)
+    unknown = sorted(files.keys() - poses.keys(), key=natural)
+    if not (poses and unknown):
+        return files
+    log.warning("%s has no pose of %s of %s; left out", calibration.where, listed(unknown), root)
+    return {name: file for name, file in files.items() if name in poses}
 
 
 def _of_videos(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes the next frames while the last one trains."""
+"""Decodes the next frames in the background while one is trained."""
 
 import queue
 import threading
@@ -13,11 +13,11 @@ from structgstream.frames import MultiViewFrame
 
 @dataclass(frozen=True)
 class Prefetch(SourceWrapper):
-    """The same frames, decoded ahead in a background thread: it changes time and memory, not results.
+    """The same frames, decoded ahead in a background thread; results are unchanged.
 
     Args:
         source: the capture.
-        depth: frames to hold ready, at least 1; each costs its pictures' bytes.
+        depth: number of frames decoded ahead, at least 1; each costs its pictures' bytes.
     """
 
     depth: int = 2

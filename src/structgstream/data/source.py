@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every capture looks like to the rest of the program."""
+"""The protocol of captures."""
 
 from collections.abc import Iterator
 from typing import Protocol
@@ -29,7 +29,7 @@ class FrameSource(Protocol):
 
     @property
     def points(self) -> NDArray[np.float64] | None:
-        """Points ``[P, 3]`` that the capture brings (a COLMAP model), in its own units; None when it has none."""
+        """Points ``[P, 3]`` that come with the capture (a COLMAP model), in its units; None without any."""
         ...
 
     def __len__(self) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which instants all cameras have."""
+"""The time steps that all cameras have."""
 
 import logging
 import re
@@ -20,8 +20,8 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
 def common_slots(slots: Mapping[str, Sequence[int]], *, where: str, label: Callable[[int], str]) -> range:
     """The range of slots that every camera has.
 
-    A camera that starts late or ends early cuts the range, with one logged warning for each end; a hole or a
-    second frame inside the range is an error.
+    Cameras that start late or end early shorten the range, with a logged warning for each end; a missing or duplicate
+    frame inside the range is an error.
 
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.

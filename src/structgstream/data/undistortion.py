@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of any lens made rectilinear as they are read, so that everything after sees pinholes.
+"""Undistortion of pictures on reading, so that all other modules handle pinhole cameras only.
 
-The grid of a camera is computed once. By default the picture shows the largest field of view that the lens fills, up to
-:data:`WIDEST_DEGREES`; a wider one can be asked for, and what the lens does not show is black and masked.
+The resampling grid of a camera is computed once. By default the picture has the largest field of view that the lens
+fills, up to :data:`WIDEST_DEGREES`; in a wider one, pixels that the lens does not show are black and masked.
 """
 
 import math
@@ -25,7 +25,7 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MultiViewFrame
 
 WIDEST_DEGREES = 110.0
-"""Across the longer side. A plane stretches what lies off its axis: 3 times at the edge of 110 degrees, 15 of 150."""
+"""Across the longer side. A rectilinear picture is stretched 3 times at the edge of 110 degrees, 15 times of 150."""
 WORTH_REDUCING = 1.25
 BORDER_SAMPLES = 129
 SCALE_SAMPLES = 33
@@ -35,14 +35,15 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
     """The pinhole that pictures of a lens can be resampled for, with square pixels.
 
     Args:
-        filmed: the camera as it films; one without distortion is given back as it is, unless something is asked for.
+        filmed: the camera with its lens; without distortion it is returned unchanged, unless ``degrees`` or ``size``
+            is given.
         degrees: field of view across the picture's width, around the optical axis; None for the largest that the lens
             fills, up to :data:`WIDEST_DEGREES` across the longer side.
         size: width and height of the pictures, pixels; None for those of the lens.
 
     Raises:
-        ConfigError: a field of view that no plane can show, or a size that is not positive.
-        CalibrationError: a lens that is one to one nowhere in its picture.
+        ConfigError: a field of view of 175 degrees or more, or a size that is not positive.
+        CalibrationError: a lens model that is invertible nowhere in its picture.
     """
     width, height = (filmed.camera.width, filmed.camera.height) if size is None else size
     if min(width, height) < 1:
@@ -111,13 +112,13 @@ def _inside(pixels: Floats, camera: Camera) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Level:
-    """A part of the pinhole's picture that is taken from a picture of the lens halved so many times.
+    """The part of the pinhole's picture that is sampled from one level of the lens picture's pyramid.
 
     Args:
         rows: of the pinhole's picture.
-        columns: the same.
-        maps: where its pixels come from, as OpenCV's fixed-point numbers of 1/32 pixel.
-        weights: share ``[h, w]`` float32 of this level against the finer ones; None for the first, which is everywhere.
+        columns: of the pinhole's picture.
+        maps: source positions of its pixels, OpenCV's fixed-point numbers of 1/32 pixel.
+        weights: blending weight ``[h, w]`` float32 of this level over the finer ones; None for the first (weight 1).
     """
 
     rows: slice
@@ -128,10 +129,10 @@ class Level:
 
 @dataclass(frozen=True)
 class Undistortion:
-    """How pictures of ``filmed`` become those of the pinhole ``target``, which has the same pose.
+    """Resamples pictures of ``filmed`` for the pinhole ``target``, which has the same pose.
 
-    Where pictures shrink, areas are averaged: the picture is reduced as far as nothing of it is lost, and where a pixel
-    of the pinhole still is larger than one of the lens, it is taken from halved pictures (Williams, Pyramidal
+    Against aliasing where pictures shrink, the picture is first reduced by area as far as no detail is lost; where a
+    pixel of the pinhole is still larger than one of the lens, it is sampled from a pyramid (Williams, Pyramidal
     Parametrics, 1983).
     """
 
@@ -159,10 +160,10 @@ class Undistortion:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
-        """Which pixels ``[H, W]`` of the pinhole the lens shows; None when it shows all."""
+        """Mask ``[H, W]`` of the pinhole's pixels that the lens shows; None if all."""
         shown = _inside(self.filmed.to_pixels(_rays(self.target)), self.filmed.camera)
         if not shown.any():
-            raise CalibrationError("The lens shows nothing of the field of view that was asked for; give another.")
+            raise CalibrationError("The lens shows nothing of the requested field of view; give another.")
         return None if shown.all() else shown
 
     @cached_property
@@ -210,7 +211,7 @@ class Undistortion:
 
 
 def _halvings(pixels: Floats, camera: Camera, size: tuple[int, int]) -> Floats:
-    """How often a picture of ``size`` must be halved, ``[H, W]``, until its pixels are as large as the pinhole's."""
+    """Pyramid level ``[H, W]`` (halvings of a picture of ``size``) with pixels as large as the pinhole's."""
     if min(pixels.shape[:2]) < 2:
         return np.zeros(pixels.shape[:2])
     down, across = (np.asarray(np.gradient(pixels, axis=axis)) for axis in (0, 1))
@@ -227,9 +228,9 @@ def _rays(camera: Camera) -> Floats:
 
 @dataclass(frozen=True)
 class UndistortedSource(WithRig):
-    """The frames of ``source``, whose pictures are as the lenses of ``filmed`` give them, as pinholes would take them.
+    """The frames of ``source``, taken with the lenses of ``filmed``, undistorted to the pinholes of the rig ``other``.
 
-    ``other`` is the rig of the pinholes. Cameras without distortion whose size stays pass through.
+    Pictures of cameras without distortion whose size stays are passed through.
     """
 
     filmed: Mapping[str, LensCamera]
@@ -247,7 +248,7 @@ class UndistortedSource(WithRig):
                 yield replace(frame, images=dict(zip(self.rig, pictures, strict=True)))
 
     def shown(self, name: str) -> NDArray[np.bool_] | None:
-        """Which pixels ``[H, W]`` of a camera its lens shows; None when all."""
+        """Mask ``[H, W]`` of a camera's pixels that its lens shows; None if all."""
         plan = self._plan(name)
         return None if plan is None else plan.shown
 
@@ -256,7 +257,7 @@ class UndistortedSource(WithRig):
         return replace(self, other=rig)
 
     def is_unchanged(self, name: str) -> bool:
-        """Whether the pictures of a camera stay as they are."""
+        """Whether the pictures of a camera are passed through."""
         filmed = self.filmed[name]
         return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
 

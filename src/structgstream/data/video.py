@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Containers that store presentation times; AVI does not.
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm", ".m4v", ".ts"})
-TOLERANCE_IN_PERIODS = 0.4  # nearer to half a period one cannot say which instant a frame belongs to
+TOLERANCE_IN_PERIODS = 0.4  # closer to half a period, the time step of a frame would be ambiguous
 STANDARD_RATES = tuple(rate * factor for rate in (24, 25, 30, 50, 60, 120) for factor in (1.0, 1000 / 1001))
 
 # Values of libswscale and of ISO/IEC 23091-2 that the bindings name differently from version to version.
@@ -36,7 +36,7 @@ MATRICES = {1: BT709, 4: 4, 5: BT601, 6: BT601, 7: 7, 9: 9, 10: 9}
 
 @dataclass(frozen=True)
 class VideoTrack:
-    """What a video file holds.
+    """The index of a video file.
 
     Args:
         path: the file.
@@ -109,7 +109,7 @@ def synchronised(
     fps: float | None = None,
     points: NDArray[np.float64] | None = None,
 ) -> VideoSource:
-    """One source out of one video per camera, matched by time stamp on a common timeline.
+    """One source from one video per camera, synchronised by time stamp on a common timeline.
 
     Args:
         tracks: camera name to its video.
@@ -175,7 +175,7 @@ def measured_fps(tracks: Mapping[str, VideoTrack]) -> float | None:
 
 
 def _slots(tracks: Mapping[str, VideoTrack], fps: float, *, where: Path) -> tuple[dict[str, list[int]], float]:
-    """Each frame's place on the common timeline, and the time of place 0 in seconds."""
+    """Each frame's slot on the common timeline, and the time of slot 0 in seconds."""
     positions = {name: np.array(track.stamps) * (track.tick_seconds * fps) for name, track in tracks.items()}
     origin = min(float(own[0]) for own in positions.values())
     phases = [float(own[0] - origin - np.rint(own[0] - origin)) for own in positions.values()]
@@ -222,7 +222,7 @@ def _open(path: Path) -> "InputContainer":
 
 
 def _scan(path: Path) -> VideoTrack:
-    """Reads all packets of a file: their time stamps, and whether all are there."""
+    """Reads all packets of a file for their time stamps, and checks that none is missing."""
     av = _av()
     with _open(path) as container:
         stream = container.streams.video[0]

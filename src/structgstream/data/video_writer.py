@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes pictures as a video that plays everywhere: H.264 in mp4, 4:2:0, BT.709, constant quality."""
+"""Writes pictures as a widely playable video: H.264 in mp4, 4:2:0, BT.709, constant quality."""
 
 from contextlib import AbstractContextManager
 from fractions import Fraction
@@ -16,10 +16,10 @@ BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
 
 
 class VideoWriter(AbstractContextManager["VideoWriter"]):
-    """An mp4 under construction: ``write`` takes one picture after the other, all of one size.
+    """Writes an mp4, picture by picture, all of one size.
 
-    The file appears under its name when the block ends without an error, never half written. A size that is
-    odd is padded by one pixel, because 4:2:0 needs even ones.
+    The file gets its name when the ``with`` block ends without an error, so it is never incomplete. Odd sizes are
+    padded by one pixel, because 4:2:0 needs even ones.
 
     Args:
         path: the file to write; its folder is made when it is missing.

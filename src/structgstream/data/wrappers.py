@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A capture seen differently: smaller, shorter, or with other cameras held out."""
+"""Wrappers of captures: resized, shortened, or with other cameras held out."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from structgstream.frames import MultiViewFrame
 
 @dataclass(frozen=True)
 class SourceWrapper:
-    """A source that passes everything through; the base of those that change something."""
+    """A source that passes everything through; base class of the wrappers."""
 
     source: FrameSource
 
@@ -74,7 +74,7 @@ class Resized(WithRig):
 
 @runtime_checkable
 class Resizable(Protocol):
-    """A source that resamples pictures anyway, so that another size costs nothing and is not a second resampling."""
+    """A source that resamples its pictures anyway and can do so to another size, without resampling twice."""
 
     def resized(self, rig: CameraRig) -> FrameSource:
         """The same frames at the sizes of ``rig``."""
@@ -134,10 +134,10 @@ def section(source: FrameSource, *, start: int = 0, frames: int | None = None) -
 
 
 def select_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
-    """The capture with these cameras alone, so that no other's pictures are decoded.
+    """The capture restricted to these cameras, so that other pictures are not decoded.
 
-    A rig has two cameras at least: another one stays when ``names`` has one. Sources of a kind that is not known here
-    stay as they are. Nothing is held out in the result.
+    A rig needs two cameras, so with a single name another camera is kept. Sources of an unknown type are returned
+    unchanged. Nothing is held out in the result.
     """
     kept = names if len(names) > 1 else (*names, *[name for name in source.rig if name not in names][:1])
     rig = CameraRig({name: source.rig[name] for name in source.rig if name in kept})
@@ -159,7 +159,7 @@ class EveryNthFrame(SourceWrapper):
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         for index in range(start, len(self)):
-            # Asking for each frame by its number skips those between without decoding, where the source can.
+            # Seeking to each frame lets the source skip those between without decoding.
             images = next(self.source.frames(index * self.step)).images
             yield MultiViewFrame(index, index / self.fps, images)
 
@@ -171,5 +171,5 @@ def every_nth_frame(source: FrameSource, step: int) -> FrameSource:
         ConfigError: ``step`` is less than 1.
     """
     if step < 1:
-        raise ConfigError(f"Frames can be taken by steps of 1 and more, got {step}.")
+        raise ConfigError(f"The step between frames must be at least 1, got {step}.")
     return source if step == 1 else EveryNthFrame(source, step)

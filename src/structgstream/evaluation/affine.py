@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is left of an error once colour is set aside.
+"""PSNR after a colour correction of the rendering.
 
-A held-out camera's exposure and white balance are unknown to training, so a part of its error says nothing of
-the scene. The best affine change of colour, fitted on the very picture that is scored, bounds that part. It
-uses the truth, so it is never a headline: reports label it ``psnr_affine``.
+A held-out camera's exposure and white balance are unknown to training, so a part of its error is unrelated to the
+scene. The best affine colour transform, fitted to the scored picture itself, bounds that part. It uses the ground
+truth, so it is never the headline: reports label it ``psnr_affine``.
 
 Note [Colour of a camera]
 ~~~~~~~~~~~~~~~~~~~~~~~~~
-What a camera does to colours belongs to the camera, not to the frame. So ``psnr_camera_color`` takes a gain and a bias
-for each channel from the camera's first frame, as training has them of its own cameras (``scene/color.py``), and holds
-them: later frames are scored as if the camera had been calibrated once. Light that changes, and colours that are wrong
-in a part of the picture, remain errors, which a fit of every picture, or one that mixes channels, would forgive.
+A camera's colour response is constant over time. So ``psnr_camera_color`` fits a gain and a bias per channel to the
+camera's first frame, as training does for its cameras (``scene/color.py``), and keeps them: later frames are scored as
+if the camera had been colour-calibrated once. Changing light and local colour errors still count, which a fit per frame
+or one that mixes channels would hide.
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ from torch import Tensor
 
 from structgstream.evaluation.metrics import decibels
 
-CHUNK = 256  # pixels: so many products of bytes add up exactly in float32
+CHUNK = 256  # pixels whose products of bytes can be added exactly in float32
 
 
 def affine_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
     """The 3x4 matrix ``A`` with the least squared error of ``A [r, g, b, 1]`` (0 to 1) against ``truth``.
 
-    Both pictures are ``[H, W, 3]`` uint8. A picture of one colour has many solutions; the smallest is
-    returned.
+    Both pictures are ``[H, W, 3]`` uint8. If the solution is not unique, as for a uniform picture, the least-norm one
+    is returned.
     """
     return _fit_matrix(_planes(picture, truth))
 
@@ -51,7 +51,7 @@ def psnr_affine(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """What a camera makes of a rendering, ``gain * rendering + bias`` for each channel (Note [Colour of a camera]).
+    """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera]).
 
     Args:
         gains: red, green, blue.
@@ -65,7 +65,7 @@ class ChannelFit:
 def channel_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> ChannelFit:
     """The gain and bias of each channel with the least squared error of ``picture`` against ``truth``.
 
-    Both are ``[H, W, 3]`` uint8. A channel of one value has the gain 1: that much colour cannot tell.
+    Both are ``[H, W, 3]`` uint8. A constant channel gets gain 1, because it does not determine one.
     """
     pairs = [_fit_line(picture[..., channel], truth[..., channel]) for channel in range(3)]
     (r, g, b), biases = zip(*pairs, strict=True)
@@ -82,7 +82,7 @@ def _fit_line(values: NDArray[np.uint8], targets: NDArray[np.uint8]) -> tuple[fl
 
 
 def psnr_camera_color(picture: NDArray[np.uint8], truth: NDArray[np.uint8], fit: ChannelFit) -> float:
-    """PSNR of ``picture`` through ``fit``, clamped and not rounded, dB: the fit is another frame's, or this one's."""
+    """PSNR of ``picture`` corrected by ``fit``, clamped and not rounded, dB."""
     levels = np.arange(256, dtype=np.float64)
     total = 0.0
     for channel, (gain, bias) in enumerate(zip(fit.gains, fit.biases, strict=True)):
@@ -93,10 +93,9 @@ def psnr_camera_color(picture: NDArray[np.uint8], truth: NDArray[np.uint8], fit:
 
 
 def _planes(*pictures: NDArray[np.uint8]) -> Tensor:
-    """Ones and then the channels of the pictures, ``[1 + 3 n, chunks, CHUNK]`` float32, zeros after the last pixel.
+    """A plane of ones, then the channels of the pictures: ``[1 + 3 n, chunks, CHUNK]`` float32, zero-padded.
 
-    The work on them is torch's: NumPy's BLAS leaves threads that spin while the next picture is drawn, which then took
-    half as long again (2 cores).
+    Computed with torch, because the spinning threads of NumPy's BLAS slowed the next rendering by half (2 cores).
     """
     pixels = pictures[0].size // 3
     planes = np.zeros((1 + 3 * len(pictures), -(-pixels // CHUNK) * CHUNK), np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a stream's bytes go: by packet, by field, by kind of packet, and in the header."""
+"""Accounting of a stream's bytes by packet, field and kind of packet, and in the header."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
 
 REST = "the rest"
-"""What belongs to no field: heads of records, checksums, and in a header all that is said in words."""
+"""Bytes of no field: heads of records, checksums, and the header's JSON."""
 FIRST = "first packet"
-NOTHING = 0.01  # of the header: a first packet below that has no news
+NOTHING = 0.01  # of the header: a first packet smaller than this share is left out of the parts
 Parts = dict[str, dict[str, float]]
 """Bytes by field, and :data:`REST`, of named parts of a stream."""
 
@@ -29,7 +29,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Group:
-    """Packets of one kind taken together: how many, and their mean bytes, of all and by field."""
+    """Packets of one kind: their number, and their mean bytes in total and by field."""
 
     count: int
     bytes: float
@@ -37,7 +37,7 @@ class Group:
 
 
 def packet_rows(reader: StreamReader) -> list[Row]:
-    """The packet of every frame that can be shown."""
+    """The packet of every frame that can be decoded."""
     infos = (reader.packets.at(index) for run in reader.runs for index in run)
     return [
         Row(
@@ -53,12 +53,12 @@ def packet_rows(reader: StreamReader) -> list[Row]:
 
 
 def with_rest(sizes: Mapping[str, int], whole: int) -> dict[str, int]:
-    """Bytes by field, and what of ``whole`` belongs to none."""
+    """Bytes by field, with the remainder of ``whole`` as :data:`REST`."""
     return {**sizes, REST: whole - sum(sizes.values())}
 
 
 def occurring_fields(sizes: Iterable[Mapping[str, float]]) -> list[str]:
-    """The fields that occur, largest sum first, the rest last."""
+    """The fields that occur, largest sum first, :data:`REST` last."""
     sums: dict[str, float] = {}
     for one in sizes:
         for name, size in one.items():
@@ -67,9 +67,9 @@ def occurring_fields(sizes: Iterable[Mapping[str, float]]) -> list[str]:
 
 
 def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
-    """The first packet, and means of the kinds of packets that follow it.
+    """The first packet, and the means of each kind of the later packets.
 
-    The first is no key packet as others are: with the codec ``compact`` all that it could say is in the header.
+    The first packet is listed apart: with the codec ``compact`` it is nearly empty, because the header holds frame 0.
     """
     chosen = {
         FIRST: [row for row in rows if row.index == 0],
@@ -80,14 +80,14 @@ def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
 
 
 def mean_of(rows: Sequence[Row]) -> Group:
-    """The mean of packets, of which there is at least one."""
+    """The mean of at least one packet."""
     names = occurring_fields(row.sizes for row in rows)
     sizes = {name: sum(row.sizes.get(name, 0) for row in rows) / len(rows) for name in names}
     return Group(len(rows), sum(row.bytes for row in rows) / len(rows), sizes)
 
 
 def parts_of(reader: StreamReader, rows: Sequence[Row]) -> Parts:
-    """Bytes by field of the header and, on average, of each kind of packet; a first one without news is left out."""
+    """Bytes by field of the header, and mean bytes of each kind of packet; a nearly empty first packet is left out."""
     parts: Parts = {"header": dict(with_rest(reader.header_field_bytes, reader.header_bytes))}
     for name, group in groups_of(rows).items():
         if name != FIRST or group.bytes > NOTHING * reader.header_bytes:

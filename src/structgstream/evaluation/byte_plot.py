@@ -19,11 +19,11 @@ SMALL = 0.01  # of every part: fields that take less are put together
 TOWERING = 3.0  # times the largest delta packet: a key packet above that is drawn cut, with its size over it
 GAPS = 150  # with more packets than this, bars touch
 NUMBERS = 25  # with more cut packets than this, their sizes are left out
-TOLD = 0.06  # of a part: a smaller share has no number
+TOLD = 0.06  # of a part: smaller shares are not labelled
 
 
 def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str) -> None:
-    """Bars over the frames, stacked by field, above what each part of the stream consists of.
+    """Bars over the frames, stacked by field, above the composition of each part of the stream.
 
     Args:
         path: the picture; its suffix is a format that matplotlib writes.
@@ -47,7 +47,7 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
 
 
 def field_colors(parts: Parts) -> dict[str, str]:
-    """A colour for each field that is worth one: those of the last part first, the largest of a part first."""
+    """A colour for each field above :data:`SMALL`: by parts from the last on, in a part by size."""
     colours: dict[str, str] = {}
     for sizes in reversed(parts.values()):
         whole = sum(sizes.values())

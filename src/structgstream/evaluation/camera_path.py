@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that move: paths that stay where the rig has looked, in the capture's own units."""
+"""Camera paths that stay within the rig's views, in the capture's units."""
 
 import math
 from dataclasses import replace
@@ -10,16 +10,15 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import ConfigError
 
-ORBIT_SHARE = 0.5  # of the distance to the nearest cameras: what lies further out was seen from one side only
+ORBIT_SHARE = 0.5  # of the distance to the nearest cameras: further out, surfaces were seen from one side only
 NEIGHBOURS = 3
 ARC_HALF_ANGLE = math.radians(50.0)
 
 
 def focus_point(rig: CameraRig) -> Tensor:
-    """The point ``[3]`` nearest to all optical axes: what the rig looks at.
+    """The point ``[3]`` nearest to all optical axes.
 
-    A rig whose cameras look the same way has no such point; then it lies ahead of their mean, at the size of
-    the rig.
+    For nearly parallel axes it lies in front of the cameras' mean position, at a distance of the rig's size.
     """
     cameras = list(rig.cameras.values())
     centers = rig.centers
@@ -37,7 +36,7 @@ def focus_point(rig: CameraRig) -> Tensor:
 
 
 def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Camera]:
-    """A flat ellipse around a camera of the rig, always looking at what that camera has in its middle.
+    """A flat ellipse around a camera of the rig, always looking at the point in the centre of that camera's picture.
 
     Args:
         rig: the cameras.
@@ -63,7 +62,7 @@ def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Cam
 
 
 def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) -> list[Camera]:
-    """From one camera of the rig to another, at their distances from what the rig looks at.
+    """From one camera of the rig to another, at interpolated distances from the focus point.
 
     Args:
         rig: the cameras.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which machine and which versions gave a number."""
+"""The machine and the versions that a result was obtained with."""
 
 import os
 import platform
@@ -37,7 +37,7 @@ def usable_cores() -> int:
 
 
 def processor_name() -> str:
-    """The processor as its maker calls it, where the system tells."""
+    """The processor's model name, if the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

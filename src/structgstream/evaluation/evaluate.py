@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores a stream from its file alone: decode, render what held-out cameras saw, compare."""
+"""Evaluates a stream from its file alone: decodes, renders held-out views, and compares."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -47,7 +47,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Compared:
-    """One camera of one frame: what it took, what the stream renders, and the scores."""
+    """One camera of one frame: ground truth, rendering and scores."""
 
     camera: str
     truth: Picture
@@ -73,22 +73,22 @@ def evaluate(
     flow: Flow | None = None,
     lpips_weights: Path | None = None,
 ) -> Report:
-    """Every score of every frame that the file holds and the capture shows.
+    """Scores of every frame of the file against the capture.
 
     Args:
         recording: the opened file: a ``StreamReader``, or another method's (``recording.py``).
         source: the capture, cut and scaled as it was for the reconstruction.
-        backend: what renders.
-        cameras: names of the cameras to score; None for those that training did not see.
+        backend: the compute back-end.
+        cameras: names of the cameras to score; None for the held-out ones.
         log: the trainer's log by frame number (``run_log.read_log``).
         observer: called with frame number and comparison for every picture, for pictures and progress.
-        metrics: "basic" leaves out what takes longer than rendering: MS-SSIM, FLIP, LPIPS and the scores over time.
-        flow: where pixels were in the frame before, when the capture knows; None estimates it.
-        lpips_weights: folder or file with the weights that LPIPS needs (``lpips.py``, Note [Weights]).
+        metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
+        flow: exact flow to the frame before, if the capture has it; None estimates it.
+        lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
 
     Raises:
-        CaptureError: the capture is not the one of the stream: a camera is missing, stands elsewhere, or has pictures
-            of another size; or it has fewer frames, or others.
+        CaptureError: the capture is not the stream's: a camera is missing, has another calibration or picture size, or
+            the frames differ.
         ConfigError: there is no camera to score, or weights for LPIPS are wrong.
         StreamError: a packet is damaged.
     """
@@ -145,7 +145,7 @@ def evaluate(
 
 
 def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[PacketInfo, Drawable, float]]:
-    """Every frame on ``device``, with the seconds that it took from the file to there."""
+    """Every frame on ``device``, with the seconds of reading, decoding and copying it."""
     began = time.perf_counter()
     for info, drawable in recording.scenes(0):
         drawable = to_device(drawable, device)
@@ -168,11 +168,11 @@ def score(
 
     Args:
         picture: the rendering.
-        truth: what the camera took.
-        first: what it took of frame 0.
-        backend: what computes SSIM.
-        seconds: that the rendering took.
-        color: what the camera does to colours, by its frame 0; None for no score of it.
+        truth: the camera's picture.
+        first: the camera's picture of frame 0.
+        backend: computes SSIM.
+        seconds: duration of the rendering.
+        color: the camera's colour response, fitted to frame 0; None to leave out that score.
 
     Raises:
         CaptureError: the pictures have different sizes.
@@ -201,7 +201,7 @@ def score(
 
 
 def rendered(scene: Drawable, camera: Camera, backend: Backend) -> tuple[Picture, float]:
-    """The 8-bit picture of ``camera`` (scene units), and the seconds it took until it was in main memory."""
+    """The 8-bit picture of ``camera`` (scene units), and the seconds until it was in main memory."""
     began = time.perf_counter()
     picture = to_8bit_image(render(scene, camera, backend).image)
     return picture, time.perf_counter() - began

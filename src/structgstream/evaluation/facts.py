@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording, its capture and its log say without a picture being looked at."""
+"""Facts of a recording, its capture and its log, without rendering."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -35,10 +35,10 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
 
 
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
-    """The capture's cameras of these names are those of the stream.
+    """Check that the capture's cameras of these names are those of the stream.
 
     Raises:
-        CaptureError: one is missing, stands elsewhere, or has pictures of another size.
+        CaptureError: one is missing, or has another calibration or picture size.
     """
     for name in names:
         ours = header.rig[name]
@@ -61,10 +61,10 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
 
 
 def check_same_frames(recording: Recording, source: FrameSource) -> None:
-    """The capture has the frames of the recording.
+    """Check that the capture has the frames of the recording.
 
     Raises:
-        CaptureError: there are fewer, or both say where in the whole capture they begin, and differ.
+        CaptureError: it has fewer, or both state their start frame, and differ.
     """
     if len(source) < len(recording.packets):
         raise CaptureError(
@@ -80,7 +80,7 @@ def check_same_frames(recording: Recording, source: FrameSource) -> None:
 
 
 def start_of(source: FrameSource) -> int | None:
-    """Where in its whole capture a source begins; None for a source of a kind that does not say."""
+    """Start frame of a source in its whole capture; None if the type of source does not state it."""
     if isinstance(source, Section):
         inner = start_of(source.source)
         return None if inner is None else inner + source.first
@@ -118,7 +118,7 @@ def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def training_facts(logs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Seconds and peak memory of the training run, from its log; nothing without one."""
+    """Seconds and peak memory of the training run, from its log; empty without one."""
     logs = [log for log in logs if log]
     if not logs:
         return {}
@@ -132,7 +132,7 @@ def training_facts(logs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
-    """The largest peak of each stage, frame 0 apart from the others, which have other work."""
+    """The largest peak of each stage, separately for frame 0 and for later frames."""
     largest: dict[str, int] = {}
     for log in logs:
         part = "online" if log["index"] else "first frame"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An empty figure, axes without ornament, and the file: what all plots of the package share."""
+"""Common parts of the package's plots: figures, axes, colours, saving."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which all common kinds of colour vision tell apart.
+# Okabe and Ito's colours, distinguishable with all common kinds of colour vision.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#222222")
 INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
@@ -32,7 +32,7 @@ def figure_of(width: float, height: float) -> "Figure":
 
 
 def without_frame(axis: "Axes") -> None:
-    """Lines where values are read off, and no more."""
+    """Removes the frame of an axes, except for the lines needed to read values."""
     axis.grid(axis="y", color=FAINT, linewidth=0.8)
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
@@ -40,7 +40,7 @@ def without_frame(axis: "Axes") -> None:
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a picture, and the folder where there is none.
+    """Writes a picture, and creates its folder if necessary.
 
     Raises:
         StorageError: the file cannot be written.

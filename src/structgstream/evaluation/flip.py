@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LDR-FLIP (Andersson et al., 2020): how visible a difference is when two pictures are flipped between on a display.
+"""LDR-FLIP (Andersson et al., 2020): visibility of the difference when a display alternates between two pictures.
 
-Written after the paper and tested against its authors' package, ``flip-evaluator`` 1.7. That one takes 0.24 s of a core
-for a pair of 640x360, and temporal FLIP makes three pairs a picture: with its truth, with the picture before, and the
-truth with the one before. What belongs to one picture is computed once here (:func:`features_of`, 6 ms of a core), and
-what belongs to a pair apart from it (:func:`flip_of`, 1 ms). Steps write in place where they can, because fresh memory
-can cost more than the arithmetic.
+Implemented from the paper and tested against its authors' package, ``flip-evaluator`` 1.7, which takes 0.24 s of a core
+for a pair of 640x360. Temporal FLIP compares three pairs per picture: with its truth, with the rendering before, and
+the truth with the one before. So features are computed once per picture (:func:`features_of`, 6 ms of a core) and
+compared per pair (:func:`flip_of`, 1 ms). Operations are in place where possible, because allocating memory can cost
+more than the arithmetic.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * np.pi / 180  # seen from 0.7 m, a displ
 # for luminance, red to green and blue to yellow (table 1 of the paper).
 SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 COLOR_EXPONENT, KNEE, KNEE_ERROR = 0.7, 0.4, 0.95  # q_c, p_c, p_t of the paper
-FEATURE_DEGREES = 0.082  # width of the edges and points that are looked for
+FEATURE_DEGREES = 0.082  # width of the detected edges and points
 FEATURE_EXPONENT = 0.5
 
 # Linear sRGB to XYZ in parts of white's, and from there to (Y, X - Y, Y - Z): YCxCz without the scales and offsets of
@@ -38,12 +38,12 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FlipFeatures:
-    """What FLIP compares of one picture, each ``[H, W]``.
+    """FLIP's features of one picture, each ``[H, W]``.
 
     Args:
-        color: L*, a* and b* of the picture as the eye blurs it, a* and b* after the Hunt effect.
-        edges: how strong the edge is at each pixel.
-        points: how strong the point or line is.
+        color: L*, a* and b* after filtering by contrast sensitivity, a* and b* with Hunt adjustment.
+        edges: edge strength at each pixel.
+        points: point and line strength at each pixel.
     """
 
     color: tuple[Plane, Plane, Plane]
@@ -65,7 +65,7 @@ def opencv() -> ModuleType:
 
 
 def features_of(picture: NDArray[np.uint8]) -> FlipFeatures:
-    """What :func:`flip_map` compares of an 8-bit sRGB picture ``[H, W, 3]``, at the default viewing conditions.
+    """FLIP's features of an 8-bit sRGB picture ``[H, W, 3]`` at the default viewing conditions.
 
     These are 0.7 m from a display 0.7 m wide with 3840 pixels across, 67.02 pixels a degree.
 
@@ -79,7 +79,7 @@ def features_of(picture: NDArray[np.uint8]) -> FlipFeatures:
 
 
 def flip_map(one: FlipFeatures, other: FlipFeatures) -> Plane:
-    """FLIP of every pixel ``[H, W]``, in [0, 1], of two pictures of the same size. Either may be the truth."""
+    """FLIP of every pixel ``[H, W]``, in [0, 1], of two pictures of the same size; symmetric."""
     cv2 = opencv()
     light, *hues = (cv2.absdiff(a, b) for a, b in zip(one.color, other.color, strict=True))
     light += _length(hues[0], hues[1])

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each pixel of a frame was in the frame before, from the camera's own pictures.
+"""Backward optical flow between consecutive pictures of one camera.
 
-A capture that knows its motion (a synthetic one) gives exact fields in place of the estimated ones: anything that is a
-:data:`Flow` will do.
+Synthetic captures give exact flow instead of estimated flow: any :data:`Flow`.
 """
 
 from collections.abc import Callable
@@ -16,11 +15,11 @@ from structgstream.flow import consistency_mask, dis_search
 
 @dataclass(frozen=True)
 class FlowField:
-    """Where the pixels of one frame were in the frame before.
+    """Backward flow of one frame.
 
     Args:
-        offsets: ``[H, W, 2]`` float32, x and y in pixels: pixel ``p`` was at ``p + offsets[p]``.
-        seen: ``[H, W]`` whether what the pixel shows was in the frame before.
+        offsets: ``[H, W, 2]`` float32, x and y in pixels: pixel ``p`` was at ``p + offsets[p]`` in the frame before.
+        seen: ``[H, W]`` mask of the pixels that were not occluded in the frame before.
     """
 
     offsets: NDArray[np.float32]
@@ -32,7 +31,7 @@ Flow = Callable[[NDArray[np.uint8], NDArray[np.uint8], str, int], FlowField]
 
 
 def dis_flow() -> Flow:
-    """Flow by dense inverse search, estimated both ways; a pixel counts as seen if ``flow.consistency_mask`` says so.
+    """Flow by dense inverse search in both directions; consistent pixels (``flow.consistency_mask``) count as seen.
 
     Raises:
         MissingExtraError: OpenCV is not installed.

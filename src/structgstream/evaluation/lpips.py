@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LPIPS (Zhang et al., 2018), version 0.1: distance of two pictures in the features of a network for classification.
+"""LPIPS (Zhang et al., 2018), version 0.1: distance of two pictures in the features of a classification network.
 
-The trunks are written here in plain torch. Their heads, the published ones, come with the package
-(``lpips_heads.npz``, licence beside it); the trunks' own weights are too large for that and are looked for (Note
-[Weights]). Without them there is no LPIPS: random weights would give numbers that look like one.
+The trunks are implemented in plain torch. The published heads come with the package (``lpips_heads.npz``, licence
+beside it); the trunks' weights are too large for that and must be installed (Note [Weights]). Without them LPIPS is not
+available.
 
 Note [Weights]
 ~~~~~~~~~~~~~~
-A trunk's weights are a file of torch's with torchvision's names of layers (``features.0.weight``). The places, in
-this order: the path that is given; the environment variable ``STRUCTGSTREAM_LPIPS_WEIGHTS``; torch's hub cache, where
-torchvision leaves them. A path may be a folder or one trunk's file. A file whose name ends in eight digits of its
-SHA-256, as torchvision's do, is held to them.
+A trunk's weights are a torch file with torchvision's names of layers (``features.0.weight``). It is searched in this
+order: the given path; the environment variable ``STRUCTGSTREAM_LPIPS_WEIGHTS``; torch's hub cache, where torchvision
+stores it. A path may be a folder or one trunk's file. If a file name ends in eight digits of its SHA-256, as
+torchvision's do, they are verified.
 """
 
 import hashlib
@@ -35,12 +35,12 @@ DEVIATION = (0.458, 0.448, 0.450)
 EPSILON = 1e-10  # added to a feature vector's length
 
 Features = tuple[Tensor, ...]
-"""Of one picture: for each of five layers ``[C, h, w]``, each pixel's vector of length 1 (or 0)."""
+"""Of one picture: for each of five layers ``[C, h, w]``, each pixel's vector normalised to length 1 (or 0)."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A convolution and the rectifier after it; ``pool`` before it, as size and step; ``tap``: LPIPS looks here."""
+    """A convolution with ReLU, after a ``pool`` (size, stride) if any; ``tap``: LPIPS compares its output."""
 
     index: int
     shape: tuple[int, int, int]  # channels out, channels in, kernel size
@@ -155,7 +155,7 @@ def weights_file(trunk: Trunk, given: Path | None = None) -> Path | None:
 
 
 def how_to_get(trunk: Trunk) -> str:
-    """What to do when the weights are not there."""
+    """Instructions for installing the trunk's weights."""
     return (
         f"the weights of {trunk.title} were not found: download https://download.pytorch.org/models/{trunk.file} into "
         f"{Path(torch.hub.get_dir()) / 'checkpoints'}, or into a folder that --lpips-weights or {ENVIRONMENT} names"
@@ -166,7 +166,7 @@ def load_lpips(trunk: Trunk, path: Path, device: torch.device) -> Lpips:
     """LPIPS with the trunk's weights from a file, and the published heads.
 
     Raises:
-        ConfigError: the file is damaged, no file of weights, or of another network.
+        ConfigError: the file is damaged, is not a file of weights, or is of another network.
     """
     _check_digest(path)
     try:

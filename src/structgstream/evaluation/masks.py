@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a camera show something other than in the first frame.
+"""Masks of the pixels that changed since the first frame.
 
-Nine pixels in ten of a usual capture show what stands still, so a mean over all pixels hides how well motion
-is reconstructed. Changed pixels are found in the camera's own pictures, never in renderings.
+In typical captures nine of ten pixels are static, so a mean over all pixels hides the quality of moving parts. The
+masks are computed from the camera's pictures, never from renderings.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 THRESHOLD = 0.1  # of full scale
-SMOOTHED, GROWN = 1, 3  # half widths in pixels: a 3x3 mean against noise, a 7x7 dilation to hold the edges
+SMOOTHED, GROWN = 1, 3  # half widths in pixels: a 3x3 mean against noise, a 7x7 dilation to include edges
 
 
 def changed_pixels(truth: NDArray[np.uint8], first: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Mask ``[H, W]`` of the pixels that show something other than in the camera's first picture.
+    """Dilated mask ``[H, W]`` of the pixels that changed since the camera's first picture.
 
-    The absolute difference of the two pictures ``[H, W, 3]``, averaged over channels and 3x3 pixels, exceeds
-    0.1 of full scale somewhere within 3 pixels.
+    The absolute difference of the two pictures ``[H, W, 3]``, averaged over channels and 3x3 pixels, is thresholded at
+    0.1 of full scale, and the mask dilated by 3 pixels.
     """
     # Sums of integers: exact, and half the memory of floats.
     channels = np.abs(np.subtract(truth, first, dtype=np.int16))

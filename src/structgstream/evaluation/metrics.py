@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a rendering is from the picture that the camera took.
+"""PSNR, SSIM and MS-SSIM of a rendering against the camera's picture.
 
-All scores compare 8-bit pictures: a rendering is clamped and rounded first, because that is what anyone sees.
+All metrics compare 8-bit pictures: a rendering is clamped and rounded first, as it is displayed.
 Definitions, and how they relate to those of other projects: ``docs/evaluation.md``.
 """
 
@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool2d, conv2d
 
 from structgstream.kernels.backend import Backend
 
-PSNR_OF_EQUALS = 100.0  # dB; above what rounding to 8 bits can give, and a number that JSON can hold
+PSNR_OF_EQUALS = 100.0  # dB; above any PSNR of different 8-bit pictures, and representable in JSON
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # exponents of MS-SSIM, finest first
@@ -29,12 +29,12 @@ def squared_errors(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDAr
 
 
 def mean_of_squares(total: int, pixels: int) -> float:
-    """The mean squared error in units of full scale of ``pixels`` whose squared errors have the sum ``total``."""
+    """Mean squared error, full scale 1, from the sum ``total`` of squared 8-bit errors over ``pixels`` pixels."""
     return total / (3 * 255**2 * pixels)
 
 
 def decibels(error: float) -> float:
-    """The PSNR of a mean squared error in units of full scale; 100 dB for no error."""
+    """The PSNR of a mean squared error (full scale 1); 100 dB for no error."""
     return -10.0 * math.log10(error) if error > 0.0 else PSNR_OF_EQUALS
 
 
@@ -77,9 +77,9 @@ def _similarity(a: Tensor, b: Tensor, *, padding: int) -> tuple[Tensor, Tensor]:
 def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | None:
     """Structural similarity over five scales (Wang et al., 2003), averaged over channels; None for small pictures.
 
-    Windows and constants of :func:`ssim_map`, over windows that lie in the picture (no padding). Each scale averages
-    2x2 pixels of the one before; an odd side gets a line of zeros before its first, as in pytorch-msssim. The mean of
-    contrast times structure over each scale, at the coarsest of SSIM, negative ones as 0, to the power of its weight.
+    Windows and constants as in :func:`ssim_map`, without padding. Each scale averages 2x2 pixels of the one before; an
+    odd side is padded with a line of zeros at its start, as in pytorch-msssim. The result is the product over scales of
+    the mean of contrast times structure (at the coarsest scale of SSIM), clamped at 0, to the power of its weight.
     """
     if min(truth.shape[:2]) < SMALLEST_OF_SCALES:
         return None
@@ -95,9 +95,9 @@ def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | Non
 
 
 def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:
-    """Mean of :func:`ssim_map` over pixels and channels: the value that Gaussian splatting papers print.
+    """Mean of :func:`ssim_map` over pixels and channels, as Gaussian splatting papers report it.
 
-    ``backend`` computes; on real pictures all agree within 1e-5, of which the C++ is the nearest to float64.
+    On real pictures all back-ends agree within 1e-5; the C++ is the nearest to float64.
     """
     device = backend.device
     image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(device) for p in (picture, truth))

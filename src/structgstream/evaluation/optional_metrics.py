@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scores that need more than two pictures: an optional package, weights, or the frame before.
+"""Metrics with further requirements: an optional package, weights, or the previous frame.
 
-What is missing is said once, with the reason and what to do about it; a score is then None, never a guess.
+If a requirement is missing, the metric is None, and the reason and its remedy are reported once.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -24,21 +24,21 @@ from structgstream.evaluation.temporal import difference_of_change, flicker, war
 
 Picture = NDArray[np.uint8]
 MetricSelection = Literal["all", "basic"]
-"""All scores, or those of two pictures that cost little: PSNR and its kinds, and SSIM."""
+"""All metrics, or only the cheap ones of two pictures: PSNR and its variants, and SSIM."""
 
 TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 
 
 @dataclass(frozen=True)
 class OptionalMetrics:
-    """What measures, and what could not be had.
+    """The available metrics, and the reasons for missing ones.
 
     Args:
-        flip: what FLIP compares of a picture, or None.
+        flip: computes FLIP's features of a picture, or None.
         lpips: by name of the trunk, those whose weights were found.
-        flow: where pixels were in the frame before, or None.
-        weights: by name of the trunk, the file its weights came from.
-        not_available: name of the score to the reason why there is none.
+        flow: backward flow, or None.
+        weights: by name of the trunk, the file of its weights.
+        not_available: for each missing metric the reason.
     """
 
     flip: Callable[[Picture], FlipFeatures] | None
@@ -50,9 +50,9 @@ class OptionalMetrics:
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """One camera's frame, as the next one needs it: both pictures and what FLIP and LPIPS compare of them.
+    """One camera's frame, kept for the temporal metrics of the next: pictures and their FLIP and LPIPS features.
 
-    Each pair is of the truth and of the picture, or None where that is not measured.
+    Each pair is of truth and rendering, or None where that metric is not computed.
     """
 
     truth: Picture
@@ -69,17 +69,17 @@ def load_optional_metrics(
     flow: Flow | None = None,
     lpips_weights: Path | None = None,
 ) -> OptionalMetrics:
-    """All instruments that can be had here, for these cameras (names beside them) and this number of frames.
+    """The metrics that are available here for these cameras (by name) and this number of frames.
 
     Args:
-        cameras: those that are scored: what is too small for a score at one of them is not measured there.
-        frames: with one, nothing is said of time.
-        device: where LPIPS is computed.
+        cameras: those that are scored; a metric that needs larger pictures than one of them has is left out.
+        frames: number of frames; temporal metrics need two.
+        device: computes LPIPS.
         flow: exact flow; None estimates it.
         lpips_weights: folder or file with the trunks' weights (``lpips.py``, Note [Weights]).
 
     Raises:
-        ConfigError: a file of weights is there and is wrong.
+        ConfigError: a file of weights is invalid.
     """
     missing: dict[str, str] = {}
     measure = None
@@ -121,13 +121,13 @@ def optional_scores(
     camera: str,
     index: int,
 ) -> tuple[dict[str, float | None], ComparedFrame]:
-    """The further scores of one picture, by their names in ``Scores``, and what the next frame needs of this one.
+    """Further scores of one picture, by their names in ``Scores``, and the state for the next frame.
 
     Args:
-        optional_metrics: what measures.
-        truth: what the camera took, ``[H, W, 3]`` uint8.
-        picture: what was rendered.
-        before: the same camera's frame before; None for the first.
+        optional_metrics: the available metrics.
+        truth: the camera's picture, ``[H, W, 3]`` uint8.
+        picture: the rendering.
+        before: the same camera's previous frame; None for the first.
         camera: its name.
         index: number of the frame.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a result: what was there, what was rendered, and the difference."""
+"""Comparison pictures of a result: truth, rendering, and their difference."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -42,9 +42,9 @@ def spread_indices(count: int, columns: int) -> list[int]:
 
 
 def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture, Picture]]], *, title: str) -> None:
-    """One picture file for a whole result: columns are frames; each camera has three rows.
+    """One picture file for a whole result: a column per frame, three rows per camera.
 
-    The rows are truths, renderings, and their differences times four.
+    The rows are truth, rendering, and their difference times four.
 
     Args:
         path: the PNG to write.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A report over time, as one picture: quality, bytes, counts, seconds."""
+"""Plots of a report over time in one picture: quality, bytes, counts, seconds."""
 
 from collections.abc import Callable, Sequence
 from itertools import cycle
@@ -21,7 +21,7 @@ FLICKER = (("flicker", "rendering"), ("truth_flicker", "truth"))
 def write_plots(path: Path, report: Report, *, title: str) -> None:
     """Panels over the frame number: PSNR by camera, distances, flicker, bytes by field, counts, and seconds by stage.
 
-    The last one is there when the trainer's log was; distances (FLIP, LPIPS) and flicker when they were measured.
+    Seconds need the trainer's log; distances (FLIP, LPIPS) and flicker are shown if they were computed.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -77,7 +77,7 @@ def _flicker(axis: "Axes", report: Report) -> None:
 
 
 def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> None:
-    """The mean over cameras of scores that are 0 at best, each in its colour, whether or not the others are there."""
+    """Plots the mean over cameras of metrics whose best value is 0, each always in the same colour."""
     for colour, (key, label) in zip(COLORS, keys):
         if points := _known(report, key):
             axis.plot(*zip(*points), color=colour, linewidth=1.5, label=label)
@@ -127,7 +127,7 @@ def _counts(axis: "Axes", report: Report) -> None:
 
 
 def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None:
-    """Bars on top of each other, the largest field lowest, those below a thousandth of the whole left out."""
+    """Stacked bars, the largest field lowest, without those below a thousandth of the total."""
     whole = sum(array.sum() for array in values.values())
     shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
@@ -139,7 +139,7 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
 
 
 def _stages(frame: FrameScores) -> dict[str, float]:
-    """Seconds by stage, and what no stage accounts for: the log's sums are left out, so that bars add up to them."""
+    """Seconds by stage and the remainder, without the log's totals, so that the bars add up to them."""
     seconds = dict(frame.log.get("seconds", {}))
     total = seconds.pop("total", 0.0)
     seconds.pop("fit", None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be scored: any file that gives something to draw for each frame, of this project or another."""
+"""The protocol of files that can be evaluated: a drawable per frame, of this method or another."""
 
 from collections.abc import Iterator, Sequence
 from typing import Protocol, runtime_checkable
@@ -22,11 +22,11 @@ class Movable(Drawable, Protocol):
 
 
 class Recording(Protocol):
-    """An opened file with one packet for each frame; ``StreamReader`` is one.
+    """An opened file with one packet per frame, such as a ``StreamReader``.
 
-    ``scenes`` decodes from the file, frame by frame, what a camera sees in normalised units; ``complete`` tells whether
-    the run that wrote the file came to its end. A frame that is no ``Scene`` has a length, its number of Gaussians,
-    and, if it is to be drawn elsewhere than on the CPU, ``on_device`` (:class:`Movable`).
+    ``scenes`` decodes a drawable in normalised units frame by frame; ``complete`` states whether the run that wrote the
+    file finished. A drawable that is no ``Scene`` has a length, its number of Gaussians, and, to be drawn on another
+    device than the CPU, ``on_device`` (:class:`Movable`).
     """
 
     @property

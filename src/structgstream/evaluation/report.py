@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an evaluation found, and the JSON it becomes, whose keys ``docs/evaluation.md`` lists."""
+"""The result of an evaluation, and its JSON, whose keys ``docs/evaluation.md`` lists."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,22 +20,21 @@ class Scores:
         psnr: dB, the headline.
         ssim: see ``metrics.ssim``.
         psnr_affine: dB after the best affine change of colour towards the truth (``affine.py``).
-        psnr_camera_color: dB after a gain and a bias for each channel that the camera's first frame gave and that are
-            held (``affine.py``, Note [Colour of a camera]); None where no fit was made.
-        psnr_changed: dB over the pixels that changed since the camera's first picture; None where there are
-            none.
-        psnr_still: dB over the others; None where there are none.
+        psnr_camera_color: dB after a gain and a bias per channel, fitted to the camera's first frame (``affine.py``,
+            Note [Colour of a camera]); None without a fit.
+        psnr_changed: dB over the pixels that changed since the camera's first picture; None without any.
+        psnr_still: dB over the other pixels; None without any.
         changed_share: share of the pixels that changed.
         render_seconds: wall-clock time of the rendering, the picture in main memory.
-        ms_ssim: see ``metrics.ms_ssim``; like all that follow None where it was not asked for or is not available,
-            for which ``stream["not_available"]`` has the reason.
+        ms_ssim: see ``metrics.ms_ssim``. This and the following scores are None if not requested or not available;
+            ``stream["not_available"]`` has the reason.
         flip: mean LDR-FLIP (``flip.py``).
         lpips_alex: LPIPS with AlexNet (``lpips.py``).
         lpips_vgg: LPIPS with VGG16.
-        e_warp: squared warping error (``temporal.py``); like all that follow None in frame 0, for it compares with the
-            camera's frame before.
-        temporal_flip: how far the change by FLIP is from the truth's.
-        t_lpips: how far the change by LPIPS with AlexNet is from the truth's.
+        e_warp: squared warping error (``temporal.py``). This and the following scores compare consecutive frames, so
+            they are None in frame 0.
+        temporal_flip: difference between the change from the previous frame by FLIP, of rendering and truth.
+        t_lpips: the same by LPIPS with AlexNet.
         flicker: mean absolute change of the rendering where the truth did not change, in levels of 1/255.
         truth_flicker: that of the truth: the camera's noise.
     """
@@ -71,10 +70,10 @@ class FrameScores:
         field_bytes: bytes by field of the state table.
         anchors: anchors of the decoded scene.
         free: free Gaussians of the decoded scene; of another method's drawable all of them.
-        decode_seconds: wall-clock time from the file to the scene where it is drawn.
+        decode_seconds: wall-clock time from the file to the scene on its device.
         cameras: scores by camera name.
         mean: their mean.
-        log: what the trainer wrote down about the frame beside the stream; empty when that file is missing.
+        log: the frame's entry in the trainer's log; empty without a log.
     """
 
     index: int
@@ -125,7 +124,7 @@ def slope(values: Sequence[float]) -> float:
 
 
 def psnr_trend(psnrs: Sequence[float]) -> dict[str, float]:
-    """How PSNR runs over the frames: first, last, worst, slope and the largest fall from the first, in dB."""
+    """PSNR over the frames: first, last, worst, slope and the largest drop from the first, in dB."""
     return {
         "psnr_first": psnrs[0],
         "psnr_last": psnrs[-1],
@@ -136,7 +135,7 @@ def psnr_trend(psnrs: Sequence[float]) -> dict[str, float]:
 
 
 def drawing_facts(frames: Sequence[FrameScores]) -> dict[str, float]:
-    """Pictures of a camera a second: of a scene that is there, and with the frame's decoding before each picture."""
+    """Renderings per second, without and with decoding of the frame before each rendering."""
     drawing = float(np.mean([frame.mean.render_seconds for frame in frames]))
     decoding = float(np.mean([frame.decode_seconds for frame in frames]))
     return {

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the trainer knows and the stream does not carry: seconds and memory by stage, PSNR on training views.
+"""The log of a reconstruction: seconds and memory by stage, PSNR on training views.
 
-One JSON object a line in ``OUT.log.jsonl`` beside ``OUT.sgs``, written after each frame, so that a crash
-loses none and a resumed run appends. ``peak_memory_bytes`` is the frame's largest; ``peak_memory_kind`` says what it
-and the sizes by stage are: each stage's own (``stage``) or the process's so far (``process``).
+``OUT.log.jsonl`` beside ``OUT.sgs`` has one JSON object per line, written after each frame, so that a crash loses none
+and a resumed run appends. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind`` states whether peaks
+are of each stage (``stage``) or of the process since its start (``process``).
 """
 
 import json
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def log_path(stream: Path) -> Path:
-    """Where the log of a stream lies."""
+    """The path of a stream's log."""
     return stream.with_suffix(".log.jsonl")
 
 
 def begin_log(stream: Path, *, frames: int = 0) -> None:
-    """Drops everything from frame ``frames`` on: all for a new run, what was never stored for a resumed one.
+    """Removes the entries from frame ``frames`` on: all for a new run, those of unstored frames for a resumed one.
 
     Raises:
         StorageError: the file cannot be written.
@@ -59,7 +59,7 @@ def log_entry(report: "FrameReport") -> dict[str, Any]:
 
 
 def read_log(stream: Path) -> dict[int, dict[str, Any]]:
-    """Frame number to entry; the later of two for one frame, and nothing for a line that a crash cut."""
+    """Frame number to entry; of two entries the later one, without lines truncated by a crash."""
     try:
         lines = log_path(stream).read_text().splitlines()
     except OSError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How steady a rendered video is: two consecutive frames of one camera at a time."""
+"""Temporal consistency of a rendered video, from consecutive frames of one camera."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,10 @@ Picture = NDArray[np.uint8]
 
 
 def warping_error(now: Picture, before: Picture, field: FlowField) -> float | None:
-    """E_warp of one pair: the mean squared difference of a rendering and the one before it carried along.
+    """E_warp of one pair: the mean squared difference of a rendering and the warped previous one.
 
-    ``before`` is sampled where the truth's flow says that each pixel was; the mean runs over channels and over the
-    pixels that were seen there. Pictures ``[H, W, 3]`` uint8 count as [0, 1]. None where no pixel was seen.
+    ``before`` is warped by the truth's backward flow; the mean is over channels and over the pixels that were not
+    occluded. Pictures are ``[H, W, 3]`` uint8, full scale 1. None if all pixels were occluded.
 
     Source: Lai et al., 2018, whose sum over channels is a mean here.
     """
@@ -26,7 +26,7 @@ def warping_error(now: Picture, before: Picture, field: FlowField) -> float | No
 
 
 def difference_of_change(rendered: float, true: float) -> float:
-    """How far the change from frame to frame is from the truth's, both by one distance of pictures.
+    """Difference between the frame-to-frame change of rendering and truth, both by the same picture distance.
 
     With LPIPS this is tLP (Chu et al., 2020): ``|LPIPS(r_t, r_{t-1}) - LPIPS(g_t, g_{t-1})|``.
     """
@@ -36,7 +36,7 @@ def difference_of_change(rendered: float, true: float) -> float:
 def flicker(now: Picture, before: Picture, still: NDArray[np.bool_]) -> float | None:
     """Mean absolute difference of two consecutive pictures over the ``still`` pixels ``[H, W]``, in levels of 1/255.
 
-    None where nothing is still.
+    None without still pixels.
     """
     count = int(np.count_nonzero(still))
     if not count:

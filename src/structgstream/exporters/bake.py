@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes plain Gaussians of a scene whose Gaussians depend on the camera.
+"""Bakes a scene, whose Gaussians depend on the camera, to plain Gaussians.
 
 Note [Baking]
 ~~~~~~~~~~~~~
-Opacity, shape and colour of a structured Gaussian are what the MLPs say for one camera; its mean is the same for all.
-A plain Gaussian has one opacity and one shape. They are averages over the training cameras, in which Gaussians are
-matched by id, and the colour is a least-squares fit of spherical harmonics to the colours that these cameras see.
-A ridge pulls all but the constant coefficient to zero: a dozen cameras on one side say little about the others.
-What was chosen among the values of :class:`BakingConfig`, and by which measurement, is in ``docs/export.md``.
+The MLPs give a structured Gaussian's opacity, shape and colour for one camera; its mean is the same for all. A plain
+Gaussian has one opacity and one shape. They are averages over the training cameras, matched by id; the colour is a
+least-squares fit of spherical harmonics to the colours for these cameras. A ridge term shrinks all but the constant
+coefficient, because a dozen cameras on one side hardly constrain the other directions. ``docs/export.md`` has the
+measurements behind the defaults of :class:`BakingConfig`.
 """
 
 from collections.abc import Iterable
@@ -28,21 +28,21 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 
 LEAST_OPACITY = 1.0 / 255.0
-"""What a rasteriser no longer draws."""
+"""Below this a rasteriser does not draw a Gaussian."""
 
 
 @dataclass(frozen=True)
 class BakingConfig:
-    """How a scene becomes plain Gaussians.
+    """Configuration of baking.
 
     Args:
         degree: of the spherical harmonics, 0 to 2.
         ridge: weight of the squares of all coefficients but the constant one, against a mean of squared errors.
-        opacity: ``seen`` averages over the cameras that see the anchor, those that do not draw the Gaussian counting
-            as 0; ``drawn`` over those that draw it.
-        shape: ``parts`` averages logarithms of scales, and quaternions of one sign; ``covariance`` covariances.
-        weight: what a camera counts in colour and shape: the Gaussian's ``opacity`` there, or its ``blend`` weight,
-            summed over the picture, which is less behind others.
+        opacity: ``seen`` averages over the cameras with the anchor in view, with 0 where the Gaussian is not drawn;
+            ``drawn`` over the cameras that draw it.
+        shape: ``parts`` averages log scales, and sign-aligned quaternions; ``covariance`` averages covariances.
+        weight: weight of a camera for colour and shape: the Gaussian's ``opacity`` there, or its ``blend`` weight,
+            summed over the picture, which accounts for occlusion.
     """
 
     degree: int = 1
@@ -60,11 +60,11 @@ def bake(
     Args:
         scene: on the device of ``backend``.
         cameras: in the scene's units; the training cameras of a stream.
-        backend: what computes.
-        baking: how; the measured choice when None.
+        backend: the compute back-end.
+        baking: the configuration; the default when None.
 
     Returns:
-        In the scene's units, in the order of ids, without those that nothing shows of.
+        Gaussians in the scene's units, in the order of ids, without invisible ones.
 
     Raises:
         StreamError: no camera draws any Gaussian.
@@ -83,7 +83,7 @@ def bake(
 
 
 def blend_weights(gaussians: Gaussians, camera: Camera, backend: Backend) -> Tensor:
-    """How much each Gaussian gives to the picture, ``[N]`` in pixels: the gradient of its sum by the colours."""
+    """Sum ``[N]`` of each Gaussian's blending weights over the picture, in pixels (gradient by its colour)."""
     colors = torch.zeros_like(gaussians.colors, requires_grad=True)
     shown = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.ids)
     with torch.enable_grad():
@@ -105,7 +105,7 @@ class _Sums:
         self.normal, self.right = like.new_zeros(count, terms, terms), like.new_zeros(count, terms, 3)
 
     def add(self, gaussians: Gaussians, camera: Camera, backend: Backend, *, seen: Tensor) -> None:
-        """One camera's Gaussians; ``seen`` are the ids of all that its visible anchors have."""
+        """Adds one camera's Gaussians; ``seen`` are the ids of all Gaussians of its visible anchors."""
         ids = gaussians.ids
         self.seen[seen] += 1.0
         self.drawn[ids] += 1.0
@@ -132,7 +132,7 @@ class _Sums:
             return
         self.log_scales[ids] += weight[:, None] * gaussians.scales.log()
         before = self.quats[ids]
-        # A quaternion and its negative are one rotation: each is turned to the side of the sum so far.
+        # A quaternion and its negative are the same rotation: each takes the sign that agrees with the sum so far.
         side = torch.where((before * quats).sum(1, keepdim=True) < 0.0, -1.0, 1.0)
         self.quats[ids] = before + weight[:, None] * side * quats
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain Gaussians, as files of 3D Gaussian splatting hold them: one shape, one opacity, colours by direction.
+"""Plain Gaussians as in files of 3D Gaussian splatting: fixed shape and opacity, direction-dependent colour.
 
-Colours are those of ``scene/harmonics.py``, Note [Spherical harmonics], from below cut off at 0.
+Colours are those of ``scene/harmonics.py``, Note [Spherical harmonics], clamped to 0 from below.
 """
 
 import math
@@ -19,7 +19,7 @@ from structgstream.similarity import Similarity
 
 @dataclass(frozen=True)
 class BakedGaussians:
-    """``N`` Gaussians that no longer depend on the camera, but for their colour.
+    """``N`` Gaussians of which only the colour depends on the camera.
 
     Args:
         means: ``[N, 3]``.
@@ -57,7 +57,7 @@ class BakedGaussians:
         return (0.5 + torch.einsum("ns,nsc->nc", basis, self.sh)).clamp(min=0.0)
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
-        """What ``camera`` sees. The back-end is not needed: it is part of what a drawable is."""
+        """The Gaussians with their colours for ``camera``; ``backend`` is unused, part of the ``Drawable`` protocol."""
         return Gaussians(
             means=self.means,
             quats=self.quats,
@@ -68,6 +68,6 @@ class BakedGaussians:
         )
 
     def in_capture_units(self, similarity: Similarity) -> "BakedGaussians":
-        """The same in the units and at the place of the capture; a similarity has no rotation, so axes stay."""
+        """The same Gaussians in the capture's units; a similarity has no rotation, so axes stay."""
         means = similarity.inverse_points(self.means.cpu().double()).to(self.means)
         return replace(self, means=means, scales=self.scales / similarity.scale)

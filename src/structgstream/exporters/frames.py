@@ -16,7 +16,7 @@ from structgstream.scene.state import on_device
 
 @dataclass(frozen=True)
 class WrittenFrame:
-    """One file: its place, its bytes, and how many Gaussians it holds."""
+    """One written file: its path, its size in bytes, and its number of Gaussians."""
 
     path: Path
     bytes: int
@@ -39,8 +39,8 @@ def write_frames(
         numbers: of the frames; one, if ``output`` names a file.
         output: the file, or a folder for ``frame_000000.ply`` and so on.
         format: of the files.
-        backend: what evaluates the MLPs.
-        degree: of the spherical harmonics; None for the measured choice.
+        backend: evaluates the MLPs.
+        degree: of the spherical harmonics; None for the default.
 
     Raises:
         StreamError: a frame is lost.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an export writes and where: the answers that follow from a few optional wishes, and what contradicts itself."""
+"""Resolves and checks the options of an export: format, destination and frames."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,14 +20,13 @@ def destination(
 
     Args:
         stream: the stream's file.
-        output: the file or folder that was asked for; None for one beside the stream.
-        format: that was asked for; None for what the name of ``output`` says, else ``ply``.
+        output: the file or folder to write; None for one beside the stream.
+        format: the format; None for the suffix of ``output``, else ``ply``.
         frame: the only frame to write, or None.
         frames: the first and the last, or None.
 
     Raises:
-        ConfigError: the name asks for a format that there is not, or for another than ``format``; or both ``frame`` and
-            ``frames`` are given.
+        ConfigError: the suffix is no format, or another than ``format``; or both ``frame`` and ``frames`` are given.
     """
     if frame is not None and frames is not None:
         raise ConfigError("--frame names one frame, --frames the first and the last; give one of them.")
@@ -54,17 +53,17 @@ def destination(
 
 
 def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: int | None) -> None:
-    """A page has no wishes.
+    """Check that no options of other formats are given for a page.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: one is given.
     """
     if frame is not None or frames is not None or sh_degree is not None:
         raise ConfigError("a page holds the whole stream; --frame, --frames and --sh-degree are for other formats.")
 
 
 def check_degree(degree: int | None, format: Format) -> int | None:
-    """The degree that is baked, or None for the measured choice.
+    """The degree to bake, or None for the default.
 
     Raises:
         ConfigError: there is no such degree, or the format cannot hold it.

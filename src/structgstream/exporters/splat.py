@@ -17,7 +17,7 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("qu
 
 
 def by_importance(gaussians: BakedGaussians) -> BakedGaussians:
-    """The same, largest volume times opacity first, so that a file that is still loading shows what matters."""
+    """Sorted by volume times opacity, largest first, so that a partly loaded file shows the largest Gaussians."""
     importance = gaussians.scales.log().sum(1) + gaussians.opacities.log()
     return gaussians.select(importance.argsort(descending=True, stable=True))
 
@@ -26,7 +26,7 @@ def splat_bytes(gaussians: BakedGaussians) -> bytes:
     """A whole ``.splat`` file, in the units and axes of ``gaussians``.
 
     Raises:
-        ConfigError: colours depend on direction. Their constant part alone is not what the cameras see on average.
+        ConfigError: colours depend on direction; their constant part alone is not the mean over the cameras.
     """
     if gaussians.degree:
         raise ConfigError(

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Niantic's ``.spz``, version 2: everything quantised, attribute by attribute, compressed with gzip.
+"""Niantic's ``.spz``, version 2: quantised attributes, stored one after another, compressed with gzip.
 
 Note [Axes of SPZ]
 ~~~~~~~~~~~~~~~~~~
 SPZ has x right, y up, z back; a capture has x right, y down, z forward. The change between them is half a turn around
 x: ``y`` and ``z`` of positions and quaternions change sign, and so does each spherical harmonic that is odd in them
-together. Readers turn the file back to the axes that they ask for.
+together. Readers convert to the axes of their application.
 
 Note [Precision of SPZ]
 ~~~~~~~~~~~~~~~~~~~~~~~

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are whole or not there."""
+"""Atomic writing of files."""
 
 import os
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ from structgstream.errors import StorageError
 def write_whole(path: Path, parts: Iterable[bytes | memoryview]) -> None:
     """Writes ``parts``, one after the other, as the file ``path``, and makes its folder when it is missing.
 
-    What stood at ``path`` stays until the new file is complete.
+    An existing file at ``path`` is replaced only when the new one is complete.
 
     Raises:
         StorageError: the file cannot be written.

@@ -19,14 +19,14 @@ FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
 
 
 def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) -> int:
-    """Writes a file of ``gaussians``, whole or not at all, and the folder when it is missing.
+    """Writes a file of ``gaussians`` atomically, and creates its folder if necessary.
 
-    What stood at ``path`` stays until the new file is complete.
+    An existing file at ``path`` is replaced only when the new one is complete.
 
     Args:
         path: the file.
-        gaussians: in the units that the file shall have, OpenCV axes.
-        format: which of the formats; ``splat`` holds degree 0 only.
+        gaussians: in the file's units, OpenCV axes.
+        format: of the file; ``splat`` holds degree 0 only.
 
     Returns:
         Bytes of the file.

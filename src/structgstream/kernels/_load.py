@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds and loads the native library once, and remembers why it is not there."""
+"""Loads the native library once, and keeps the reason if it cannot be loaded."""
 
 import ctypes
 import sys
@@ -12,11 +12,11 @@ from structgstream.kernels.prototypes import PROTOTYPES, declare
 
 _NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
 ABI_VERSION = 1
-"""Of csrc/include/structgstream.h, which says when it rises."""
+"""As in csrc/include/structgstream.h, which states when it is incremented."""
 
 
 def library_path() -> Path:
-    """Where the install puts the library."""
+    """Where the library is installed."""
     return Path(str(files("structgstream") / "_native" / _NAMES.get(sys.platform, "libstructgstream.so")))
 
 
@@ -35,15 +35,15 @@ def _loaded() -> tuple[ctypes.CDLL | None, str | None]:
     version = library.sgs_abi_version() if hasattr(library, "sgs_abi_version") else 0
     if version != ABI_VERSION:
         return None, (
-            f"The CPU kernels at {path} have version {version} of their interface, and this structgstream calls "
-            f"version {ABI_VERSION}; install structgstream again, so that both are of one version."
+            f"The CPU kernels at {path} have interface version {version}, but this structgstream needs "
+            f"version {ABI_VERSION}; install structgstream again."
         )
     declare(library, PROTOTYPES)
     return library, None
 
 
 def native_reason() -> str | None:
-    """Why the native library cannot be used, with the way to mend it; None when it can."""
+    """Why the native library cannot be used and how to fix it; None if it can be used."""
     return _loaded()[1]
 
 
@@ -51,7 +51,7 @@ def native_library() -> ctypes.CDLL:
     """The native library.
 
     Raises:
-        BackendError: it is not there or does not load.
+        BackendError: it is missing or does not load.
     """
     library, reason = _loaded()
     if library is None:
@@ -63,5 +63,5 @@ ISA_NAMES = ("baseline", "avx2", "avx512")
 
 
 def instruction_set() -> str:
-    """The instruction set that the kernels use on this machine."""
+    """Name of the instruction set that the kernels use on this machine."""
     return ISA_NAMES[native_library().sgs_isa()]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiles this package's CUDA sources where NVIDIA's compiler is, once for each kind of GPU, and keeps the result.
+"""Compiles this package's CUDA sources with NVIDIA's compiler, once per GPU architecture, and caches the library.
 
-The sources are installed with the package, because the machine that builds a wheel is seldom the one with the GPU.
+The sources are installed with the package, because a wheel is seldom built on the machine that has the GPU.
 """
 
 import ctypes
@@ -21,16 +21,16 @@ from structgstream.errors import BackendError
 from structgstream.kernels.cuda_ssim import LossLibrary, cuda_stream
 
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC")
-_LAST_LINES = 5  # of what a failing compiler says
+_LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
 
 def source_folder() -> Path:
-    """Where the install puts the sources."""
+    """Where the sources are installed."""
     return Path(str(files("structgstream") / "_native" / "cuda"))
 
 
 def find_nvcc(environment: Mapping[str, str]) -> Path | None:
-    """NVIDIA's compiler: in ``CUDA_HOME`` or ``CUDA_PATH``, on ``PATH``, or where its installer puts it."""
+    """NVIDIA's compiler: from ``CUDA_HOME`` or ``CUDA_PATH``, ``PATH``, or its default folder; None if not found."""
     folders = [Path(environment[name]) / "bin" for name in ("CUDA_HOME", "CUDA_PATH") if environment.get(name)]
     on_path = shutil.which("nvcc", path=environment.get("PATH", ""))
     candidates = [folder / "nvcc" for folder in folders]
@@ -40,19 +40,19 @@ def find_nvcc(environment: Mapping[str, str]) -> Path | None:
 
 
 def cache_folder(environment: Mapping[str, str]) -> Path:
-    """Where compiled libraries are kept: the user's cache."""
+    """The folder of compiled libraries, in the user's cache."""
     root = environment.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "structgstream" / "cuda"
 
 
 def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Path:
-    """The library for ``architecture`` (``sm_90``), compiled now unless ``cache`` has it.
+    """Path of the library for ``architecture`` (``sm_90``), compiled unless ``cache`` has it.
 
-    It is kept under a hash of the sources, the compiler's version, the flags and the architecture. Processes may race:
-    a library appears whole or not at all.
+    Its file name is a hash of the sources, the compiler's version, the flags and the architecture. It is renamed into
+    place, so processes that compile at the same time do not see a partial file.
 
     Raises:
-        BackendError: the sources are not there, the compiler fails, or the cache cannot be written.
+        BackendError: the sources are missing, the compiler fails, or the cache cannot be written.
     """
     units = sorted(sources.glob("*.cu"))
     if not units:
@@ -85,7 +85,7 @@ def _output(command: list[str]) -> str:
 
 
 def loss_plan() -> tuple[Path | None, str]:
-    """NVIDIA's compiler, and a sentence: what the loss of the cuda back-end runs on, and why. Compiles nothing."""
+    """NVIDIA's compiler or None, and a sentence stating what computes the cuda back-end's loss. Compiles nothing."""
     nvcc = find_nvcc(os.environ)
     if nvcc is None:
         return None, (
@@ -97,7 +97,7 @@ def loss_plan() -> tuple[Path | None, str]:
 
 @cache
 def loss_library() -> tuple[LossLibrary | None, str]:
-    """The kernels for this machine's GPU or None, and a sentence: what runs and why. The first call compiles."""
+    """The kernels for this machine's GPU or None, and the sentence of :func:`loss_plan`. The first call compiles."""
     nvcc, sentence = loss_plan()
     if nvcc is None:
         return None, sentence

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors and the weights of the three MLPs, and what generating structured Gaussians returns."""
+"""Arguments and result of generating structured Gaussians: anchors, MLP weights, Gaussians."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from structgstream.gaussians import Gaussians
 
 
 class Anchors(NamedTuple):
-    """What the generation reads of ``M`` anchors.
+    """The anchor fields that the generation reads, ``M`` anchors.
 
     Args:
         positions: ``[M, 3]``, x_v.
@@ -46,14 +46,13 @@ class MLPWeights(NamedTuple):
 
 @dataclass(frozen=True)
 class StructuredGaussians:
-    """The Gaussians of the anchors that a camera may see.
+    """The Gaussians of the anchors in a camera's view.
 
     Args:
-        gaussians: ascending by id, their quaternions of unit length. What has opacity 0 has scale 0 too and shows
-            nowhere; only back-ends that wait for no count have such rows.
-        anchors: ``[m]`` int64, ascending: those that were looked at, among them all that may show.
-        raw_opacities: ``[m, K]`` tanh outputs of these anchors, without a graph; a Gaussian is drawn where it is
-            positive.
+        gaussians: ascending by id, with unit quaternions. Rows of opacity 0 have scale 0 and are invisible; only
+            back-ends with shapes that do not depend on data return such rows.
+        anchors: ``[m]`` int64, ascending: the anchors that were evaluated, a superset of the visible ones.
+        raw_opacities: ``[m, K]`` tanh outputs of these anchors, without a graph; positive ones are drawn.
     """
 
     gaussians: Gaussians

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A compute back-end is a value: a name and the functions that do the work.
+"""Compute back-ends: each is a value with a name and one function per operation.
 
-``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` is gsplat behind the same
-functions. A back-end that lacks an operation of its own names another's, visibly, where the value is built.
+``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` wraps gsplat. A back-end without
+its own implementation of an operation takes another's, stated where the value is built.
 """
 
 import logging
@@ -34,11 +34,11 @@ BackendName = Literal["auto", "cpu", "cuda", "reference"]
 
 @dataclass(frozen=True)
 class Backend:
-    """The operations that a scene and a trainer need; ``kernels.operations`` has the contract of each.
+    """The operations that rendering and training need; ``kernels.operations`` defines the contract of each.
 
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
-        device: where its tensors live.
+        device: of its tensors.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Backend:
 
 
 def reference_backend() -> Backend:
-    """Pure torch on the CPU: slow, exact, always there."""
+    """Pure torch on the CPU: slow, always available, the oracle of the others."""
     from structgstream.kernels import (
         reference_adam,
         reference_anchors,
@@ -122,7 +122,7 @@ def cpu_backend() -> Backend:
 
 
 def cuda_backend() -> Backend:
-    """gsplat's rasteriser and this package's loss on an NVIDIA GPU, torch for the rest.
+    """gsplat's rasteriser and this package's loss on an NVIDIA GPU, torch for the other operations.
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
@@ -164,20 +164,20 @@ def cuda_backend() -> Backend:
 
 
 def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
-    """The cuda back-end with shapes that do not depend on numbers: the host waits for nothing within an iteration.
+    """The cuda back-end with shapes that do not depend on data, so that an iteration has no host synchronisation.
 
-    ``generate_structured`` gives all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]); a picture has
-    room for ``budget.capacity`` pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]): ask ``budget.shortage()``
-    when the work is done.
+    ``generate_structured`` gives all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]). A picture has
+    at most ``budget.capacity`` (Gaussian, tile) pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]); check
+    ``budget.shortage()`` at the end.
 
     Raises:
-        BackendError: another back-end, on which nothing waits anyway.
+        BackendError: ``backend`` is not the cuda one.
     """
     from structgstream.kernels import cuda_anchors
     from structgstream.kernels.cuda import rasterize
 
     if backend.name != "cuda":
-        raise BackendError(f"Only the cuda back-end works apart from the host, not {backend.name}.")
+        raise BackendError(f"Only the cuda back-end runs asynchronously, not {backend.name}; use it as it is.")
     return replace(
         backend,
         rasterize=partial(rasterize, budget=budget),
@@ -186,7 +186,7 @@ def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
 
 
 def backend_reasons() -> dict[str, str | None]:
-    """Each back-end's name and why it is missing here (None: it is there)."""
+    """For each back-end the reason why it is not available here; None if it is."""
     from structgstream.kernels._load import native_reason
     from structgstream.kernels.cuda import cuda_reason
 
@@ -194,20 +194,20 @@ def backend_reasons() -> dict[str, str | None]:
 
 
 def backend_remarks() -> dict[str, str]:
-    """What a user should know of a back-end that is there: which of its operations run on what."""
+    """Remarks about available back-ends for the user: what computes the cuda back-end's loss."""
     from structgstream.kernels._nvcc import loss_plan
 
     return {"cuda": loss_plan()[1]}
 
 
 def select_backend(name: BackendName | Backend) -> Backend:
-    """The back-end of that name; ``auto`` takes the first of cuda, cpu, reference that this machine has.
+    """The back-end of that name; ``auto`` takes the first available of cuda, cpu, reference.
 
     Args:
-        name: its name; a back-end stands for itself.
+        name: its name; a :class:`Backend` is returned as it is.
 
     Raises:
-        BackendError: the named one is not available, with the reason and the way to get it.
+        BackendError: the named one is not available; the message states why and how to get it.
     """
     if isinstance(name, Backend):
         return name

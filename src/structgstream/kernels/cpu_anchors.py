@@ -143,7 +143,7 @@ def _check(tensors: Sequence[Tensor], mlps: MLPWeights, distance_input: bool) ->
     for tensor, shape in zip(tensors, expected, strict=True):
         if tensor.dtype != torch.float32 or tuple(tensor.shape) != shape:
             raise BackendError(
-                f"The cpu back-end generates from float32 tensors that fit each other: expected {shape}, got "
+                f"The cpu back-end expected a float32 anchor or MLP tensor of shape {shape}, got "
                 f"{tensor.dtype} {tuple(tensor.shape)}; the reference back-end takes other precisions."
             )
 
@@ -153,7 +153,7 @@ def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection |
 
     Raises:
         BackendError: a tensor of another precision.
-        OutOfMemoryError: there is no room for a byte an anchor.
+        OutOfMemoryError: there is no memory for one byte per anchor.
     """
     tensors = anchors[:4]
     if any(tensor.dtype != torch.float32 for tensor in tensors):
@@ -187,7 +187,7 @@ def activate_anchors(
     """The Gaussians of the anchors ``visible``, see ``kernels.reference_anchors.activate_anchors``.
 
     Raises:
-        BackendError: a tensor of another precision, or shapes that do not fit each other.
+        BackendError: a tensor of another precision, or inconsistent shapes.
     """
     tensors = [tensor.contiguous() for tensor in (*anchors, *(weight for head in mlps for weight in head))]
     _check(tensors, mlps, distance_input)
@@ -209,11 +209,11 @@ def generate_structured(
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``.
 
-    Gradients of what does not require them are not computed. Results do not depend on the number of threads.
+    Only gradients of tensors that require them are computed. Results do not depend on the number of threads.
 
     Raises:
-        BackendError: a tensor of another precision, or shapes that do not fit each other.
-        OutOfMemoryError: there is no room for a byte an anchor.
+        BackendError: a tensor of another precision, or inconsistent shapes.
+        OutOfMemoryError: there is no memory for one byte per anchor.
     """
     visible = visible_anchors(anchors, viewport, tiles)
     center = viewport.center if seen_from is None else seen_from

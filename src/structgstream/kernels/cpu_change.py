@@ -13,7 +13,7 @@ def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixel
     """See ``kernels.operations.ChangedPixels``.
 
     Raises:
-        OutOfMemoryError: there is no room for three bytes a pixel.
+        OutOfMemoryError: there is no memory for three bytes per pixel.
     """
     assert before.shape == now.shape, (before.shape, now.shape)
     assert before.dtype == now.dtype == torch.uint8, (before.dtype, now.dtype)

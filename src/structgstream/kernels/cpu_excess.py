@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far Gaussians stray from their anchors in this package's C++; the
-contract is ``kernels.operations.Excess``."""
+"""The loss on Gaussians' distances to their anchors in this package's C++; the contract is
+``kernels.operations.Excess``."""
 
 from typing import Any
 

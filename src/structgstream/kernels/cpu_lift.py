@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flow lifted to displacements in this package's C++; the contract is ``kernels.operations.Lift``."""
+"""3D displacements from optical flow in this package's C++; the contract is ``kernels.operations.Lift``."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     """See ``kernels.operations.Lift``; float32.
 
     Raises:
-        OutOfMemoryError: there is no room for the terms of one target a thread.
+        OutOfMemoryError: there is no memory for the terms of one target per thread.
     """
     views, movers = seen.weights.shape
     targets, count = neighbors.rows.shape

@@ -18,7 +18,7 @@ from structgstream.kernels.raster_types import RasterOutput, TileSelection
 
 
 class _State:
-    """Owns what forward leaves for backward."""
+    """Owns the native state that forward keeps for backward."""
 
     def __init__(self, address: int | None) -> None:
         if not address:
@@ -29,7 +29,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _View:
-    """What a rendering needs beside Gaussians: float32, contiguous, without gradient."""
+    """The arguments of a rendering other than Gaussians: float32, contiguous, without gradient."""
 
     viewport: Viewport
     background: Tensor | None
@@ -37,7 +37,7 @@ class _View:
     trained: int
 
     def arguments(self) -> list[int | float | None]:
-        """The camera's arguments, as the C++ takes them."""
+        """The camera's arguments in the order of the C++ functions."""
         viewport = self.viewport
         return [*addresses(viewport.viewmat, viewport.K), viewport.width, viewport.height, viewport.near]
 
@@ -113,11 +113,11 @@ def rasterize(
     onto: Tensor | None = None,
     trained: int | None = None,
 ) -> RasterOutput:
-    """See ``kernels.operations.Rasterize``. Repeated calls give the same bits, whatever the number of threads.
+    """See ``kernels.operations.Rasterize``. Results repeat bit for bit and do not depend on the number of threads.
 
     Raises:
         BackendError: a tensor is not float32 on the CPU.
-        OutOfMemoryError: the lists of what each tile draws do not fit.
+        OutOfMemoryError: there is no memory for the tiles' lists of Gaussians.
     """
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     given = tensors if screen_offsets is None else (*tensors, screen_offsets)
@@ -136,7 +136,7 @@ def rasterize(
         assert onto.shape == (viewport.height, viewport.width, 3)
         assert onto.is_contiguous()
         assert not onto.requires_grad
-        onto = onto.detach()  # An alias: autograd will make the result of what it is given.
+        onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
     view = _View(
         _in_float32(viewport),
         None if background is None else _constant(background),
@@ -154,7 +154,7 @@ def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> 
     """See ``kernels.operations.BlendingWeights``; float32.
 
     Raises:
-        OutOfMemoryError: the lists of what each tile draws do not fit.
+        OutOfMemoryError: there is no memory for the tiles' lists of Gaussians.
     """
     tensors = [_constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
     maps = maps.float().contiguous()

@@ -16,7 +16,7 @@ class _L1SSIM(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, comparison: Comparison) -> tuple[Tensor, Tensor]:
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        sums = torch.empty(2, image.shape[0], dtype=torch.float64)  # rows, summed here in a fixed order
+        sums = torch.empty(2, image.shape[0], dtype=torch.float64)  # of rows; added here in a fixed order
         native_library().sgs_l1_ssim(
             *comparison.arguments(image), *addresses(gradient, sums[0], sums[1]), torch.get_num_threads()
         )
@@ -54,7 +54,7 @@ def l1_ssim(
     """See ``kernels.operations.L1SSIM``; float32. Results do not depend on the number of threads.
 
     Raises:
-        BackendError: another precision, layout or size than the C++ computes with.
+        BackendError: a precision, layout or size that the C++ does not support.
     """
     return _L1SSIM.apply(image.contiguous(), Comparison.of(image, target, gains, biases, tiles))  # type: ignore[return-value]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sweep along rays in this package's C++; the contract is ``kernels.operations.Sweep``."""
+"""The plane sweep along rays in this package's C++; the contract is ``kernels.operations.Sweep``."""
 
 import ctypes
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's CUDA rasteriser behind this package's contract.
+"""gsplat's CUDA rasteriser with this package's contract.
 
-gsplat is imported only when a GPU is there: without one its import prints warnings and its functions fail late.
+gsplat is imported only if there is a GPU: without one its import prints warnings and its functions fail when called.
 """
 
 import importlib.util
@@ -17,7 +17,7 @@ from structgstream.kernels.reference_raster import boxes_reaching_tiles, detach_
 
 
 def cuda_reason() -> str | None:
-    """Why the back-end is not available on this machine, with the way to get it; None when it is."""
+    """Why the back-end is not available on this machine and how to get it; None if it is."""
     if not torch.cuda.is_available():
         built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
         return f"torch {torch.__version__}, {built}, sees no NVIDIA GPU; install a driver and a CUDA build of torch."
@@ -39,9 +39,9 @@ def rasterize(
 ) -> RasterOutput:
     """See ``kernels.operations.Rasterize``.
 
-    The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient means the
-    same on every back-end. ``trained`` saves nothing here: the gradients of the rest are computed and not used. With a
-    ``budget`` the host does not wait (``kernels.cuda_tiles``, Note [Pairs without waiting]).
+    The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient is the same
+    on every back-end. ``trained`` saves no work here: the other gradients are computed and dropped. With a ``budget``
+    there is no host synchronisation (``kernels.cuda_tiles``, Note [Pairs without waiting]).
     """
     from gsplat.cuda._wrapper import rasterize_to_pixels  # pyright: ignore[reportMissingImports]
 
@@ -100,8 +100,8 @@ def _pair_lists(
     tiles: TileSelection | None,
     budget: PairBudget | None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """As gsplat reads them: where each tile's list starts ``[1, rows, columns]``, the rows of the Gaussians, and which
-    tiles are drawn ``[1, rows, columns]``; with a ``budget`` there is a row of tiles more.
+    """gsplat's arguments: start of each tile's list ``[1, rows, columns]``, rows of the Gaussians, and mask of the
+    tiles to draw ``[1, rows, columns]``; with a ``budget`` there is an extra row of tiles.
     """
     masks = None if tiles is None else tiles.mask
     if budget is not None and means2d.shape[1]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam in torch's fused kernel, one launch a tensor; the contract is ``kernels.operations.AdamStep``."""
+"""Adam in torch's fused kernel, one launch per tensor; the contract is ``kernels.operations.AdamStep``."""
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ def adam_step(
     eps: float,
     rows: Tensor | None = None,
 ) -> None:
-    """See ``kernels.operations.AdamStep``; the host waits for nothing. ``rows`` go the reference's way."""
+    """See ``kernels.operations.AdamStep``; without host synchronisation. With ``rows`` the reference computes."""
     if rows is not None:
         reference_adam.adam_step(param, grad, exp_avg, exp_avg_sq, lr=lr, step=step, betas=betas, eps=eps, rows=rows)
         return
@@ -31,7 +31,7 @@ def adam_step(
         [exp_avg],
         [exp_avg_sq],
         [],
-        # A number is filled in by a kernel: nothing is copied from the host.
+        # torch.full is a kernel on the device: nothing is copied from the host.
         [torch.full((), float(step), device=param.device)],
         lr=lr,
         beta1=betas[0],

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors to Gaussians for a GPU, in shapes that do not depend on the numbers.
+"""Anchors to Gaussians on a GPU, with shapes that do not depend on data.
 
 Note [Shapes without waiting]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
-How many anchors a camera sees, and how many of their Gaussians have a positive opacity, is known on the GPU alone. To
-gather them the host must wait for that number. So all ``M * K`` Gaussians are generated here. Those that would not be
-drawn have opacity 0 and scale 0: every rasteriser leaves them out, the volume of their scales adds nothing, and no
-gradient passes through them. Whoever counts Gaussians counts ``opacities > 0``.
+The numbers of anchors in view and of Gaussians with positive opacity are known on the GPU only; to gather these rows
+the host would have to synchronise. So all ``M * K`` Gaussians are generated. Those that are not drawn have opacity 0
+and scale 0: every rasteriser skips them, they add nothing to the volume, and no gradient passes through them. The
+number of Gaussians is therefore the count of ``opacities > 0``.
 """
 
 import torch
@@ -30,7 +30,7 @@ def generate_structured(
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``: ``N = M * K`` Gaussians of all anchors.
 
-    Those with a positive opacity are the reference's; ``raw_opacities`` of anchors out of sight are -1 (Note [Shapes
+    Those with a positive opacity equal the reference's; ``raw_opacities`` of anchors out of view are -1 (Note [Shapes
     without waiting]).
     """
     positions, log_offset_scales, log_base_scales, offsets, features = anchors
@@ -57,8 +57,8 @@ def generate_structured(
 
 
 def _outputs(mlps: MLPWeights, inputs: Tensor) -> list[Tensor]:
-    """What each head says, before its activation."""
-    # One product for the three first layers: on a GPU small products cost their launch.
+    """Outputs of each head before activation."""
+    # One product for the three first layers, because the cost of small products is their launch.
     first, bias = torch.cat([head.w1 for head in mlps]), torch.cat([head.b1 for head in mlps])
     hidden = torch.relu(torch.nn.functional.linear(inputs, first, bias))
     parts = hidden.split([head.w1.shape[0] for head in mlps], dim=1)

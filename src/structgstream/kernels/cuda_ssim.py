@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """L1 and SSIM with their gradients in this package's CUDA; the contract is ``kernels.operations.L1SSIM``.
 
-Nothing here waits for the GPU: means and gradients stay where the pictures are.
+There is no host synchronisation: means and gradients stay on the device.
 """
 
 import ctypes
@@ -20,12 +20,12 @@ from structgstream.kernels.ssim_arguments import Comparison
 
 @dataclass(frozen=True)
 class LossLibrary:
-    """The interface of ``csrc/cuda/ssim.h`` and the device whose memory it reads.
+    """The compiled functions of ``csrc/cuda/ssim.h`` and the device type of their memory.
 
     Args:
-        library: what was compiled.
+        library: the loaded library.
         device_type: ``cuda``; ``cpu`` for the emulation that tests build.
-        stream: the queue that a tensor's work goes to, as an integer (0: the default one).
+        stream: gives a device's stream as an integer (0: the default stream).
     """
 
     library: ctypes.CDLL
@@ -36,15 +36,15 @@ class LossLibrary:
         declare(self.library, CUDA_PROTOTYPES)
 
     def call(self, name: str, *arguments: int | None, device: torch.device) -> None:
-        """Queue one function's work.
+        """Launch one function.
 
         Raises:
-            BackendError: CUDA refused it.
+            BackendError: CUDA reports an error.
         """
         error = getattr(self.library, name)(*arguments, self.stream(device))
         if error:
             said = self.library.sgs_cuda_error(error).decode()
-            raise BackendError(f"CUDA refused the loss kernels ({said}); take the cpu back-end, or report this.")
+            raise BackendError(f"The CUDA loss kernels failed ({said}); take the cpu back-end, or report this.")
 
 
 def cuda_stream(device: torch.device) -> int:
@@ -94,7 +94,7 @@ def l1_ssim(
     """See ``kernels.operations.L1SSIM``; float32. Results repeat bit for bit.
 
     Raises:
-        BackendError: another precision, layout, size or device than the kernels compute with.
+        BackendError: a precision, layout, size or device that the kernels do not support.
     """
     comparison = Comparison.of(image, target, gains, biases, tiles)
     mask = None if tiles is None else tiles.mask
@@ -104,5 +104,7 @@ def l1_ssim(
         if tensor is not None and tensor.device.type != library.device_type
     ]
     if elsewhere:
-        raise BackendError(f"The loss kernels read memory of the {library.device_type}, not of {elsewhere[0]}.")
+        raise BackendError(
+            f"The loss kernels read tensors on {library.device_type}, not on {elsewhere[0]}; move the tensors there."
+        )
     return _L1SSIM.apply(library, image.contiguous(), comparison)  # type: ignore[return-value]

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which Gaussians a tile draws, front to back, without asking the GPU how many there are.
+"""Depth-sorted lists of the Gaussians of each tile, with a fixed capacity and no host synchronisation.
 
 Note [Pairs without waiting]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~
-gsplat's rasteriser reads the number of (Gaussian, tile) pairs on the host before it makes the lists: once a picture the
-host waits for all that is queued. Here the lists have a fixed capacity. Unused places go to a row of tiles below the
-picture, which has no pixels; of pairs beyond the capacity the furthest are lost, and ``PairBudget`` remembers how many
-there should have been. Whoever sets a budget asks once, at the end of its work, and does the work again with a larger
-one if it was short: lists do not depend on the capacity, as long as it suffices.
+gsplat's rasteriser reads the number of (Gaussian, tile) pairs on the host before it makes the lists, which synchronises
+host and device once per picture. Here the lists have a fixed capacity. Unused places go to a row of tiles below the
+picture, which has no pixels; of pairs beyond the capacity the farthest are dropped, and ``PairBudget`` records how many
+were needed. The caller checks the budget once, at the end of its work, and repeats the work with a larger budget if it
+was too small. With sufficient capacity the lists do not depend on it.
 """
 
 import logging
@@ -25,11 +25,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PairBudget:
-    """Room for the pairs of a picture, and the most that one has needed (Note [Pairs without waiting]).
+    """Capacity of a picture's lists, and the largest number of pairs needed (Note [Pairs without waiting]).
 
     Args:
-        capacity: places.
-        needed: ``[]`` int64, on the device; grows in place.
+        capacity: pairs.
+        needed: ``[]`` int64 on the device, the maximum over pictures; updated in place.
     """
 
     capacity: int
@@ -37,11 +37,11 @@ class PairBudget:
 
     @classmethod
     def of(cls, capacity: int, device: torch.device) -> "PairBudget":
-        """A budget that nothing has needed yet."""
+        """A budget with ``needed`` 0."""
         return cls(capacity, torch.zeros((), dtype=torch.int64, device=device))
 
     def shortage(self) -> int:
-        """Places that were missing in the worst picture, 0 when all had room. The host waits for the device here."""
+        """Pairs beyond the capacity in the worst picture, 0 if none. Synchronises host and device."""
         return max(0, int(self.needed) - self.capacity)
 
 
@@ -49,14 +49,14 @@ Result = TypeVar("Result")
 
 
 def run_with_pair_budget(work: Callable[[PairBudget], Result], *, capacity: int, device: torch.device) -> Result:
-    """What ``work`` gives within a budget; done again with more room until nothing was short."""
+    """The result of ``work``, repeated with a larger budget until the capacity suffices."""
     while True:
         budget = PairBudget.of(capacity, device)
         result = work(budget)
         shortage = budget.shortage()
         if shortage == 0:
             return result
-        _log.info("Pictures needed room for %d pairs more than %d; the work is done again.", shortage, capacity)
+        _log.info("Pictures needed %d pairs more than the capacity of %d; the work is repeated.", shortage, capacity)
         capacity += 2 * shortage
 
 
@@ -64,9 +64,9 @@ class TileLists(NamedTuple):
     """Lists of Gaussians by tile, as gsplat reads them.
 
     Args:
-        starts: ``[rows + 1, columns]`` int32, where each tile's list starts; the last row is not of the picture.
+        starts: ``[rows + 1, columns]`` int32, start of each tile's list; the last row lies below the picture.
         ids: ``[capacity]`` int32, rows of the Gaussians.
-        needed: ``[]`` int64, pairs that there are.
+        needed: ``[]`` int64, number of pairs.
     """
 
     starts: Tensor
@@ -75,15 +75,15 @@ class TileLists(NamedTuple):
 
 
 def tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, *, width: int, height: int, capacity: int) -> TileLists:
-    """Lists of at most ``capacity`` pairs, in each tile by depth, equal depths by row.
+    """Lists of at most ``capacity`` pairs, sorted in each tile by depth, then by row.
 
     Args:
         means2d: ``[N, 2]`` pixels, ``N`` > 0.
-        radii: ``[N, 2]`` int32 pixels, 0 where a Gaussian is not drawn; its other values may be anything.
+        radii: ``[N, 2]`` int32 pixels, 0 for a Gaussian that is not drawn, whose other values are ignored.
         depths: ``[N]``.
         width: of the picture, pixels.
         height: of the picture, pixels.
-        capacity: places, see Note [Pairs without waiting].
+        capacity: pairs, see Note [Pairs without waiting].
     """
     rows, columns = tile_grid(width, height)
     with torch.no_grad():
@@ -107,10 +107,10 @@ def tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, *, width: int, he
         nth = places - (ends - counts)[owners]
         wide = across.clamp(min=1)[owners]
         tile = (low[owners, 1] + nth // wide) * columns + low[owners, 0] + nth % wide
-        # Spread out, so that no tile below the picture has a long list.
+        # Spread over the tiles below the picture, so that none has a long list.
         tile = torch.where(places < needed, tile, rows * columns + places % columns)
         short = torch.int16 if (rows + 1) * columns < torch.iinfo(torch.int16).max else torch.int32
-        sorted_tiles, by_tile = tile.to(short).sort(stable=True)  # Places are in order of depth, and stay so in a tile.
+        sorted_tiles, by_tile = tile.to(short).sort(stable=True)  # A stable sort keeps the order of depth in a tile.
         every = torch.arange((rows + 1) * columns, dtype=short, device=means2d.device)
         starts = torch.searchsorted(sorted_tiles, every, out_int32=True)
     return TileLists(starts.reshape(rows + 1, columns), order[owners[by_tile]].to(torch.int32), needed)

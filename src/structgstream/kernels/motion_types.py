@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the operations take and return that put things in place before a frame's first iteration."""
+"""Arguments and results of the operations that initialise a frame's motion and births: ``Lift`` and ``Sweep``."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,14 +8,14 @@ from torch import Tensor
 
 
 class ViewFlows(NamedTuple):
-    """Flow of ``E`` movers in ``V`` views.
+    """Optical flow of ``E`` movers (anchors and free Gaussians) in ``V`` views.
 
     Args:
-        weights: ``[V, E]`` W, pixels of flow.
+        weights: ``[V, E]`` W, sum of the mover's blending weights over the pixels with reliable flow.
         flows: ``[V, E, 2]`` f, pixels.
         viewmats: ``[V, 4, 4]``.
-        Ks: ``[V, 3, 3]`` of the pictures in whose pixels f is.
-        near: ``[V]`` distance along z under which a view sees nothing.
+        Ks: ``[V, 3, 3]``, for pictures of the size at which f is measured.
+        near: ``[V]`` distance of the near plane along z.
     """
 
     weights: Tensor
@@ -26,11 +26,11 @@ class ViewFlows(NamedTuple):
 
 
 class Neighbors(NamedTuple):
-    """Whose flow each of ``T`` targets follows.
+    """The movers whose flow determines each of ``T`` targets.
 
     Args:
         rows: ``[T, N]`` int64, rows of movers.
-        affinities: ``[T, N]`` g, how much each counts.
+        affinities: ``[T, N]`` g, their weights.
     """
 
     rows: Tensor
@@ -39,12 +39,12 @@ class Neighbors(NamedTuple):
 
 @dataclass(frozen=True)
 class Lifted:
-    """Flow as displacements in space.
+    """3D displacements fitted to optical flow.
 
     Args:
         displacements: ``[T, 3]``.
-        inlier_share: ``[T]`` weight of the flow that agrees within 1.5 pixels, against all of it; 0 without any.
-        agreeing_views: ``[T]`` int64, views of which more than ``share`` of the flow agrees.
+        inlier_share: ``[T]`` share of the flow's weight with a residual below 1.5 pixels; 0 without flow.
+        agreeing_views: ``[T]`` int64, number of views in which more than ``share`` of the weight are inliers.
     """
 
     displacements: Tensor
@@ -54,15 +54,15 @@ class Lifted:
 
 @dataclass(frozen=True)
 class SweepView:
-    """A view that rays are swept through.
+    """A view of the plane sweep.
 
     Args:
-        colors: ``[h, w, 3]`` of the picture, 0 ... 1, the same surface having one colour in all views.
-        missing: ``[h, w]`` how much of the surroundings of a pixel the rendering lacks, 0 ... 1.
-        depths: ``[h, w]`` of what is rendered, along z; infinite where nothing is.
+        colors: ``[h, w, 3]`` picture, 0 ... 1, colour-corrected so that views are comparable.
+        missing: ``[h, w]`` share of a pixel's neighbourhood with new content that the rendering lacks, 0 ... 1.
+        depths: ``[h, w]`` rendered depth along z; infinite where nothing is rendered.
         viewmat: ``[4, 4]``.
-        K: ``[3, 3]`` of a picture of that size.
-        near: nothing lies nearer.
+        K: ``[3, 3]`` for a picture of that size.
+        near: distance of the near plane along z.
     """
 
     colors: Tensor
@@ -78,8 +78,8 @@ class Swept:
     """The best point of each ray.
 
     Args:
-        depths: ``[P]`` along z; 0 for a ray without a point.
-        costs: ``[P]`` the least; infinite without one.
+        depths: ``[P]`` along z; 0 for a ray without a valid point.
+        costs: ``[P]`` least cost; infinite without a valid point.
     """
 
     depths: Tensor

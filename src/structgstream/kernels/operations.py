@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The operations of a back-end: each one's signature and contract, once for all back-ends.
+"""The operations of a back-end: their signatures and contracts, the same for all back-ends.
 
-A back-end gives a function for each (``kernels.backend``); the type checker refuses one with another signature.
+A back-end has one function for each (``kernels.backend``); the type checker rejects another signature.
 
 Note [Ownership]
 ~~~~~~~~~~~~~~~~
 The same on every back-end:
 
-- What is given is read, and neither changed nor kept as a result's memory, but for two. ``Rasterize`` draws into
-  ``onto``, which is the picture afterwards: the ``image`` that is returned lies in its memory, and the next drawing
-  onto it changes both. ``AdamStep`` moves ``param`` and its two moments in place.
-- What is returned belongs to the caller.
-- Cameras, targets, masks and numbers get no gradient; every other tensor gets one if it requires it. What counts or
-  chooses (``ids``, ``anchors``, ``raw_opacities``, ``radii``) has no graph.
+- Arguments are neither changed nor aliased by results, with two exceptions. ``Rasterize`` draws into ``onto`` in place:
+  the returned ``image`` shares its memory, so the next drawing into it changes both. ``AdamStep`` updates ``param`` and
+  its two moments in place.
+- Results belong to the caller.
+- Cameras, targets, masks and numbers get no gradient; every other tensor gets one if it requires it. ``ids``,
+  ``anchors``, ``raw_opacities`` and ``radii`` of results have no graph.
 - Indices are int64 and ascending, masks bool.
-- A kernel that needs more memory than there is raises ``OutOfMemoryError``; tensors that a back-end cannot compute with
-  raise ``BackendError``, which names a back-end that can.
+- If memory is short a kernel raises ``OutOfMemoryError``. Tensors that a back-end does not support raise
+  ``BackendError``, which names a back-end that supports them.
 """
 
 from collections.abc import Sequence
@@ -34,15 +34,15 @@ class Rasterize(Protocol):
     """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
     Args:
-        gaussians: what is drawn; their ids play no part.
-        viewport: where from, and the size of the picture.
+        gaussians: to draw; their ids are not read.
+        viewport: the camera.
         background: ``[3]``, black when None.
         screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
             gradient.
-        tiles: what to draw, everything when None. A Gaussian that reaches none of them counts as not drawn.
-        onto: ``[H, W, 3]`` without gradient, contiguous, given with ``tiles``: what the picture shows in the other
-            tiles, else zero. Drawn into (Note [Ownership]).
-        trained: only so many Gaussians, the first ones, get gradients; all when None.
+        tiles: the tiles to draw, all when None. A Gaussian that reaches none of them has radius 0.
+        onto: ``[H, W, 3]`` without gradient, contiguous, only with ``tiles``: the picture that is drawn into in
+            place (Note [Ownership]), so that the other tiles keep its pixels; they are zero when None.
+        trained: only the first ``trained`` Gaussians get gradients; all when None.
     """
 
     def __call__(
@@ -59,11 +59,11 @@ class Rasterize(Protocol):
 
 
 class BlendingWeights(Protocol):
-    """For each Gaussian the sum over the pixels of its blending weight times each map, ``[N, C]``, without graph.
+    """Sums ``[N, C]`` over the pixels of each Gaussian's blending weight times each map, without graph.
 
     Args:
-        gaussians: what is drawn; their colours and ids play no part.
-        viewport: where from.
+        gaussians: to draw; their colours and ids are not read.
+        viewport: the camera.
         maps: ``[H, W, C]`` of the viewport's size, C at least 1.
     """
 
@@ -74,13 +74,13 @@ class L1SSIM(Protocol):
     """Mean absolute difference and mean SSIM of ``gains * image + biases`` against ``target``.
 
     Args:
-        image: ``[H, W, 3]``; gradients flow here only.
+        image: ``[H, W, 3]``; the only argument with a gradient.
         target: ``[H, W, 3]``, float in [0, 1] or uint8.
         gains: ``[3]``; one when None.
         biases: ``[3]``; given with ``gains``.
-        tiles: pixels of the other tiles count as equal (difference 0, SSIM 1); they are still read, up to ten
-            pixels from the tiles that count. The gradient is that of the whole picture in the tiles, and zero in
-            the others.
+        tiles: if given, pixels of the other tiles count as equal (difference 0, SSIM 1); those up to ten pixels
+            from the selected tiles are still read. The gradient is that of the whole picture in the selected
+            tiles, and zero in the others.
     """
 
     def __call__(
@@ -95,7 +95,7 @@ class L1SSIM(Protocol):
 
 
 class Volume(Protocol):
-    """The product of the three scales ``[N, 3]``, summed, and the number of opacities ``[N]`` above zero.
+    """Sum of the products of the three scales ``[N, 3]``, and the number of opacities ``[N]`` above zero.
 
     Gradients flow to ``scales``.
     """
@@ -104,40 +104,41 @@ class Volume(Protocol):
 
 
 class Excess(Protocol):
-    """The parts of |offsets ``[M, K, 3]`` x exp(log_scales ``[M, 3]``)| beyond ``limit``, summed, ``[]``."""
+    """Sum ``[]`` of max(|offsets ``[M, K, 3]`` x exp(log_scales ``[M, 3]``)| - ``limit``, 0)."""
 
     def __call__(self, offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor: ...
 
 
 class ChangedPixels(Protocol):
-    """Mask ``[H, W]`` of what changed between two pictures ``[H, W, 3]`` uint8, and its surroundings.
+    """Dilated mask ``[H, W]`` of the pixels that changed between two pictures ``[H, W, 3]`` uint8.
 
-    A pixel has changed when the mean absolute difference of the 3 x 3 pixels around it (those that exist), over the
-    channels, exceeds ``threshold`` (in 0 ... 1). Sums are of integers: every back-end finds the same pixels.
+    A pixel has changed when the mean absolute difference over its 3 x 3 neighbourhood (inside the picture) and the
+    channels exceeds ``threshold``. Sums are of integers, so every back-end gives the same mask.
 
     Args:
         before: the camera's earlier picture.
         now: its later picture.
-        threshold: above the sensor's noise.
-        reach_pixels: pixels up to this far from a changed one, across or down, count as well.
+        threshold: in 0 ... 1, above the sensor's noise.
+        reach_pixels: half width of the square by which the mask is dilated, pixels.
     """
 
     def __call__(self, before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor: ...
 
 
 class Lift(Protocol):
-    """For each of ``T`` targets the displacement d that explains the flow of its neighbours best, in all views.
+    """For each of ``T`` targets the 3D displacement d that fits its neighbours' optical flow in all views.
 
-    Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views, with Geman-McClure weights
-    ``1 / (1 + r^2 / s^2)^2`` of falling scale s (``reference_lift.ROBUST_PIXELS``) after one round without them.
-    ``reg = (0.02 sum + 0.05)`` times the mean square of J, where ``sum`` is that of the present weights.
+    Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views by iteratively reweighted least
+    squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / s^2)^2`` of decreasing
+    scale s (``reference_lift.ROBUST_PIXELS``). ``reg`` is ``0.02 sum + 0.05`` times the mean square of J, with the
+    sum of the present weights.
 
     Args:
         centers: ``[E, 3]`` of movers.
         seen: W and f of the movers in each view.
         neighbours: of each target, and g.
-        priors: ``[T, 3]``.
-        share: of :class:`Lifted`.
+        priors: ``[T, 3]`` displacements.
+        share: as in :class:`Lifted`.
     """
 
     def __call__(
@@ -146,21 +147,21 @@ class Lift(Protocol):
 
 
 class Sweep(Protocol):
-    """For each ray the cheapest of ``planes`` depths, evenly spaced in inverse depth.
+    """For each ray the depth of least cost among ``planes`` candidates, evenly spaced in inverse depth.
 
-    A view supports a point that falls into its picture where something is missing and in front of what is rendered
-    there; it contradicts one where nothing is missing and the point would be seen. The cost is the mean difference
-    of colour over the supports (each at most 0.3), 0.15 times the share of contradictions, and 0.05 over the
-    supports. Of the depths around the cheapest that cost at most 0.01 more the middle one is taken.
+    A view supports a point that projects to a pixel with missing content, in front of the rendered depth; it
+    contradicts a point that projects to a pixel without missing content and would be visible. The cost is the mean
+    colour difference over the supports (each at most 0.3) + 0.15 times the share of contradictions + 0.05 / number
+    of supports. Of the run of depths around the minimum that cost at most 0.01 more, the middle one is taken.
 
     Args:
         views: all of them.
-        view_index: whose rays.
+        view_index: the view whose pixels' rays are swept.
         pixels: ``[P, 2]`` int64, column and row.
-        farthest: ``[P]`` depth at which each ray ends; it begins at the view's near plane.
-        planes: points on a ray.
-        least_supports: a point needs so many ...
-        most_contradictions: ... and at most this share of contradictions among both.
+        farthest: ``[P]`` depth at which each ray ends; it starts at the view's near plane.
+        planes: candidate depths per ray.
+        least_supports: number of supports that a valid point needs.
+        most_contradictions: largest share of contradictions among supports and contradictions of a valid point.
     """
 
     def __call__(
@@ -177,19 +178,18 @@ class Sweep(Protocol):
 
 
 class GenerateStructured(Protocol):
-    """The Gaussians of the anchors that a camera may see (paper, equations for mu' and Sigma').
+    """The Gaussians of the anchors in a camera's view (paper, equations for mu' and Sigma').
 
-    Opacity is tanh and used as it is, so that only what is positive is drawn; the scale is the base times a
-    sigmoid. Which anchors are looked at changes the cost of a rendering and never its pixels: an anchor counts as a
-    ball that holds all its Gaussians.
+    Opacity is the tanh output; only positive ones are drawn. The scale is the base scale times a sigmoid. Culling
+    changes the cost of a rendering, never its pixels: it tests a ball that contains all Gaussians of an anchor.
 
     Args:
         anchors: all of the scene's.
-        mlps: the three heads; inputs are the feature, the direction (3) and, if asked for, the distance (1).
-        viewport: where from.
-        distance_input: whether the heads see the distance.
-        tiles: only what reaches one of these tiles counts.
-        seen_from: ``[3]``, whence direction and distance are taken; the viewport's centre when None.
+        mlps: the three heads; inputs are the feature (D), the direction (3) and optionally the distance (1).
+        viewport: the camera.
+        distance_input: whether the distance is an input of the heads.
+        tiles: if given, only anchors that reach one of these tiles.
+        seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
     """
 
     def __call__(
@@ -205,7 +205,7 @@ class GenerateStructured(Protocol):
 
 
 class AdamStep(Protocol):
-    """Move ``param`` in place by one step, as ``torch.optim.Adam`` does (Note [Ownership]).
+    """Update ``param`` in place by one step of ``torch.optim.Adam`` (Note [Ownership]).
 
     Args:
         param: any shape.
@@ -216,7 +216,7 @@ class AdamStep(Protocol):
         step: number of this step, from 1.
         betas: decay of the moments.
         eps: added to the root of the corrected second moment.
-        rows: ``[r]`` int64, none twice; only these rows (first dimension) are touched. None: all.
+        rows: ``[r]`` int64, unique; only these rows (first dimension) are updated. None: all.
     """
 
     def __call__(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The functions of csrc/include/structgstream.h and csrc/cuda/ssim.h as ctypes must know them.
+"""ctypes prototypes of the functions of csrc/include/structgstream.h and csrc/cuda/ssim.h.
 
-ctypes then takes plain numbers and addresses, and refuses a call with other arguments. A letter stands for a type of C:
-``p`` any pointer, ``i`` int, ``l`` int64_t, ``f`` float, ``d`` double, ``v`` void, ``s`` a string of the library.
+With them ctypes converts plain numbers and addresses, and rejects a call with other arguments. A letter stands for a C
+type: ``p`` any pointer, ``i`` int, ``l`` int64_t, ``f`` float, ``d`` double, ``v`` void, ``s`` a static string.
 """
 
 import ctypes
@@ -48,13 +48,13 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_code_residuals": ("i", "ppilippp"),
     "sgs_code_numbers": ("i", "ppilpip"),
 }
-"""By function of the library for the processor: its result, and its arguments in order."""
+"""For each function of the CPU library: result type, argument types in order."""
 CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
     "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
     "sgs_cuda_error": ("s", "i"),
 }
-"""The same of the library for a GPU."""
+"""The same for the CUDA library."""
 
 
 def declare(library: ctypes.CDLL, prototypes: Mapping[str, tuple[str, str]]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What rasterisers share: tiles, and what every one returns."""
+"""Types that all rasterisers share: selections of tiles, and the result."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 TILE_PIXELS = 16
-"""Side of a tile: the unit in which a part of a picture can be asked for."""
+"""Side of a tile, pixels; parts of a picture are selected by tile."""
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:
-    """Rows and columns of tiles of a picture; the last ones may be cut off."""
+    """Number of rows and columns of tiles of a picture; the last ones may be partial."""
     return -(-height // TILE_PIXELS), -(-width // TILE_PIXELS)
 
 
 @dataclass(frozen=True)
 class TileSelection:
-    """Some tiles of a picture.
+    """A selection of a picture's tiles.
 
     Args:
         mask: ``[rows, columns]`` bool.
@@ -34,12 +34,12 @@ class TileSelection:
         assert self.mask.shape == tile_grid(self.width, self.height), (self.mask.shape, self.width, self.height)
 
     def pixels(self) -> Tensor:
-        """The pixels of the tiles as a mask ``[H, W]``."""
+        """Mask ``[H, W]`` of the pixels in the selected tiles."""
         rows = self.mask.repeat_interleave(TILE_PIXELS, 0)
         return rows.repeat_interleave(TILE_PIXELS, 1)[: self.height, : self.width]
 
     def count_pixels(self) -> int:
-        """Number of pixels in the tiles."""
+        """Number of pixels in the selected tiles."""
         rows, columns = self.mask.shape
         heights = self.mask.new_full((rows,), TILE_PIXELS, dtype=torch.int64)
         widths = self.mask.new_full((columns,), TILE_PIXELS, dtype=torch.int64)
@@ -53,8 +53,8 @@ class RasterOutput:
     """One rendering.
 
     Args:
-        image: ``[H, W, 3]``, not clamped; zero (or what was there) in tiles that were not asked for.
-        alpha: ``[H, W]`` coverage in [0, 1]; zero in tiles that were not asked for.
+        image: ``[H, W, 3]``, not clamped; in tiles that were not selected zero, or the pixels of ``onto``.
+        alpha: ``[H, W]`` coverage in [0, 1]; zero in tiles that were not selected.
         radii: ``[N]`` float32 pixels, 0 where a Gaussian was not drawn.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors to drawable Gaussians in pure torch: the oracle of the culling and of the generation."""
+"""Anchors to drawable Gaussians in pure torch: the oracle of culling and generation."""
 
 import torch
 from torch import Tensor
@@ -10,9 +10,9 @@ from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights,
 from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection
 
 BALL_DEVIATIONS = 3.4
-"""A Gaussian ends within so many standard deviations: alpha = 1/255 is reached before 3.33 at any opacity."""
+"""Radius of a Gaussian in standard deviations: alpha falls below 1/255 before 3.33 at any opacity."""
 BOX_MARGIN_PIXELS = 2.0
-"""The rasteriser's low-pass makes the smallest Gaussian this wide."""
+"""Margin for the rasteriser's low-pass filter, which widens the smallest Gaussian to this."""
 
 
 def visible_anchor_mask(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
@@ -32,7 +32,7 @@ def visible_anchor_mask(anchors: Anchors, viewport: Viewport, tiles: TileSelecti
             at_high = above / torch.where(above < 0, furthest, closest)
             low.append(focal * at_low + center - BOX_MARGIN_PIXELS)
             high.append(focal * at_high + center + BOX_MARGIN_PIXELS)
-            # A ball as near as its radius has no box: it counts unless it lies beyond a side of the frustum.
+            # A ball that contains the camera plane has no box: it counts unless it lies outside a frustum side.
             around = closest <= 0
             for sign, edge in ((1.0, center), (-1.0, size[axis] - center)):
                 slope = (edge + BOX_MARGIN_PIXELS) / focal
@@ -47,7 +47,7 @@ def visible_anchor_mask(anchors: Anchors, viewport: Viewport, tiles: TileSelecti
 
 
 def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) -> Tensor:
-    """Mask ``[M]`` of the boxes of pixels ``low`` ... ``high`` ``[M, 2]`` that share a tile with a mask of tiles."""
+    """Mask ``[M]`` of the pixel boxes ``low`` ... ``high`` ``[M, 2]`` that overlap a tile of the mask ``tiles``."""
     covered = torch.zeros(tiles.shape[0] + 1, tiles.shape[1] + 1, dtype=torch.int64, device=tiles.device)
     covered[1:, 1:] = tiles.long().cumsum(0).cumsum(1)
     x0, y0 = (low[:, axis].clamp(0, size[axis] - 1).long() // TILE_PIXELS for axis in range(2))
@@ -87,7 +87,7 @@ def activate_anchors(
     positions, log_offset_scales, log_base_scales, offsets, features = anchors
     k = offsets.shape[1]
     to_anchor = positions[visible] - center
-    distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)  # An anchor may sit in the camera.
+    distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)  # An anchor may lie at the camera's centre.
     parts = [features[visible], to_anchor / distance]
     inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
     opacity = torch.tanh(_head(mlps.opacity, inputs))  # [m, K]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far Gaussians stray from their anchors, in pure torch: the oracle."""
+"""The loss on Gaussians' distances to their anchors in pure torch: the oracle."""
 
 import torch
 from torch import Tensor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Displacements in space from flow in pictures, in pure torch: the oracle."""
+"""3D displacements from optical flow in pure torch: the oracle."""
 
 import torch
 from torch import Tensor
@@ -7,14 +7,13 @@ from torch import Tensor
 from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 
 ROBUST_PIXELS = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
-"""Scale of the Geman-McClure weights in each round after the first, which trusts everything."""
+"""Scale of the Geman-McClure weights in each round after the first, which has none."""
 INLIER_PIXELS = 1.5
 PRIOR_SHARE, PRIOR_FLOOR = 0.02, 0.05
 
 
 def projection_jacobians(centers: Tensor, viewmats: Tensor, Ks: Tensor, near: Tensor) -> Tensor:
-    """Pixels by which each camera sees each point move for a unit of displacement, ``[V, E, 2, 3]``; zero before
-    the near plane."""
+    """Jacobians ``[V, E, 2, 3]`` of each point's projection, pixels per unit; zero in front of the near plane."""
     points = torch.einsum("vij,ej->vei", viewmats[:, :3, :3], centers) + viewmats[:, None, :3, 3]
     x, y, z = points.unbind(-1)
     front = z > near[:, None]
@@ -54,5 +53,5 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
 
 
 def _squared(J: Tensor, f: Tensor, d: Tensor) -> Tensor:
-    """Squared length in pixels of what a displacement ``[T, 3]`` leaves of the flow, ``[V, T, N]``."""
+    """Squared residual of the flow under a displacement ``[T, 3]``, ``[V, T, N]`` square pixels."""
     return (torch.einsum("vtnki,ti->vtnk", J, d) - f).square().sum(-1)

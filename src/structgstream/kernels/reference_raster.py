@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The oracle: EWA splatting in pure torch, differentiable by autograd, at any floating-point precision.
+"""EWA splatting in pure torch, differentiable by autograd, at any floating-point precision: the oracle.
 
 Definition (as gsplat 1.5): perspective projection of the covariance with the point clamped to 1.3 times the field of
 view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to
@@ -127,7 +127,7 @@ def rasterize(
 def detach_untrained(
     gaussians: Gaussians, screen_offsets: Tensor | None, trained: int | None
 ) -> tuple[Gaussians, Tensor | None]:
-    """The same, but that rows from ``trained`` on have no graph."""
+    """The arguments with rows from ``trained`` on detached."""
     if trained is None:
         return gaussians, screen_offsets
     values = {
@@ -142,7 +142,7 @@ def detach_untrained(
 def restrict_to_tiles(
     image: Tensor, alpha: Tensor, radii: Tensor, tiles: TileSelection | None, onto: Tensor | None
 ) -> RasterOutput:
-    """What was drawn of a whole picture, kept in ``tiles`` alone and drawn ``onto`` the rest."""
+    """Restricts a full rendering to ``tiles``; other tiles keep ``onto``, or are zero."""
     if tiles is None:
         assert onto is None, "a picture to draw onto needs tiles"
         return RasterOutput(image, alpha, radii)
@@ -150,15 +150,15 @@ def restrict_to_tiles(
     alpha = torch.where(inside, alpha, 0.0)
     if onto is None:
         return RasterOutput(torch.where(inside[..., None], image, 0.0), alpha, radii)
-    onto = onto.detach()  # An alias: autograd makes the result of what it is given.
+    onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
     return RasterOutput(onto.copy_(torch.where(inside[..., None], image, onto)), alpha, radii)
 
 
 def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
     """See ``kernels.operations.BlendingWeights``.
 
-    A colour's gradient is the sum of its Gaussian's weights times the picture's gradient, so any rasteriser can tell,
-    for three maps with each gradient.
+    The gradient of a Gaussian's colour is the sum of its blending weights times the picture's gradient, so any
+    rasteriser gives the sums of three maps per backward pass.
     """
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
@@ -177,7 +177,7 @@ def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewp
 
 
 def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:
-    """Mask ``[n]`` of the boxes (pixels) with the centre of a pixel in one of ``tiles``, or without any centre."""
+    """Mask ``[n]`` of the boxes (pixels) that contain a pixel centre of ``tiles``, or no pixel centre at all."""
     width, height = tiles.width, tiles.height
     first, last = (low - 0.5 - BOX_SLACK_PIXELS).ceil().long(), (high + 0.5 + BOX_SLACK_PIXELS).floor().long()
     x0, y0 = first[:, 0].clamp(0, width), first[:, 1].clamp(0, height)
@@ -205,7 +205,7 @@ def _tile(
     alpha = opacities[drawn, None, None] * power.exp()
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0.0)
     after = (1.0 - alpha).cumprod(0)
-    # Transmittance only falls, so cutting where it would reach the limit is the same as stopping there.
+    # Transmittance decreases monotonically, so masking below the limit equals stopping there.
     blended = after.detach() > MIN_TRANSMITTANCE
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     weights = torch.where(blended, alpha * before, 0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Along each ray the depth at which several views see the same new thing, in pure torch: the oracle."""
+"""Plane sweep for new content: each ray's depth by agreement between views, in pure torch: the oracle."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,9 @@ from torch import Tensor
 from structgstream.kernels.motion_types import SweepView, Swept
 
 SUPPORTING, CONTRADICTING = 0.3, 0.05
-"""A view supports a point where so much of it is missing from the rendering, and contradicts one where less is."""
+"""A view supports a point at pixels with ``missing`` above the first, and contradicts it below the second."""
 FRONT_SHARE = 1.03
-"""A point counts as in front of what is rendered up to so many times its depth."""
+"""A point counts as in front of the rendered depth up to this multiple of it."""
 MOST_DIFFERENCE = 0.3
 MISS_COST, LONELY_COST = 0.15, 0.05
 EQUAL_COST = 0.01
@@ -66,8 +66,8 @@ def sweep(
 
 
 def _middle_of_cheapest(costs: Tensor) -> tuple[Tensor, Tensor]:
-    """The least of each row's costs ``[P, planes]``, ``[P]``, and the plane ``[P, 1]`` in the middle of those around it
-    that are as good: on a plain surface a stretch of the ray is."""
+    """Least cost ``[P]`` of each row of ``costs`` ``[P, planes]``, and the middle plane ``[P, 1]`` of the run of nearly
+    equal costs around it, as on textureless surfaces."""
     planes = costs.shape[1]
     best = costs.argmin(1, keepdim=True)
     least = costs.gather(1, best)

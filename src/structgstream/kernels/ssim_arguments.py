@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What this package's loss kernels, of both libraries, compare a picture with: checked, and in the order of their
-arguments."""
+"""Checks and orders the arguments of the CPU and CUDA loss kernels."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ from structgstream.kernels.raster_types import TileSelection
 
 @dataclass(frozen=True)
 class Comparison:
-    """The constants of ``kernels.operations.L1SSIM``, contiguous, the correction in float32."""
+    """The arguments of ``kernels.operations.L1SSIM`` other than ``image``: contiguous, gains and biases float32."""
 
     target: Tensor
     gains: Tensor | None
@@ -25,10 +24,10 @@ class Comparison:
     def of(
         cls, image: Tensor, target: Tensor, gains: Tensor | None, biases: Tensor | None, tiles: TileSelection | None
     ) -> "Comparison":
-        """What ``image`` can be compared with.
+        """The checked arguments.
 
         Raises:
-            BackendError: another precision, layout or size than the kernels compute with.
+            BackendError: a precision, layout or size that the kernels do not support.
         """
         if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
             raise BackendError(
@@ -48,8 +47,8 @@ class Comparison:
         return cls(target.contiguous(), gains, biases, tiles)
 
     def arguments(self, image: Tensor) -> list[int | None]:
-        """The first arguments of a loss kernel; they are valid while ``image`` and this live."""
+        """The first arguments of a loss kernel; addresses are valid while ``image`` and this object exist."""
         is_bytes = self.target.dtype == torch.uint8
         targets = (None, self.target) if is_bytes else (self.target, None)
-        mask = None if self.tiles is None else self.tiles.mask  # A byte for each tile.
+        mask = None if self.tiles is None else self.tiles.mask  # One byte per tile.
         return [*addresses(image, *targets), *image.shape[:2], *addresses(self.gains, self.biases, mask)]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The built player: one JavaScript module, made from ``viewer/packages`` by ``scripts/build-player``.
 
-It lies in the repository and in the wheel, so that nobody who installs the package needs Node. A test builds it again
-and compares.
+It is part of the repository and the wheel, so that installing the package does not need Node. A test rebuilds and
+compares it.
 """
 
 from importlib.resources import files

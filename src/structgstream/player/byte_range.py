@@ -7,20 +7,19 @@ _ONE_RANGE = re.compile(r"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.ASCII | re.IGNO
 
 
 class UnsatisfiableRange(Exception):
-    """The range begins behind the last byte."""
+    """The range starts after the last byte."""
 
 
 def requested_range(header: str | None, size_bytes: int) -> range | None:
-    """Which bytes of ``size_bytes`` a ``Range`` header asks for.
+    """The bytes of ``size_bytes`` that a ``Range`` header requests.
 
-    Several ranges at once, other units and what is not written as the RFC says count as no range: a server may always
-    answer with everything.
+    Multiple ranges, other units and malformed headers count as no range; a server may always answer with all bytes.
 
     Returns:
         offsets of the first byte and the one after the last; None for all.
 
     Raises:
-        UnsatisfiableRange: none of the bytes is there.
+        UnsatisfiableRange: none of the bytes exists.
     """
     found = _ONE_RANGE.fullmatch(header) if header else None
     if found is None or not any(found.groups()):

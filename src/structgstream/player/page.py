@@ -3,10 +3,9 @@
 
 Note [Nothing from elsewhere]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
-Every page states a Content-Security-Policy that lets it load from its own origin only, and the single page from
-nowhere at all. So no stream, whatever it holds, and no link to the page, whatever its parameters say, makes a browser
-ask a third party for anything. Workers are blobs that the module makes of itself; styles are inline, as the element's
-shadow root holds them.
+Every page has a Content-Security-Policy that allows loading from its own origin only, the single page from nowhere. So
+neither the content of a stream nor the parameters of a link can make a browser contact a third party. Workers are blobs
+of the module itself; styles are inline, because they are in the element's shadow root.
 """
 
 import base64
@@ -20,7 +19,7 @@ from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import PlayerError
 
 MOST_PAGE_STREAM_BYTES: Final = 256 * 10**6
-"""Of a stream in a page: browsers hold no string of twice this length."""
+"""Largest stream in a page: browsers cannot hold a string of twice this length."""
 
 _POLICY: Final = {
     "default-src": "'none'",
@@ -44,7 +43,7 @@ def policy(**sources: str) -> str:
 
 
 SERVED_POLICY: Final = {"script_src": "'self' blob:", "connect_src": "'self' blob:"}
-"""What pages with the module beside them add: it, and the stream."""
+"""Further directives of pages that load the module and the stream from their origin."""
 
 
 def linked_page(title: str, *, stream: str, attributes: Mapping[str, str] | None = None) -> str:
@@ -87,9 +86,10 @@ def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
 
 
 def inline_module(source: str) -> str:
-    """A module as the content of a ``script`` element, which ends at the first ``</script`` whatever surrounds it.
+    """A module escaped for a ``script`` element, which ends at the first ``</script`` in any context.
 
-    In JavaScript these letters occur in texts and patterns only, where a backslash before the stroke changes nothing.
+    In JavaScript these letters occur only in strings and regular expressions, where a backslash before the slash has no
+    effect.
     """
     # After <!-- a parser takes <script> and </script> for a nested pair. Our bundle never writes it.
     assert "<!--" not in source, "an HTML comment cannot be inlined"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the player's server on the loopback address, and opens a browser where there is a screen."""
+"""Runs the player's server on the loopback address, and opens a browser if there is a screen."""
 
 import os
 import socket
@@ -20,9 +20,9 @@ def run(app: Starlette, *, port: int = 0, on_start: Callable[[str], None]) -> No
     """Serves ``app`` until Ctrl-C.
 
     Args:
-        app: what answers.
-        port: 0 takes one that is free.
-        on_start: called with the address once the port is ours.
+        app: the application.
+        port: 0 takes a free one.
+        on_start: called with the address once the port is bound.
 
     Raises:
         PlayerError: the port is taken, or may not be used.
@@ -30,13 +30,13 @@ def run(app: Starlette, *, port: int = 0, on_start: Callable[[str], None]) -> No
     with bound(port) as listening:
         config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
         on_start(f"http://{ADDRESS}:{listening.getsockname()[1]}/")
-        # uvicorn ends tidily on Ctrl-C and then passes it on.
+        # uvicorn shuts down on Ctrl-C and then raises it again.
         with suppress(KeyboardInterrupt):
             uvicorn.Server(config).run(sockets=[listening])
 
 
 def bound(port: int) -> socket.socket:
-    """A socket that accepts connections from this machine already, so that a browser may be opened at once.
+    """A listening socket on the loopback address, so that a browser can be opened at once.
 
     Raises:
         PlayerError: the port is taken, or may not be used.
@@ -56,7 +56,7 @@ def bound(port: int) -> socket.socket:
 
 
 def open_browser(address: str, *, environ: Mapping[str, str] = os.environ) -> bool:
-    """Opens ``address``; False where there is no screen, as a browser for terminals would take ours."""
+    """Opens ``address``; False without a screen, where a text browser would take over the terminal."""
     graphical = sys.platform in ("darwin", "win32") or any(
         environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     )

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The application behind ``structgstream play``: page, player, stream, and the cameras' own pictures.
+"""The web application of ``structgstream play``: page, player, stream, and the capture's pictures.
 
 Note [Only this machine]
 ~~~~~~~~~~~~~~~~~~~~~~~~
-The server listens on the loopback address, and so any page that a browser has open can reach it. Three things keep
-others out: a request whose Host is not a name of this machine is refused, so that no name that resolves to 127.0.0.1
-makes a foreign page same-origin (DNS rebinding); no answer allows another origin to read it; and addresses name cameras
-and frames, never files.
+The server listens on the loopback address, so any page open in a browser can reach it. Three measures protect it:
+requests whose Host is not a name of this machine are refused, against DNS rebinding; no response allows another origin
+to read it; and URLs name cameras and frames, never files.
 """
 
 from collections.abc import Iterator, Mapping
@@ -28,7 +27,7 @@ from structgstream.player.stream_file import StreamFile, pieces
 from structgstream.player.truth import Truth
 
 LOOPBACK_NAMES = ("127.0.0.1", "localhost")
-# A file that grows has another state with each request, so nothing is kept and nothing has a validator.
+# A growing file may differ in each response, so responses are not cached and have no validators.
 _HEADERS: Mapping[str, str] = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -38,11 +37,11 @@ _HEADERS: Mapping[str, str] = {
 
 
 def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
-    """The application; every answer is made when it is asked for, so the file may grow meanwhile.
+    """The application; each request opens the file anew, so it may grow meanwhile.
 
     Args:
         stream: the file to play.
-        truth: pictures to compare with, where the capture is at hand.
+        truth: the capture's pictures to compare with, or None.
 
     Raises:
         PlayerError: the installation lacks the player.
@@ -96,14 +95,14 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
 
 
 def _part_of(stream: StreamFile, request: Request) -> Response:
-    """The bytes of a stream that a request asks for, of those that are there now."""
+    """The response to a request for bytes of the stream, at its present length."""
     try:
         data = stream.opened()
     except StreamError as error:
         return _gone(error)
     size = len(data)
     headers = {**_HEADERS, "Accept-Ranges": "bytes"}
-    # If-Range asks for a range of a version that is known by a validator, and none was ever given.
+    # If-Range refers to a validator, and no response has one.
     header = None if "if-range" in request.headers else request.headers.get("range")
     try:
         asked = requested_range(header, size)
@@ -122,7 +121,7 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
 
 
 def _closing(data: FileBytes, wanted: range) -> Iterator[bytes | memoryview]:
-    with data, suppress(StreamError):  # A file that has become shorter meanwhile ends the answer early.
+    with data, suppress(StreamError):  # If the file becomes shorter meanwhile, the response ends early.
         yield from pieces(data, wanted)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream file that may still be growing, as a server sees it. It knows nothing of what is in the packets."""
+"""A possibly growing stream file for the server, which does not decode packets."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ PIECE_BYTES = 256 * 1024
 
 @dataclass(frozen=True)
 class StreamFile:
-    """The file at ``path``; it is opened for each question, as it may be replaced at any time."""
+    """The file at ``path``; every method opens it anew, because it may be replaced at any time."""
 
     path: Path
 
     def opened(self) -> FileBytes:
-        """The file as long as it is now.
+        """The open file at its present length.
 
         Raises:
             StreamError: it cannot be read.
@@ -34,7 +34,7 @@ class StreamFile:
         return FileBytes(self.path)
 
     def state(self) -> tuple[int, bool]:
-        """Bytes of the file, and whether its end has been written.
+        """Length of the file in bytes, and whether it is complete (has its index).
 
         Raises:
             StreamError: it cannot be read.
@@ -43,15 +43,15 @@ class StreamFile:
             return len(data), footer_offset(data) is not None
 
     def check(self) -> None:
-        """Refuse what a player cannot show anything of, as :func:`check_has_header`."""
+        """Check that the file has a whole header, see :func:`check_has_header`."""
         with self.opened() as data:
             check_has_header(data, str(self.path))
 
     def has_header(self) -> bool:
-        """Whether the file is there and holds a whole header.
+        """Whether the file exists and has a whole header.
 
         Raises:
-            StreamError: what it holds is no stream, or one of another version.
+            StreamError: it is no stream, or of another version.
         """
         if not self.path.exists():
             return False
@@ -63,20 +63,20 @@ class StreamFile:
 
 
 def check_has_header(data: ByteSource, name: str) -> None:
-    """Refuse what a player cannot show anything of.
+    """Check that a stream has a whole header.
 
     Raises:
-        StreamError: it is empty, no stream, of another version, or cut within its header.
+        StreamError: it is empty, no stream, of another version, or truncated within its header.
     """
     if not len(data):
         raise StreamError(f"{name} is empty; expected a stream made by structgstream reconstruct.")
     check_prefix(data, name)
     head = read_head(data, PREFIX.size)
     if head is None or head[0] != RecordType.INIT:
-        raise StreamError(f"Nothing of {name} can be shown: {incomplete_reason(data, PREFIX.size)}.")
+        raise StreamError(f"No frame of {name} can be decoded: {incomplete_reason(data, PREFIX.size)}.")
 
 
 def pieces(data: ByteSource, wanted: range) -> Iterator[bytes | memoryview]:
-    """The bytes ``wanted`` of ``data``, a piece at a time."""
+    """The bytes ``wanted`` of ``data``, in pieces."""
     for start in range(wanted.start, wanted.stop, PIECE_BYTES):
         yield data[start : min(start + PIECE_BYTES, wanted.stop)]

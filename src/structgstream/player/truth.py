@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the cameras took, as JPEG, for the player to show beside the reconstruction."""
+"""The capture's pictures as JPEG, for the player to show beside the reconstruction."""
 
 import threading
 from collections import OrderedDict
@@ -12,22 +12,21 @@ from structgstream.frames import MultiViewFrame
 
 JPEG_QUALITY = 95
 MOST_CACHED_BYTES = 64 * 10**6
-MOST_SKIPPED = 8  # frames decoded in vain cost less than opening the videos again and seeking
+MOST_SKIPPED = 8  # decoding and skipping up to this many frames costs less than seeking in reopened videos
 
 
 class Truth:
     """Pictures of a capture, one camera and frame at a time.
 
-    They are decoded when they are asked for and kept within a bound. While one camera is asked for frame after frame,
-    its video goes on being decoded where it stands.
+    They are decoded on demand and cached. Consecutive frames of one camera are decoded without seeking.
 
     Args:
         source: the part of the capture that the stream was made from, at the stream's size.
         cameras: names of the cameras that both have.
-        most_cached_bytes: of encoded pictures to keep.
+        most_cached_bytes: size of the cache of encoded pictures.
 
     Raises:
-        MissingExtraError: there is nothing to encode with.
+        MissingExtraError: OpenCV, which encodes, is not installed.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class Truth:
         self.cached_bytes = 0
 
     def jpeg(self, camera: str, frame: int) -> bytes | None:
-        """The picture of a camera; None when there is no such camera or frame.
+        """A camera's picture as JPEG; None if there is no such camera or frame.
 
         Raises:
             CaptureError: the picture cannot be read.
@@ -68,7 +67,7 @@ class Truth:
     def _encoded(self, camera: str, frame: int) -> bytes:
         image = self._at(camera, frame).images[camera]
         cv2 = self._cv2
-        # Colour at full resolution: people compare pixels.
+        # No chroma subsampling, because pixels are compared.
         sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
         wanted = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, *sampling]
         whole, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), wanted)
@@ -76,7 +75,7 @@ class Truth:
         return data.tobytes()
 
     def _at(self, camera: str, frame: int) -> MultiViewFrame:
-        standing, self._open = self._open, None  # A decoder that raised is not asked again.
+        standing, self._open = self._open, None  # A decoder that raised is not used again.
         if standing is not None and standing[0] == camera and 0 <= frame - standing[1] <= MOST_SKIPPED:
             frames = standing[2]
         else:

@@ -11,14 +11,14 @@ from structgstream.player.stream_file import StreamFile, check_has_header, piece
 
 
 def write_page(path: Path, stream: StreamFile) -> int:
-    """Writes one HTML page that holds the player and the stream, as long as it is now.
+    """Writes one HTML page that contains the player and the stream at its present length.
 
     Returns:
         Bytes of the page.
 
     Raises:
         PlayerError: the stream is too long for a page, or the installation lacks the player.
-        StreamError: nothing of the stream can be shown.
+        StreamError: no frame of the stream can be decoded.
         StorageError: the page cannot be written.
     """
     with stream.opened() as data:
@@ -36,7 +36,7 @@ def write_site(folder: Path, stream: StreamFile) -> int:
 
     Raises:
         PlayerError: the installation lacks the player.
-        StreamError: nothing of the stream can be shown.
+        StreamError: no frame of the stream can be decoded.
         StorageError: a file cannot be written, or would replace the stream itself.
     """
     stream.check()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Dynamic anchor points: the structured half of a scene (paper, section Structured 3DGs)."""
+"""Anchor points, the structured part of a scene (paper, section Structured 3DGs)."""
 
 from dataclasses import dataclass, fields
 
@@ -8,22 +8,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class AnchorCloud:
-    """``M`` anchors, each of which carries ``K`` structured Gaussians.
+    """``M`` anchors with ``K`` structured Gaussians each.
 
     Args:
         positions: ``[M, 3]`` the paper's x_v, scene units.
         log_offset_scales: ``[M, 3]`` log of the paper's l_v, which multiplies the offsets. See Note [Two scales].
-        log_base_scales: ``[M, 3]`` log of the largest scale that the covariance head may give.
+        log_base_scales: ``[M, 3]`` log of the upper bound of the Gaussians' scales.
         offsets: ``[M, K, 3]`` the paper's O_v, in units of l_v.
         features: ``[M, D]`` the paper's f_v.
-        appearance: ``[M, R]`` how far the features have left f_v since frame 0, along the rows of the scene's
-            ``appearance_basis``; None unless a configuration lets appearance change.
+        appearance: ``[M, R]`` change of the features since frame 0, as coefficients of the rows of the scene's
+            ``appearance_basis``; None unless the configuration makes appearance dynamic.
 
     Note [Two scales]
     ~~~~~~~~~~~~~~~~~
-    The paper's l_v has three numbers; Scaffold-GS, on which it builds, keeps six an anchor: three multiply offsets,
-    three bound the Gaussians' scales. l_v is read as the first three (its only equation multiplies offsets by it); the
-    others are ``log_base_scales``, static unless a configuration puts them in the dynamic set.
+    The paper's l_v has three components per anchor. Scaffold-GS, on which it builds, has six: three multiply the
+    offsets, three bound the Gaussians' scales. We take l_v as the first three, because its only equation multiplies
+    offsets by it. The others are ``log_base_scales``, static unless a configuration adds them to the dynamic set.
     """
 
     positions: Tensor
@@ -38,15 +38,15 @@ class AnchorCloud:
 
     @property
     def offsets_per_anchor(self) -> int:
-        """The paper's k."""
+        """The paper's k, offsets (and so Gaussians) per anchor."""
         return self.offsets.shape[1]
 
     def select(self, rows: Tensor) -> "AnchorCloud":
-        """The anchors of a mask or of indices ``[m]``, contiguous."""
+        """The anchors of a mask ``[M]`` or of indices ``[m]``, contiguous."""
         return AnchorCloud(**{name: column[rows].contiguous() for name, column in self._columns().items()})
 
     def with_rows(self, rows: Tensor, other: "AnchorCloud") -> "AnchorCloud":
-        """The same, those of the mask ``rows`` ``[M]`` replaced by ``other``; nothing is written in place."""
+        """A copy in which the anchors of the mask ``rows`` ``[M]`` are replaced by ``other``."""
         columns = {name: column.clone() for name, column in self._columns().items()}
         for name, column in columns.items():
             column[rows] = getattr(other, name)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class CameraColor:
-    """A gain and a bias for each training camera and channel: ``picture = gain * rendering + bias``.
+    """A gain and a bias per training camera and channel: ``picture = gain * rendering + bias``.
 
     Args:
         gains: ``[V, 3]``, mean one over the cameras.
@@ -17,9 +17,9 @@ class CameraColor:
 
     Note [Colour gauge]
     ~~~~~~~~~~~~~~~~~~~
-    A common gain could move into the scene's colours and back, so the split is fixed: the training cameras' mean
-    correction is the identity, exactly. Held-out cameras, of which nothing may be learned, render with that mean. A
-    soft penalty would only slow the drift, for the loss does not see a common gain at all.
+    A gain common to all cameras and the scene's colours are ambiguous. The gauge is fixed by making the training
+    cameras' mean correction exactly the identity. Held-out cameras, for which no correction may be fitted, render with
+    that mean. A penalty would only slow a drift, because the loss is invariant to a common gain.
     """
 
     gains: Tensor
@@ -32,7 +32,7 @@ class CameraColor:
         return cls(gains=like.new_ones(cameras, 3), biases=like.new_zeros(cameras, 3))
 
     def gauged(self) -> "CameraColor":
-        """The correction with the gauge of Note [Colour gauge] applied; differentiable."""
+        """The correction in the gauge of Note [Colour gauge]; differentiable."""
         return CameraColor(
             gains=self.gains - self.gains.mean(0) + 1.0,
             biases=self.biases - self.biases.mean(0),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is behind a scene, where no camera saw anything: a smooth colour by direction."""
+"""The environment: a smooth, direction-dependent background colour behind all Gaussians."""
 
 import math
 
@@ -10,11 +10,11 @@ from structgstream.cameras import Camera
 from structgstream.scene.harmonics import sh_basis
 
 _INVISIBLE = 1.0 / 512.0
-"""What this share of a background changes is less than half a step of 8 bits."""
+"""Transmittance below which the background changes a pixel by less than half an 8-bit level."""
 
 
 def environment(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """sRGB ``[..., 3]`` seen in unit ``directions`` ``[..., 3]`` of the scene: ``0.5 + sum Y_i c_i``, within 0 and 1.
+    """sRGB ``[..., 3]`` in unit ``directions`` ``[..., 3]`` of the scene: ``0.5 + sum Y_i c_i``, clamped to [0, 1].
 
     Args:
         coefficients: ``[(degree + 1)^2, 3]`` (``scene/harmonics.py``, Note [Spherical harmonics]).
@@ -25,9 +25,10 @@ def environment(coefficients: Tensor, directions: Tensor) -> Tensor:
 
 
 def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
-    """One colour ``[3]`` for a whole picture, the environment where ``camera`` looks; None without one.
+    """One background colour ``[3]`` for a whole picture: the environment along ``camera``'s axis; None without one.
 
-    What a trainer draws on: a rasteriser has it for nothing, and where surfaces leave a percent of it, it is as good.
+    Used in training: a constant background costs nothing in the rasteriser, and is accurate enough where little of it
+    shows.
     """
     if coefficients is None:
         return None
@@ -35,9 +36,9 @@ def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
 
 
 def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
-    """Unit directions ``[N, 3]`` of the centres of ``pixels`` ``[N]``, counted row by row, in the axes of the scene.
+    """Unit directions ``[N, 3]``, in world axes, of the centres of ``pixels`` ``[N]`` (row-major indices).
 
-    A similarity does not rotate: they are the same in units of the capture and of the scene.
+    They are the same in the units of the capture and of the scene, because the similarity does not rotate.
     """
     viewport = camera.viewport(torch.zeros(0, dtype=torch.float64, device=pixels.device))
     y = torch.div(pixels, camera.width, rounding_mode="floor")
@@ -47,7 +48,7 @@ def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
 
 
 def in_environment(image: Tensor, alpha: Tensor, camera: Camera, coefficients: Tensor) -> Tensor:
-    """``image`` ``[H, W, 3]``, drawn on black with coverage ``alpha`` ``[H, W]``, before the environment."""
+    """``image`` ``[H, W, 3]``, drawn on black with coverage ``alpha`` ``[H, W]``, composited over the environment."""
     rest = 1.0 - alpha.reshape(-1)
     pixels = (rest > _INVISIBLE).nonzero()[:, 0]
     behind = environment(coefficients.to(image), pixel_directions(camera, pixels).to(image))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A part of a picture: what moves there is drawn anew, the rest is there already."""
+"""Partial rendering: only the tiles that moving Gaussians reach are drawn."""
 
 from dataclasses import dataclass
 
@@ -11,15 +11,15 @@ from structgstream.kernels.raster_types import TileSelection
 
 @dataclass(frozen=True)
 class Focus:
-    """Where a camera's picture can differ from the one before.
+    """The tiles of one camera's picture that optimisation can change.
 
-    Drawing with a focus gives in its tiles what drawing everything would give, as long as what moves stays within
-    them, at the cost of the tiles.
+    Drawing with a focus gives the pixels of a full rendering in these tiles, as long as the moving Gaussians stay
+    within them, at a cost proportional to the tiles.
 
     Args:
         tiles: those that moving Gaussians reach.
-        picture: ``[H, W, 3]`` the rest of the picture, as far as a loss looks beyond the tiles; drawn onto in place.
-            In the tiles it shows what was drawn there last.
+        picture: ``[H, W, 3]`` the full picture outside the tiles, at least as far as the loss window reads beyond them.
+            Drawn into in place: its tiles hold the last drawing.
         still: Gaussians that reach the tiles and do not move; without gradient.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free Gaussians: what the anchors cannot express (paper, section Global Free 3DGs Patching Strategy)."""
+"""Free Gaussians, which patch what the anchors cannot represent (paper, Global Free 3DGs Patching Strategy)."""
 
 from dataclasses import dataclass, fields
 
@@ -16,8 +16,8 @@ class FreeGaussians:
         log_scales: ``[F, 3]``.
         quats: ``[F, 4]`` wxyz, normalised when drawn.
         logit_opacities: ``[F]``.
-        colors: ``[F, 3]`` sRGB, the same from every side.
-        births: ``[F]`` int64, ascending and never used twice in a stream: the identity of a Gaussian over time.
+        colors: ``[F, 3]`` sRGB, independent of the view direction.
+        births: ``[F]`` int64 identities, ascending, each used once in a stream.
     """
 
     means: Tensor
@@ -32,7 +32,7 @@ class FreeGaussians:
 
     @classmethod
     def empty(cls, like: Tensor | None = None) -> "FreeGaussians":
-        """No free Gaussians, with the dtype and device of ``like``."""
+        """Zero free Gaussians, with the dtype and device of ``like``."""
         like = torch.zeros(0) if like is None else like
         return cls(
             means=like.new_zeros(0, 3),
@@ -44,11 +44,11 @@ class FreeGaussians:
         )
 
     def select(self, rows: Tensor) -> "FreeGaussians":
-        """The rows that a mask ``[F]`` or an index ``[f]`` names."""
+        """The rows of a mask ``[F]`` or of indices ``[f]``."""
         return FreeGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def append(self, other: "FreeGaussians") -> "FreeGaussians":
-        """These and then ``other``."""
+        """These rows, then those of ``other``."""
         return FreeGaussians(
             **{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)}
         )

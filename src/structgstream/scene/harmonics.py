@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours by direction: real spherical harmonics of low degree.
+"""Real spherical harmonics of low degree, for direction-dependent colours.
 
 Note [Spherical harmonics]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~
-A colour is ``0.5 + sum Y_i c_i``. ``Y`` are the real spherical harmonics with the Condon-Shortley phase of a unit
-direction away from the camera, order by order, each from ``-m`` to ``m``: what 3D Gaussian splatting (Kerbl et al.
-2023) writes to its files and every viewer of them evaluates. Their factors are those that make the integral of every
-``Y_i^2`` over the sphere one.
+A colour is ``0.5 + sum Y_i c_i``. ``Y_i`` are the orthonormal real spherical harmonics with the Condon-Shortley phase,
+evaluated at a unit direction away from the camera and ordered by degree ``l``, then by order ``m`` from ``-l`` to
+``l``. This is the convention of the files of 3D Gaussian splatting (Kerbl et al., 2023).
 """
 
 import math

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An order of anchors in which neighbours in space are neighbours in memory and in a stream (Morton, 1966)."""
+"""Z-order (Morton, 1966) of anchors: neighbours in space are close in memory and in the stream."""
 
 from dataclasses import replace
 
@@ -9,11 +9,11 @@ from torch import Tensor
 from structgstream.scene.scene import Scene
 
 CELL_BITS = 20
-"""Of a cell's place along an axis."""
+"""Bits of a cell's coordinate along one axis."""
 
 
 def morton_keys(cells: Tensor) -> Tensor:
-    """Places int64 ``[M]`` of cells int64 ``[M, 3]``, from 0 to below 2^20, on a Z-order curve; x changes fastest."""
+    """Z-order keys int64 ``[M]`` of cells int64 ``[M, 3]`` with coordinates in 0 ... 2^20 - 1; x is the lowest bit."""
     keys = torch.zeros(len(cells), dtype=torch.int64, device=cells.device)
     for bit in range(CELL_BITS):
         for axis in range(3):
@@ -31,12 +31,12 @@ def morton_cells(keys: Tensor) -> Tensor:
 
 
 def morton_order(positions: Tensor, *, step: float | None = None) -> Tensor:
-    """Rows ``[M]`` of ``positions`` ``[M, 3]`` along a Z-order curve, those of one cell as they stood.
+    """Row indices ``[M]`` that sort ``positions`` ``[M, 3]`` along a Z-order curve; stable within a cell.
 
     Args:
         positions: in units of the scene.
-        step: side of a cell, the nearest multiples of it being the cells' middles; None takes a 2^20th of the
-            bounding cube, and so does a step that is smaller.
+        step: side of a cell, whose centre is a multiple of it. None, or a step too small for 2^20 cells along the
+            longest axis, divides the bounding cube into 2^20 cells along each axis.
     """
     if not len(positions):
         return torch.zeros(0, dtype=torch.int64, device=positions.device)
@@ -51,7 +51,7 @@ def morton_order(positions: Tensor, *, step: float | None = None) -> Tensor:
 
 
 def in_morton_order(scene: Scene, *, step: float | None = None) -> Scene:
-    """The same scene, its anchors in :func:`morton_order`. It must have no free Gaussians, whose ids would change."""
+    """``scene`` with its anchors in :func:`morton_order`. It must have no free Gaussians, whose ids would change."""
     assert not len(scene.free), "ids of free Gaussians follow those of anchors"
     order = morton_order(scene.anchors.positions, step=step)
     return replace(scene, anchors=scene.anchors.select(order))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene and a camera give a picture."""
+"""Rendering: from a scene and a camera to a picture."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -19,7 +19,7 @@ from structgstream.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Rendering:
-    """What one rendering gave.
+    """The result of one rendering.
 
     Args:
         image: ``[H, W, 3]`` sRGB, not clamped.
@@ -27,7 +27,7 @@ class Rendering:
         radii: ``[N]`` extent on the picture in pixels, 0 for Gaussians that were not drawn.
         gaussians: the drawn set, ``N`` rows.
         screen_offsets: ``[N, 2]`` zeros; after ``backward`` its gradient is the view-space positional gradient in
-            pixels (None when it was not asked for).
+            pixels (None when it is not tracked).
     """
 
     image: Tensor
@@ -50,12 +50,12 @@ def draw(
 
     Args:
         gaussians: the drawable set, in the units of the camera.
-        camera: where from.
-        backend: what computes.
+        camera: the view.
+        backend: the compute back-end.
         track_screen: keep the view-space positional gradient (see :class:`Rendering`).
-        focus: draw only its tiles, onto its picture and among its still Gaussians; the rendering tells of
-            ``gaussians`` alone.
-        background: ``[3]`` what is behind them; None for black.
+        focus: draw only its tiles, into its picture and together with its still Gaussians. ``radii``, ``gaussians``
+            and ``screen_offsets`` of the result cover ``gaussians`` alone.
+        background: ``[3]`` background colour; None for black.
     """
     means, count = gaussians.means, len(gaussians)
     offsets = torch.zeros_like(means[:, :2], requires_grad=True) if track_screen else None
@@ -77,15 +77,14 @@ def draw(
 
 
 class Drawable(Protocol):
-    """What gives a camera its Gaussians: a ``Scene``, or another method's model."""
+    """A model that gives Gaussians for a camera: a ``Scene``, or another method's model."""
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians: ...
 
 
 def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
-    """Draw ``scene`` as ``camera`` (in the scene's units) sees it, with the mean colour correction: the identity.
-
-    It is before its environment, if it has one.
+    """Draw ``scene`` for ``camera`` (in the scene's units), without gradient, with the mean colour correction (the
+    identity) and over the environment, if it has one.
     """
     with torch.no_grad():
         rendering = draw(scene.gaussians(camera, backend), camera, backend)
@@ -95,5 +94,5 @@ def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
 
 
 def to_8bit_image(image: Tensor) -> NDArray[np.uint8]:
-    """A rendering ``[H, W, 3]`` in sRGB as the 8-bit picture that a viewer sees: clamped, then rounded."""
+    """A rendering ``[H, W, 3]`` in sRGB as the displayed 8-bit picture: clamped, then rounded."""
     return image.detach().clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8).cpu().numpy()

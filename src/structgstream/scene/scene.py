@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene at one instant. It knows no loss, no file and no optimiser."""
+"""A scene at one time step, independent of losses, files and optimisers."""
 
 from dataclasses import dataclass, replace
 
@@ -19,17 +19,17 @@ from structgstream.scene.free import FreeGaussians
 
 @dataclass(frozen=True)
 class Scene:
-    """Anchors, the three MLPs that dress them, free Gaussians, and the rig's colour correction.
+    """Anchors, the three MLPs that generate structured Gaussians, free Gaussians, and the rig's colour correction.
 
     Args:
         anchors: the structured part.
         mlps: F_alpha, F_c and F_Sigma.
         free: the free part.
-        camera_color: one row for each training camera of the rig, in rig order.
-        distance_input: whether the MLPs see the distance to the camera (the paper: yes; Scaffold-GS: no).
-        appearance_basis: ``[R, D]`` directions in which the anchors' features may change after frame 0; None with no
+        camera_color: one row per training camera of the rig, in rig order.
+        distance_input: whether the distance to the camera is an input of the MLPs (paper: yes; Scaffold-GS: no).
+        appearance_basis: ``[R, D]`` directions along which the anchors' features change after frame 0; None without
             ``appearance``.
-        environment: ``[(degree + 1)^2, 3]`` what is behind everything (``scene/environment.py``); None for black.
+        environment: ``[(degree + 1)^2, 3]`` background coefficients (``scene/environment.py``); None for black.
     """
 
     anchors: AnchorCloud
@@ -42,29 +42,29 @@ class Scene:
 
     @property
     def features(self) -> Tensor:
-        """What the MLPs see of each anchor now, ``[M, D]``."""
+        """The features ``[M, D]`` that the MLPs read: f_v plus the change of appearance."""
         anchors = self.anchors
         if anchors.appearance is None or self.appearance_basis is None:
             return anchors.features
         return anchors.features + anchors.appearance @ self.appearance_basis
 
     def with_folded_appearance(self) -> "Scene":
-        """The same looks, with the appearance in the features: for many looks at a scene that stays as it is."""
+        """An equivalent scene with the appearance folded into the features: faster when it is rendered repeatedly."""
         if self.appearance_basis is None:
             return self
         anchors = replace(self.anchors, features=self.features, appearance=None)
         return replace(self, anchors=anchors, appearance_basis=None)
 
     def background(self, camera: Camera) -> Tensor | None:
-        """The colour ``[3]`` of the environment where ``camera`` looks; None for black."""
+        """The environment's colour ``[3]`` along ``camera``'s axis; None for black."""
         return background(self.environment, camera)
 
     def structured(
         self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None, seen_from: Tensor | None = None
     ) -> StructuredGaussians:
-        """The structured Gaussians that ``camera`` may see, or those that may show in ``tiles``.
+        """The structured Gaussians of the anchors in ``camera``'s view, or of those that reach ``tiles``.
 
-        They look as from ``seen_from`` ``[3]``, which is where the camera is unless given.
+        View direction and distance are taken from ``seen_from`` ``[3]``, by default the camera's centre.
         """
         cloud = self.anchors
         anchors = Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
@@ -84,14 +84,14 @@ class Scene:
         return Gaussians(
             means=free.means,
             quats=free.quats,
-            scales=free.log_scales.contiguous().exp(),  # of strided columns it takes four times as long
+            scales=free.log_scales.contiguous().exp(),  # exp of strided columns takes four times as long
             opacities=free.logit_opacities.sigmoid(),
             colors=free.colors,
             ids=torch.arange(first, first + len(free), device=free.means.device),
         )
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
-        """Everything that can be drawn for ``camera``: structured Gaussians, then free ones."""
+        """The Gaussians to draw for ``camera``: structured ones in view, then all free ones."""
         return self.with_free_gaussians(self.structured(camera, backend))
 
     def with_free_gaussians(self, generated: StructuredGaussians) -> Gaussians:

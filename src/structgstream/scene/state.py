@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state table: every piece of a scene, where it is, how long it lives, how it is learned and how it is sent.
+"""The state table: for each field of a scene its attribute, lifetime, shape, learning rates and coding.
 
 Note [State table]
 ~~~~~~~~~~~~~~~~~~
-Nobody else keeps a list of fields. The optimiser trains the parameters of the dynamic fields at the rates that rows
-name, the quantiser rounds them to the steps that rows name, the stream's init record carries the static fields and
-packets the dynamic ones in the coding that rows state, and size accounting sums over both. Half of the paper's
-ablations are edits of the dynamic set. The order of rows is the order of fields in a stream.
+This is the only list of fields. The optimiser takes the parameters of the dynamic fields and their learning rates from
+it, the quantiser their steps; the init record carries the static fields and packets the dynamic ones in the coding
+stated here; size accounting sums over both. Half of the paper's ablations are edits of the dynamic set. The order of
+rows is the order of fields in a stream.
 """
 
 from collections.abc import Iterable, Mapping
@@ -53,22 +53,22 @@ ParameterName = (
     ]
 )
 Granularity = Literal["anchor", "free", "camera", "shared"]
-"""What there is one of for each row of a field; a shared field holds for the whole scene."""
+"""The object that a row of a field describes; ``shared`` fields belong to the whole scene."""
 InitCoding = Literal["uncoded", "positions", "rows", "numbers"]
 """How the init record of a compact stream holds a field (docs/bitstream.md, section Coded init fields)."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A tensor of the scene that is trained and rounded by itself: a field, or some columns of one.
+    """A tensor with its own learning rate and quantization step: a field, or some columns of one.
 
     Args:
         name: its name in configurations and in the header's steps.
         path: of the attribute in a :class:`Scene`.
-        columns: how many of its field's columns it has; one column is a vector in the scene. 0: the whole field.
-        step: the field of ``RoundingConfig`` by which it is sent rounded after frame 0; None for what never is.
-        online_rate: the field of ``OnlineRates`` at which it is trained after frame 0; None for not at all.
-        first_rate: the field of ``InitialRates`` at which frame 0 trains it; None for not at all.
+        columns: number of its columns in the field; one column is a vector in the scene. 0: the whole field.
+        step: the field of ``RoundingConfig`` with its quantization step after frame 0; None: never quantized.
+        online_rate: the field of ``OnlineRates`` with its learning rate after frame 0; None: not trained.
+        first_rate: the field of ``InitialRates`` with its learning rate in frame 0; None: not trained.
     """
 
     name: ParameterName
@@ -80,7 +80,7 @@ class Parameter:
 
     @property
     def trainable(self) -> bool:
-        """Whether there is a rate for it."""
+        """Whether it has a learning rate."""
         return self.online_rate is not None or self.first_rate is not None
 
     @cached_property
@@ -102,18 +102,18 @@ class StateField:
         name: the field's name in streams, reports and configurations.
         code: its number in a stream; never reused.
         symbol: the paper's symbol.
-        granularity: what it has a row for.
-        shape: numbers, and letters that are the same size wherever they stand (docs/bitstream.md, section Fields).
+        granularity: the object that a row describes.
+        shape: numbers, and letters that stand for one size in all fields (docs/bitstream.md, section Fields).
         path: of the attribute in a :class:`Scene`; empty for a field with ``parts``.
-        parts: the parameters whose columns the field is made of, if it is not one parameter itself.
-        dynamic: whether the paper changes it after frame 0.
-        optional: what a scene may do without: fields of the same word come together or not at all. None: required.
+        parts: the parameters whose columns make up the field, if it is not a single parameter.
+        dynamic: whether the paper trains it after frame 0.
+        optional: group of optional fields, which are present together or not at all. None: required.
         integers: whether it holds int64 instead of float32.
-        outputs: of an MLP, the numbers that it gives for each of an anchor's Gaussians; 0 for other fields.
+        outputs: of an MLP, its outputs per structured Gaussian; 0 for other fields.
         init_coding: how the init record of a compact stream holds it.
-        step, online_rate, first_rate: as of :class:`Parameter`.
-        init_step: the field of ``RoundingConfig`` by which frame 0 is sent rounded; ``sensitivity`` where what the
-            cameras see decides, ``own`` where the code that makes the field does. Without one it is ``step``.
+        step, online_rate, first_rate: as in :class:`Parameter`.
+        init_step: the field of ``RoundingConfig`` with its quantization step in frame 0; ``sensitivity``: chosen from
+            the sensitivity of the renderings; ``own``: chosen by the code that creates the field. None: as ``step``.
     """
 
     name: FieldName
@@ -135,12 +135,12 @@ class StateField:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The parts, or the field itself as the only one."""
+        """The parts, or the whole field as the only parameter."""
         return self.parts or (Parameter(self.name, self.path, 0, self.step, self.online_rate, self.first_rate),)
 
     @property
     def quantized(self) -> bool:
-        """Whether packets of a compact stream can carry the field, as bins."""
+        """Whether packets of a compact stream can carry the field (as bins)."""
         return all(parameter.step for parameter in self.parameters)
 
 
@@ -223,12 +223,12 @@ _PARTS_OF_SCENE = {"anchors": AnchorCloud, "mlps": MLPWeights, "free": FreeGauss
 
 
 def fields_of(*granularities: Granularity) -> tuple[FieldName, ...]:
-    """The fields that have a row for each anchor, free Gaussian or camera, or are shared, in the table's order."""
+    """The names of the fields of these granularities, in the table's order."""
     return tuple(row.name for row in STATE_TABLE if row.granularity in granularities)
 
 
 def parameters_of(names: Iterable[FieldName]) -> tuple[Parameter, ...]:
-    """What fields are made of, in the order of ``names``."""
+    """The parameters of the fields ``names``, in that order."""
     return tuple(parameter for name in names for parameter in FIELDS[name].parameters)
 
 
@@ -245,13 +245,13 @@ def unflatten_head(vector: Tensor, inputs: int, outputs: int) -> HeadWeights:
 
 
 def tensor_of(scene: Scene, parameter: Parameter) -> Tensor | None:
-    """A parameter's tensor in ``scene``, an MLP as one vector; None where the scene does without it."""
+    """A parameter's tensor in ``scene``, an MLP as one vector; None if the scene lacks this optional field."""
     value = getattr(getattr(scene, parameter.holder) if parameter.holder else scene, parameter.attribute)
     return flatten_head(value) if isinstance(value, HeadWeights) else value
 
 
 def state_of(scene: Scene) -> dict[FieldName, Tensor]:
-    """The scene as named tensors, one for each row of the table that it has."""
+    """The scene as named tensors, one per field that it has."""
     state: dict[FieldName, Tensor] = {}
     for row in STATE_TABLE:
         found = [(p, value) for p in row.parameters if (value := tensor_of(scene, p)) is not None]
@@ -263,7 +263,7 @@ def state_of(scene: Scene) -> dict[FieldName, Tensor]:
 
 
 def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scene:
-    """The inverse of :func:`state_of`; nothing is copied that a view can give."""
+    """The inverse of :func:`state_of`; tensors are views where possible."""
     values: dict[ParameterName, Tensor] = {}
     for name, value in state.items():
         row = FIELDS[name]
@@ -274,7 +274,7 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
 
 
 def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) -> Scene:
-    """The scene of which ``values`` are the parameters' tensors (:func:`tensor_of`)."""
+    """The scene whose parameters have the tensors ``values`` (:func:`tensor_of`)."""
     k, inputs = values["anchor_offsets"].shape[1], values["anchor_features"].shape[1] + 3 + int(distance_input)
     found: dict[str, Any] = {holder: {} for holder in _PARTS_OF_SCENE}
     for row in STATE_TABLE:
@@ -291,17 +291,17 @@ def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) 
 
 
 def with_dynamic_fields(scene: Scene, dynamic: Iterable[FieldName]) -> Scene:
-    """``scene``, with zeros for the optional fields of anchors that are to change and that it does without so far.
+    """``scene`` with zeros for those optional anchor fields of ``dynamic`` that it lacks.
 
     Raises:
-        ConfigError: a field is not one of anchors, or the table does not tell how many columns it has.
+        ConfigError: a missing field is not an anchor field, or its number of columns is not fixed by the table.
     """
     state = state_of(scene)
     missing = [FIELDS[name] for name in dynamic if name not in state]
     for row in missing:
         columns = [size for size in row.shape[1:] if isinstance(size, int)]
         if row.granularity != "anchor" or len(columns) < len(row.shape) - 1:
-            raise ConfigError(f"The dynamic set has {row.name}, which the scene does without; take it out of the set.")
+            raise ConfigError(f"The dynamic set has {row.name}, which the scene lacks; take it out of the set.")
         state[row.name] = scene.anchors.positions.new_zeros(len(scene.anchors), *columns)
     return scene_of(state, distance_input=scene.distance_input) if missing else scene
 

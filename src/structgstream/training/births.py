@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What emerges is there, opaque, before the first iteration: free Gaussians from geometry (design, births).
+"""Births of free Gaussians from multi-view geometry before the first iteration, and removal of wrong ones.
 
-A gradient makes a child only beside a parent, faint, and lets it find its place over frames. Where pixels of several
-views stay wrong after everything has moved, the pictures themselves tell what is there and where: along the ray of such
-a pixel, in front of what is rendered, there is a depth at which the other views lack the same colour.
+Spawning by gradients places a faint child beside a parent, which then needs frames to converge. Where pixels of several
+views still have a large residual after the motion start, new content is located directly by a plane sweep: along the
+ray of such a pixel, in front of the rendered depth, at the depth where other views have the same missing colour.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,45 +28,45 @@ HIT_VOXELS = 1.8
 
 @dataclass(frozen=True)
 class BirthConfig:
-    """When free Gaussians are born from geometry, and die of blame."""
+    """Births of free Gaussians from geometry, and removal by residuals; not in the paper."""
 
     enabled: bool = False
-    """Off, the paper: gradients alone make children."""
+    """Paper: False, free Gaussians are spawned by gradients only."""
     picture_width: int = 320
-    """Pictures are looked at in at most this width."""
+    """Pictures are reduced to at most this width, pixels."""
     residual_threshold: float = 0.10
-    """A pixel is missing where the rendering is off by so much more than frame 0's was."""
+    """Residual, 0 to 1, above which a pixel counts as wrong, and as missing if it exceeds frame 0's by this much."""
     pixel_step: int = 2
-    """A ray is swept for every so many-th missing pixel, across and down."""
+    """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48
     least_supports: int = 2
-    """Other views that must lack the same."""
+    """Least number of other views that support a point: there a missing pixel lies at its projection."""
     most_contradictions: float = 0.34
-    """At most this share of the views that could see a point may lack nothing there."""
+    """Largest share of contradicting views, which would see the point but miss nothing, among those that can judge."""
     most_cost: float = 0.12
     least_hits: int = 4
-    """Points of as many rays must lie within 1.8 voxels."""
+    """Least number of ray points within 1.8 voxels for a birth."""
     most: int = 500
-    """Births a frame; those with most hits come first."""
+    """Largest number of births per frame; those with most hits are taken."""
     most_missing_share: float = 0.25
-    """Where more of the pictures than this is missing, nothing emerged: a light was switched, or a camera bumped."""
+    """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
     size: float = 0.7
-    """Standard deviation at birth, in distances between rays."""
+    """Standard deviation at birth, in units of the distance between neighbouring swept rays."""
     opacity: float = 0.7
     blame_share: float = 0.5
-    """A free Gaussian is to blame in a view where so much of what it covers is wrong, ..."""
+    """A free Gaussian is an outlier in a view if more than this share of its pixels is wrong."""
     blame_views: int = 2
-    """... and dies when so many views, and half of those that show it, blame it."""
+    """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
 
 
 @dataclass(frozen=True)
 class ViewResidual:
-    """What the rendering of a view lacks.
+    """Wrong and missing pixels of a view.
 
     Args:
-        view: the picture, at the width that is looked at.
-        wrong: ``[h, w]`` bool, pixels that are off.
-        missing_share: ``[h, w]`` how much of the 5 x 5 pixels around is off by more than frame 0 was anywhere near.
+        view: the picture, reduced.
+        wrong: ``[h, w]`` bool, pixels whose residual exceeds the threshold.
+        missing_share: ``[h, w]`` share of the 5 x 5 pixels around whose residual exceeds frame 0's by the threshold.
     """
 
     view: View
@@ -75,7 +75,7 @@ class ViewResidual:
 
 
 def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, config: BirthConfig) -> ViewResidual:
-    """Compare a rendering as recorded, ``[H, W, 3]`` in 0 ... 1, with the picture of ``view``."""
+    """Compare a colour-corrected rendering, ``[H, W, 3]`` in 0 ... 1, with the picture of ``view``."""
     scale = min(1.0, config.picture_width / view.camera.width)
     small = view.reduced(scale)
     size = (small.camera.height, small.camera.width)
@@ -88,12 +88,12 @@ def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, c
 
 
 def blamed_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, config: BirthConfig) -> Tensor:
-    """Mask ``[F]`` of the free Gaussians that several views blame.
+    """Mask ``[F]`` of the free Gaussians to remove, as outliers in several views.
 
     Args:
-        coverage: ``[V, F]`` pixels that each covers.
-        wrong: ``[V, F]`` those of them that are off.
-        least_pixels: a view that sees less of a Gaussian says nothing.
+        coverage: ``[V, F]`` pixels that each covers, by blending weight.
+        wrong: ``[V, F]`` wrong pixels among them.
+        least_pixels: views where a Gaussian covers fewer pixels do not count.
         config: the rule.
     """
     seen = coverage > least_pixels
@@ -110,15 +110,15 @@ def sweep_births(
     config: BirthConfig,
     backend: Backend,
 ) -> FreeGaussians:
-    """New free Gaussians where several views lack the same.
+    """New free Gaussians at points whose colour is missing in several views.
 
     Args:
         missing: of every training view.
-        depths: by view index ``[h, w]`` of what is rendered, infinite where nothing is.
-        color: corrections of the cameras.
+        depths: by view index, rendered depth ``[h, w]``, infinite where nothing is rendered.
+        color: colour corrections of the cameras.
         first_birth: identity of the first.
         config: the rule.
-        backend: what computes.
+        backend: the compute back-end.
 
     Raises:
         MissingExtraError: SciPy is not installed.
@@ -164,7 +164,7 @@ def _sweep_view(entry: ViewResidual, depths: Tensor, color: CameraColor) -> Swee
 
 
 def _strided_mask(step: int, like: Tensor) -> Tensor:
-    """Every ``step``-th pixel across and down."""
+    """Mask of every ``step``-th pixel across and down."""
     mask = torch.zeros_like(like)
     mask[::step, ::step] = True
     return mask
@@ -173,7 +173,7 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
 def _merge_points(
     points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, config: BirthConfig
 ) -> FreeGaussians:
-    """One free Gaussian for each voxel of the points, if enough of them lie around it."""
+    """One free Gaussian per voxel of the points, if at least ``least_hits`` points lie around it."""
     try:
         from scipy.spatial import KDTree
     except ImportError as error:

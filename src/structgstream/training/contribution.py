@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each anchor contributes to the training pictures: anchors that hardly show cost time and bytes for nothing."""
+"""Contribution of each anchor to the training pictures, used to prune anchors that are hardly visible."""
 
 from collections.abc import Sequence
 
@@ -14,8 +14,8 @@ from structgstream.scene.scene import Scene
 def contributions(scene: Scene, cameras: Sequence[Camera], *, scale: float, backend: Backend) -> Tensor:
     """Blending weights of each anchor's Gaussians, summed over the pixels of all cameras, ``[M]``.
 
-    In shares of what an average anchor contributes, so that neither size nor number of the pictures matters: they are
-    drawn in ``scale`` of their width and height.
+    Relative to the mean over anchors, hence independent of the number and size of the pictures, which are drawn at
+    ``scale`` of their width and height.
     """
     anchors = len(scene.anchors)
     total = scene.anchors.positions.new_zeros(anchors)

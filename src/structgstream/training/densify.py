@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Applying growth to everything that has a row for each anchor: parameters with their moments, and statistics."""
+"""Applies growing and pruning of anchors to parameters, optimiser moments and statistics."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from structgstream.training.statistics import GradientStatistics
 
 @dataclass
 class Densifier:
-    """Statistics of frame 0 and the surgery they ask for.
+    """Collects statistics of frame 0, and grows and prunes anchors by them.
 
     The clamp of the base scales is Scaffold-GS's: at most ``exp(0.05)`` scene units, whenever anchors are pruned.
     """
@@ -34,7 +34,7 @@ class Densifier:
 
     @classmethod
     def of(cls, scene: Scene, *, config: GrowthConfig, iterations: int, voxel_size: float) -> "Densifier":
-        """Empty statistics for ``scene``, which is fitted in so many ``iterations``."""
+        """Empty statistics for ``scene``, which is fitted in ``iterations`` iterations."""
         m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
         device = scene.anchors.positions.device
         return cls(
@@ -42,7 +42,7 @@ class Densifier:
         )
 
     def collects(self, iteration: int) -> bool:
-        """Whether statistics are wanted at this iteration."""
+        """Whether statistics are collected at this iteration."""
         return self.config.collect_from < iteration <= self.config.last(self.iterations)
 
     def is_due(self, iteration: int) -> bool:
@@ -81,11 +81,11 @@ class Densifier:
         return len(new), int(remove.sum())
 
     def prunes_by_contribution(self, iteration: int) -> bool:
-        """Whether contributions decide after this iteration who stays."""
+        """Whether anchors are pruned by contribution after this iteration."""
         return self.config.least_contribution > 0.0 and iteration in self.config.contribution_at
 
     def prune_by_contribution(self, contributions: Tensor, adam: Adam[ParameterName]) -> int:
-        """Remove the anchors whose ``contributions`` ``[M]`` (shares of the mean) are too small; tells how many."""
+        """Remove the anchors whose ``contributions`` ``[M]`` (relative to the mean) are too small; returns how many."""
         keep = contributions >= self.config.least_contribution
         self._replace(adam, keep=keep, added={}, count=0)
         return int((~keep).sum())
@@ -93,9 +93,9 @@ class Densifier:
     def _replace(
         self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor], count: int
     ) -> None:
-        """Keep the rows of a mask ``[M]`` and append ``count`` in everything that has a row for each anchor.
+        """Keep the rows of a mask ``[M]`` and append ``count`` rows, in all tensors with a row per anchor.
 
-        What ``added`` has not is zero in the new rows.
+        New rows of parameters that are not in ``added`` are zero.
         """
         k = self.offsets_per_anchor
         new: dict[ParameterName, Tensor] = {}

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The environment of a scene (``scene/environment.py``) from the training pictures of frame 0, in closed form.
+"""Least-squares fit of a scene's environment (``scene/environment.py``) to the training pictures of frame 0.
 
 Note [Honest coverage]
 ~~~~~~~~~~~~~~~~~~~~~~
-Before a black background, what is dark is drawn by leaving it out: coverage then does not tell what no camera saw from
-what was dark there, and an environment would shine through dark doors and hair. With a background of another colour in
-every iteration (``InitialConfig.random_background``) only what covers can show a colour, so what is left open is what
-nobody saw.
+With a black background the optimiser represents dark surfaces by transparency. Coverage then does not distinguish dark
+surfaces from unobserved regions, and an environment would shine through dark doors and hair. With a random background
+colour in every iteration (``InitialConfig.random_background``) only opaque surfaces can match the pictures, so what
+stays transparent is unobserved.
 """
 
 from collections.abc import Sequence
@@ -22,34 +22,34 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.views import View
 
-_STRIDE = 4  # pixels: what is fitted has a few coefficients
+_STRIDE = 4  # pixels between samples: enough for a few coefficients
 _LEAST_GAIN = 0.1
 
 
 @dataclass(frozen=True)
 class EnvironmentConfig:
-    """What is drawn behind the scene; it needs honest coverage (Note [Honest coverage])."""
+    """The environment behind the scene; needs ``random_background`` (Note [Honest coverage])."""
 
     enabled: bool = False
-    """Whether there is one (paper: no, black)."""
+    """Whether an environment is fitted (paper: no, black)."""
     degree: int = 2
-    """Of the spherical harmonics, 0 to 2."""
+    """Degree of the spherical harmonics, 0 to 2."""
     smoothness: float = 1e-3
-    """Ridge: of a coefficient of degree l it is l (l + 1) times that of all pixels' mean weight."""
+    """Ridge penalty: for a coefficient of degree l, l (l + 1) times this times the mean weight of the pixels."""
     least_weight: float = 1e-2
-    """Of a pixel that is covered. Others weigh as much more as they are open: what is there continues nearby."""
+    """Added to a pixel's transparency (1 - coverage) to give its weight, so that covered pixels count a little."""
     step: float = 1 / 256
-    """What the coefficients are whole multiples of, in streams with the codec ``compact``."""
+    """Quantization step of the coefficients with the codec ``compact``, full scale 1."""
 
 
 def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
     """Coefficients ``[(degree + 1)^2, 3]`` of the colours in the pictures' directions, by least squares.
 
     Args:
-        scene: frame 0; its coverage tells where pixels weigh, its colour correction what the mean camera would show.
+        scene: frame 0; its coverage determines the pixels' weights, its colour correction the reference colours.
         views: the training pictures.
         config: of the fit.
-        backend: what computes.
+        backend: the compute back-end.
     """
     count = (config.degree + 1) ** 2
     products = torch.zeros(count, count, dtype=torch.float64)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frame 0 as whole numbers of steps, which the init record codes: as few bits as the pictures allow.
+"""Quantization of frame 0 for the init record, with steps from the sensitivity of the rendered pictures.
 
 Note [Sensitivity]
 ~~~~~~~~~~~~~~~~~~
-What an error of a number does to the pictures is, to first order, the square of their derivative by it. One backward
-pass of a picture weighted with random signs has the sum of these squares over all pixels as the expectation of its
-squared gradients (Hutchinson, 1989), so a pass over the cameras tells what every number is worth. Steps follow from
-it: each number may add the same error.
+To first order, the squared error of the pictures caused by an error of a value is proportional to the sum over pixels
+of the squared derivatives by that value. The squared gradient of a picture weighted with random signs is an unbiased
+estimate of this sum (Hutchinson, 1989), so one backward pass per training camera estimates the sensitivity to every
+value. Steps are chosen so that each value adds the same error.
 
 Note [Gauges]
 ~~~~~~~~~~~~~
-Many scenes draw the same pictures. Features may be mapped by any invertible matrix if the MLPs' first layers undo it;
-of these the one is taken in which every direction is worth the same and directions do not depend on each other
-(Karhunen-Loeve), so most columns of most anchors become zero. l_v only multiplies O_v, and both are fitted: l_v
-becomes 1, and the offsets lengths in the scene. What a position loses on its grid its offsets get.
+The parametrisation of a scene is not unique. Features may be mapped by any invertible matrix if the MLPs' first layers
+apply its inverse; we take the one for which the sensitivity is equal in all directions and the features are
+uncorrelated (Karhunen-Loeve), so that most columns of most anchors become zero. l_v only multiplies O_v: l_v is set to
+1, and the offsets become lengths in the scene. The quantization error of a position is added to its offsets.
 """
 
 from collections.abc import Mapping
@@ -32,18 +32,18 @@ from structgstream.training.rounding import RoundingConfig, round_straight_throu
 
 SENSITIVITY_FIELDS: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
 FINEST, COARSEST = -1, 2
-"""Of an anchor's step, as powers of two times that of an average one: what is hidden now may come to light."""
-_LEAST_SHARE = 1e-4  # of the largest eigenvalue: directions of features are not stretched further than by 100
+"""Bounds of an anchor's step relative to the mean one, as powers of two: occluded anchors may become visible later."""
+_LEAST_SHARE = 1e-4  # of the largest eigenvalue: features are not scaled by more than 100
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """How pictures depend on a scene: means over all their numbers, in units of full scale (Note [Sensitivity]).
+    """Sensitivity of the pictures to a scene, as means over all pixels and channels, full scale 1 (Note [Sensitivity]).
 
     Args:
-        fields: squared derivatives by each number of the :data:`SENSITIVITY_FIELDS` fields, of their shapes.
+        fields: squared derivatives by each value of the :data:`SENSITIVITY_FIELDS` fields, of their shapes.
         features: ``[D, D]``, products of the derivatives by an anchor's features, summed over anchors.
-        used: ``[M, K]``, the offsets whose opacity is above zero for some camera.
+        used: ``[M, K]``, mask of the offsets whose opacity is above zero for some camera.
     """
 
     fields: Mapping[FieldName, Tensor]
@@ -52,7 +52,7 @@ class Sensitivity:
 
 
 def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed: int) -> Sensitivity:
-    """What the training cameras of ``rig`` (in the scene's units) see of every number."""
+    """Sensitivity of the pictures of ``rig``'s training cameras (in the scene's units)."""
     generator = torch.Generator().manual_seed(seed)
     state: dict[FieldName, Tensor] = {name: value.detach() for name, value in state_of(scene).items()}
     for name in SENSITIVITY_FIELDS:
@@ -71,7 +71,7 @@ def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed
         behind = open_scene.background(rig[name])
         image = draw(open_scene.with_free_gaussians(structured), rig[name], backend, background=behind).image
         count += image.numel()
-        if not image.requires_grad:  # It shows nothing.
+        if not image.requires_grad:  # Nothing is drawn.
             continue
         signs = (torch.randint(0, 2, image.shape, generator=generator) * 2 - 1).to(image)
         found = torch.autograd.grad(
@@ -88,7 +88,7 @@ def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed
 
 
 def regauge(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]:
-    """A scene that draws the same with numbers that cost less (Note [Gauges]), and what they are worth."""
+    """An equivalent scene whose values cost fewer bits (Note [Gauges]), and its sensitivity."""
     anchors, fields = scene.anchors, dict(sensitivity.fields)
     lengths = anchors.log_offset_scales.exp()[:, None]
     fields["anchor_offsets"] = fields["anchor_offsets"] / lengths.square()
@@ -112,7 +112,7 @@ def regauge(scene: Scene, sensitivity: Sensitivity) -> tuple[Scene, Sensitivity]
 
 
 def _whitening_matrices(features: Tensor, products: Tensor, mlps: MLPWeights) -> tuple[Tensor, Tensor]:
-    """A matrix ``[D, D]`` that makes directions worth the same and independent, the most varied first; its inverse."""
+    """Matrix ``[D, D]`` to uncorrelated features of equal sensitivity, by decreasing variance, and its inverse."""
     values, vectors = torch.linalg.eigh(products)
     if not len(features) or not float(values.max()) > 0.0:
         same = torch.eye(len(products)).to(products)
@@ -122,14 +122,14 @@ def _whitening_matrices(features: Tensor, products: Tensor, mlps: MLPWeights) ->
     turn = torch.linalg.eigh((centred @ stretched).T @ (centred @ stretched)).eigenvectors.flip(1)
     forward = stretched @ turn
     inverse = torch.linalg.inv(forward)
-    # The scale is free: weights stay as large as they are, for steps and rates that are used to it.
+    # The scale is free: it keeps the magnitude of the weights, for which steps and learning rates are tuned.
     seen = torch.cat([head.w1[:, : len(products)] for head in mlps]).double()
     scale = ((seen @ inverse.T).square().sum() / seen.square().sum().clamp(min=1e-300)).sqrt().clamp(min=1e-30)
     return forward * scale, inverse / scale
 
 
 def _fold_into_mlp(head: HeadWeights, mean: Tensor, inverse: Tensor) -> HeadWeights:
-    """The MLP for features less ``mean``, times the inverse of ``inverse``."""
+    """The MLP whose first layer undoes the change of features: minus ``mean``, times the inverse of ``inverse``."""
     seen, rest = head.w1[:, : len(mean)].double(), head.w1[:, len(mean) :]
     w1 = torch.cat([(seen @ inverse.T).to(rest), rest], dim=1)
     return head._replace(w1=w1, b1=(head.b1.double() + seen @ mean).to(head.b1))
@@ -143,14 +143,14 @@ def quantize_first_frame(
     voxel_size: float,
     steps: Mapping[str, float],
 ) -> tuple[Scene, dict[FieldName, float]]:
-    """The scene with all that the init record codes as whole numbers of steps, and these steps by field.
+    """Quantizes the fields that the init record codes; returns the dequantized scene and the steps by field.
 
     Args:
-        scene: frame 0, as :func:`regauge` gave it.
+        scene: frame 0, as :func:`regauge` returned it.
         sensitivity: of ``scene``.
-        config: how much may be lost.
+        config: allowed error and fixed steps.
         voxel_size: the grid of the anchors.
-        steps: of what changes later: what the frames after this one round to.
+        steps: quantization steps of the later frames, for dynamic fields.
     """
     plain, state = config.resolved(), state_of(scene)
     used = sensitivity.used[..., None].expand_as(state["anchor_offsets"])
@@ -159,7 +159,7 @@ def quantize_first_frame(
         int((sensitivities > 0).logical_and(counted.get(name, sensitivities > 0)).sum())
         for name, sensitivities in sensitivity.fields.items()
     )
-    # A step has the error of its square over twelve; all numbers have the same.
+    # A quantization error has the variance step^2 / 12; all values contribute equally.
     most = plain.first_noise_levels / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
     found: dict[FieldName, float] = {"anchor_positions": float32(voxel_size)}
     state["anchor_positions"] = round_straight_through(state["anchor_positions"], found["anchor_positions"])
@@ -186,7 +186,7 @@ def quantize_first_frame(
 def _quantize_rows(
     values: Tensor, sensitivities: Tensor, most: float, *, counted: Tensor | None
 ) -> tuple[float, Tensor]:
-    """A step, and values ``[M, ...]`` as multiples of it times a power of two for each row."""
+    """A step, and values ``[M, ...]`` quantized to it times a power of two per row."""
     counted = sensitivities > 0 if counted is None else counted
     flat, rows = sensitivities * counted, tuple(range(1, sensitivities.dim()))
     mean = float(flat.sum() / counted.sum().clamp(min=1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optical flow of a training camera as maps that can be gathered."""
+"""Optical flow of a training camera as maps to be summed by blending weights."""
 
 import numpy as np
 import torch
@@ -9,14 +9,13 @@ from structgstream.flow import consistency_mask, dis_search
 from structgstream.training.views import area_mean
 
 CONTEXT_PIXELS = 16
-"""Flow is looked for in the box around what changed, and so far around it."""
+"""Margin in pixels around the bounding box of the changed pixels, in which flow is estimated."""
 
 
 def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, int]) -> Tensor:
-    """Flow from one picture to another of the same camera, with the confidence c in it: ``[h, w, 3]``, the maps
-    (c, c flow_x, c flow_y).
+    """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
 
-    c is the share of the pixels whose flow leads back (``flow.consistency_mask``). It is zero outside a box around
+    c is the share of consistent pixels (``flow.consistency_mask``), zero outside a box around
     ``changed``.
 
     Args:
@@ -40,7 +39,7 @@ def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, in
 
 
 def _box(mask: Tensor) -> tuple[slice, slice] | None:
-    """Rows and columns around what is in the mask ``[H, W]``; None for nothing, or for too little to search in."""
+    """Bounding box of the mask ``[H, W]`` with margin; None if it is empty or too small for the flow search."""
     if not mask.any():
         return None
     spans = []

@@ -12,43 +12,44 @@ from structgstream.scene.anchors import AnchorCloud
 
 @dataclass(frozen=True)
 class GrowthConfig:
-    """When and where anchors are added and removed."""
+    """Schedule and thresholds of growing and pruning anchors in frame 0."""
 
     collect_from: int = 500
     """Statistics are collected after this iteration."""
     start: int = 1500
-    """Anchors change after this iteration (paper: densification starts at 1500)."""
+    """Anchors are grown and pruned after this iteration (paper: 1500)."""
     stop: int = 15_000
-    """Anchors change until this iteration, and never within the last ``interval`` of a fit (:meth:`last`)."""
+    """Anchors are grown and pruned until this iteration, and not within the last ``interval`` of a fit (:meth:`last`;
+    Scaffold-GS: 15,000)."""
     interval: int = 100
-    """Iterations between changes."""
+    """Iterations between growing and pruning (Scaffold-GS: 100)."""
     grad_threshold: float = 2e-4
-    """Mean view-space gradient (NDC) from which a Gaussian asks for a coarse anchor; doubles with each level."""
+    """Mean view-space gradient (NDC) above which a Gaussian proposes an anchor at the coarsest level; doubles with each
+    finer level (Scaffold-GS: 2e-4)."""
     levels: int = 3
-    """Cell sizes: 16, 4 and 1 voxels."""
+    """Number of cell sizes, 16, 4 and 1 voxels (Scaffold-GS: 3)."""
     eligible_count: int = 40
-    """A Gaussian is considered once it was drawn more often than this."""
+    """A Gaussian proposes anchors only if it was drawn more often than this since the last growing."""
     prune_visits: int = 80
-    """An anchor is judged once it was visited more often than this."""
+    """An anchor can be pruned by opacity once it was in view more often than this."""
     prune_opacity: float = 0.005
-    """An anchor goes when its opacity, summed over its Gaussians, averages less than this a visit."""
+    """An anchor is pruned if the sum of its Gaussians' opacities is below this on average over the views."""
     least_contribution: float = 0.0
-    """At ``contribution_at`` an anchor goes that contributes less to the training pictures than this share of what an
-    average anchor does (Scaffold-GS: 0, none)."""
+    """At ``contribution_at``, anchors whose contribution to the training pictures is below this share of the mean are
+    pruned (Scaffold-GS: 0, none)."""
     contribution_at: tuple[int, ...] = ()
-    """The iterations after which contributions are looked at."""
+    """The iterations after which anchors are pruned by contribution."""
     max_anchors: int = 1_000_000
-    """No anchor is added beyond this number; those with the largest gradients come first."""
+    """Largest number of anchors; proposals with the largest gradients are taken first (paper: no bound)."""
     least_growth: float = 0.0
-    """There is room for this share of the seeds on top of them, even beyond ``max_anchors``: a capture with many points
-    grows, too."""
+    """At least this share of the number of seeds may be added, even beyond ``max_anchors``."""
     room_until: int = 0
-    """Their number may rise evenly from ``start`` to this iteration; 0: there is room for all from the beginning."""
+    """The allowed number of anchors rises linearly from ``start`` to this iteration; 0: all are allowed at once."""
 
     def room_at(self, iteration: int, seeds: int) -> int:
-        """How many anchors there may be after ``iteration``, when there were ``seeds`` at first.
+        """Allowed number of anchors after ``iteration``, with ``seeds`` initial ones.
 
-        Few at first cost little while pictures are still coarse, and what comes late comes where it is missed most.
+        Few anchors are cheap while the pictures are coarse, and late ones are placed where gradients are still large.
         """
         most = self.max_anchors
         if self.least_growth:
@@ -59,16 +60,16 @@ class GrowthConfig:
         return min(most, seeds + round(share * max(0, most - seeds)))
 
     def last(self, iterations: int) -> int:
-        """The iteration after which anchors no longer change, in a fit of ``iterations``.
+        """The last iteration after which anchors are grown or pruned, in a fit of ``iterations``.
 
-        What is added must be fitted too: a whole interval is left for that. Scaffold-GS, which stops growing half way
-        through its 30,000 iterations, never meets this; the paper ends at 4,000, in the midst of the growing.
+        One interval is left to train the last added anchors. This does not affect Scaffold-GS, which stops growing half
+        way through its 30,000 iterations, but the paper, whose 4,000 iterations end during the growing.
         """
         return min(self.stop, iterations - self.interval)
 
 
 class OpacityStatistics:
-    """Summed opacity and visits of each anchor."""
+    """Sum of opacities, and number of views, of each anchor."""
 
     def __init__(self, anchors: int, device: torch.device) -> None:
         self.opacity = torch.zeros(anchors, device=device)
@@ -84,7 +85,7 @@ class OpacityStatistics:
 class NewAnchors:
     """Anchors to append: positions ``[A, 3]``, one cell size each ``[A]``, features ``[A, D]``.
 
-    ``strengths`` ``[A]`` are the largest mean gradients that asked for them, in thresholds of their level.
+    ``strengths`` ``[A]`` are the largest mean gradients of the proposing Gaussians, in units of the level's threshold.
     """
 
     positions: Tensor
@@ -104,7 +105,7 @@ class NewAnchors:
 
 
 def cell_keys(points: Tensor, cell: float, origin: Tensor, extent: Tensor) -> Tensor:
-    """One int64 for the cell of each point ``[P, 3]``; ``origin``, ``extent`` ``[3]`` int64 bound all cells."""
+    """An int64 key of the cell of each point ``[P, 3]``; ``origin``, ``extent`` ``[3]`` int64 bound all cells."""
     cells = (points / cell).round().to(torch.int64) - origin
     return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
 
@@ -119,20 +120,20 @@ def grow(
     most: int,
     generator: torch.Generator,
 ) -> NewAnchors:
-    """Propose anchors where Gaussians pull hard.
+    """Propose anchors where view-space gradients are large.
 
     Args:
         anchors: the present anchors, ``M`` with ``K`` Gaussians each.
         mean_gradient: ``[M * K]`` mean view-space gradient, NDC.
-        count: ``[M * K]`` how often each Gaussian was drawn.
+        count: ``[M * K]`` number of views that drew each Gaussian.
         voxel_size: the finest cell, scene units.
         config: thresholds.
-        most: at most so many anchors in the end, present ones counted.
+        most: largest number of anchors, including the present ones.
         generator: for the random thinning.
 
-    Three levels of cells (16, 4, 1 voxels); the finer ones only when a coarser one has added something in this call.
-    A cell that already holds an anchor, old or proposed, is left alone. Where there is not room for all, those stay
-    whose gradients exceed their level's threshold most.
+    Three levels of cells (16, 4, 1 voxels); finer levels only if a coarser one has added anchors in this call. Cells
+    with an anchor, present or proposed, get none. If ``most`` is exceeded, the proposals with the largest ratio of
+    gradient to threshold are taken.
     """
     k = anchors.offsets_per_anchor
     eligible = count > config.eligible_count
@@ -183,6 +184,6 @@ def grow(
 
 
 def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
-    """Mask ``[M]`` of anchors that were looked at often enough and are as good as transparent."""
+    """Mask ``[M]`` of the anchors that were in view often enough and are nearly transparent."""
     judged = statistics.visits > config.prune_visits
     return judged & (statistics.opacity < config.prune_opacity * statistics.visits)

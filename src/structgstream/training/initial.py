@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frame 0: a static reconstruction whose anchors are fit to move later (paper, section Structured 3DGs)."""
+"""Frame 0: a static reconstruction with anchors (paper, section Structured 3DGs)."""
 
 from dataclasses import dataclass, field
 
@@ -27,7 +27,7 @@ from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
 
-_CONTRIBUTION_SCALE = 0.5  # Contributions are sums over many pixels: a quarter of them will do.
+_CONTRIBUTION_SCALE = 0.5  # Contributions are sums over many pixels, so half the resolution suffices.
 
 
 @dataclass(frozen=True)
@@ -35,49 +35,53 @@ class InitialRates:
     """Learning rates of frame 0 (Scaffold-GS), scheduled over ``schedule_iterations``."""
 
     positions: LearningRate = constant(0.0)
-    """Anchors do not move in frame 0."""
+    """Of x_v: positions are fixed in frame 0."""
     offsets: LearningRate = LearningRate(0.01, 1e-4)
-    """Times 1.1 rig radii, as the reference code scales it with the extent of the cameras."""
+    """Of O_v, times 1.1 rig radii, as in Scaffold-GS."""
     features: LearningRate = constant(0.0075)
     scales: LearningRate = constant(0.007)
-    """Both scales of an anchor."""
+    """Of both scales of an anchor, in log space."""
     opacity_mlp: LearningRate = LearningRate(0.002, 2e-5)
     covariance_mlp: LearningRate = constant(0.004)
     color_mlp: LearningRate = LearningRate(0.008, 5e-5)
     camera_color: LearningRate = LearningRate(0.002, 1e-4)
-    """Gains and biases; unused when ``camera_color`` is off."""
+    """Of gains and biases; unused without ``camera_color``."""
 
 
 @dataclass(frozen=True)
 class InitialConfig:
-    """How frame 0 is fitted."""
+    """Configuration of frame 0."""
 
     iterations: int = 4000
-    """Paper: 4000."""
+    """Optimisation steps (paper: 4000)."""
     voxel_size: float = 0.005
-    """The paper's eps, in units of the normalised scene."""
+    """The paper's eps (0.005), in units of the normalised scene."""
     seed_voxels: int = 1
-    """Points become one anchor for so many voxels along each axis (paper: 1); growth adds those between where pictures
-    need them."""
+    """Initial points are reduced to one anchor per cell of this many voxels along each axis (paper: 1); growing adds
+    anchors between them."""
     offsets_per_anchor: int = 5
-    """The paper's k."""
+    """The paper's k (5): structured Gaussians per anchor."""
     feature_width: int = 32
+    """Length of f_v (Scaffold-GS: 32)."""
     hidden_width: int = 32
+    """Width of the MLPs' hidden layer (Scaffold-GS: 32)."""
     distance_input: bool = True
-    """Whether the MLPs see the distance to the camera (paper: yes; Scaffold-GS: no)."""
+    """Whether the distance to the camera is an input of the MLPs (paper: yes; Scaffold-GS: no)."""
     camera_color: bool = False
-    """Learn a gain and a bias for each training camera (Note [Colour gauge]); for rigs whose exposures differ."""
+    """Train a gain and a bias per training camera and channel (Note [Colour gauge]), for rigs with unequal exposures
+    (paper: no)."""
     coarse_iterations: int = 0
-    """The first iterations look at pictures reduced by ``coarse_scale``, which cost less."""
+    """Number of first iterations on pictures reduced by ``coarse_scale``, which cost less (paper: 0)."""
     coarse_scale: float = 0.5
+    """Scale of width and height of the pictures in these iterations."""
     schedule_iterations: int = 30_000
     """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
     random_background: bool = False
-    """Whether every iteration has a background of another colour (``training/environment.py``, Note [Honest coverage];
-    paper: black)."""
+    """Random background colour in every iteration (``training/environment.py``, Note [Honest coverage]; paper:
+    black)."""
     all_drawn: bool = False
-    """Whether all of an anchor's Gaussians begin opaque enough to be drawn (``training/seeding.py``, Note [Dead
-    outputs]; Scaffold-GS: no, half of them by chance)."""
+    """Initialise F_alpha so that all of an anchor's Gaussians are drawn (``training/seeding.py``, Note [Dead outputs];
+    Scaffold-GS: no, about half are)."""
     disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
     solidity: SolidityConfig = field(default_factory=SolidityConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
@@ -86,7 +90,7 @@ class InitialConfig:
 
 
 def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[ParameterName, float]:
-    """Rate of every parameter of frame 0 after ``iteration`` steps; ``extent`` is 1.1 rig radii in scene units."""
+    """Learning rate of every parameter of frame 0 after ``iteration`` steps; ``extent``: 1.1 rig radii, scene units."""
     share = iteration / config.schedule_iterations
     units = {"offsets": extent}
     return {
@@ -97,14 +101,14 @@ def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[Pa
 
 
 def rig_extent(rig: CameraRig) -> float:
-    """1.1 times the largest distance of a camera to the mean camera: the unit of Scaffold-GS's offset rate."""
+    """1.1 times the largest distance of a camera to the mean position: the unit of Scaffold-GS's offset rate."""
     centers = torch.stack([rig[name].center for name in rig.training])
     return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
 
 
 @dataclass
 class _FirstFrameHooks(Hooks[View, SceneLoss]):
-    """What frame 0 does in an iteration: disturb what is drawn, grow and remove anchors."""
+    """Iterations of frame 0: perturbation of the drawn Gaussians, growing and pruning of anchors."""
 
     config: InitialConfig
     backend: Backend
@@ -120,13 +124,13 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
 
     @property
     def scene(self) -> Scene:
-        """As it is now; differentiable."""
+        """The present scene; differentiable."""
         return self.parameters.scene(self.template)
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
         config, generator = self.config, self.generator
         scene = self.scene
-        # The order of what is drawn from the generator is part of the result.
+        # The result depends on the order of random draws.
         loss = view_loss(
             scene,
             sample,
@@ -189,9 +193,9 @@ def fit_first_frame(
         frame: the pictures; only those of ``rig.training`` are read.
         rig: cameras in normalised units.
         points: ``[P, 3]`` initial points in normalised units.
-        config: the schedule.
-        backend: what computes.
-        seed: all randomness comes from it.
+        config: of frame 0.
+        backend: the compute back-end.
+        seed: of all random numbers.
         on_step: called after every iteration.
     """
     generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
@@ -226,7 +230,7 @@ def fit_first_frame(
 def _seeded(
     points: Tensor, *, cameras: int, config: InitialConfig, device: torch.device, generator: torch.Generator
 ) -> Scene:
-    """Where frame 0 starts."""
+    """The initial scene of frame 0."""
     return seeded_scene(
         points,
         cameras=cameras,
@@ -242,6 +246,6 @@ def _seeded(
 
 
 def _trained(config: InitialConfig) -> frozenset[ParameterName]:
-    """What has a rate, without the camera colour where it is off."""
+    """The trained parameters, without the camera colour if it is off."""
     trained: set[ParameterName] = {name for name, rate in rates_at(0, config, extent=1.0).items() if rate > 0.0}
     return frozenset(trained if config.camera_color else trained.difference(CAMERA_ROWS))

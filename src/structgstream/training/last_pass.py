@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a fit does at its end, from the last rendering of each view."""
+"""Loss and PSNR at the end of a fit, from the last rendering of each view."""
 
 import math
 
@@ -11,10 +11,10 @@ from structgstream.training.views import View
 
 
 class LastPass:
-    """Mean loss terms and PSNR over the last pass through the cameras. Numbers are read when they are asked for.
+    """Mean loss terms and PSNR over the last pass through the views; tensors are read on access only.
 
     Args:
-        after: iterations that are not looked at; the pass follows them.
+        after: number of first iterations to ignore.
     """
 
     def __init__(self, after: int = 0) -> None:
@@ -23,7 +23,7 @@ class LastPass:
         self._squared_errors: dict[int, Tensor] = {}
 
     def add(self, iteration: int, loss: ViewLoss, view: View) -> None:
-        """Note one view's result, in place of what was noted of it before."""
+        """Record a view's result, replacing its earlier one."""
         if iteration > self._after:
             self._squared_errors[view.index] = loss.squared_error(view)
             self._terms[view.index] = {name: value.detach() for name, value in loss.terms.items()}

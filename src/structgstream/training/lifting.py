@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flow in the training pictures, lifted to a displacement of every mover (Note [Movers])."""
+"""3D displacements of movers (Note [Movers]) from optical flow in the training pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,28 +17,28 @@ from structgstream.training.views import View
 
 @dataclass(frozen=True)
 class LiftConfig:
-    """How flow becomes motion."""
+    """Robust fit of displacements to the flow of neighbouring movers; not in the paper."""
 
     neighbours: int = 12
-    """A mover follows the flow of so many movers nearest to it, itself among them."""
+    """Number of nearest movers, including itself, whose flow a displacement is fitted to."""
     bandwidth: float = 0.7
-    """Standard deviation of the weight of a neighbour by distance, in distances to the farthest of them."""
+    """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
     color_bandwidth: float = 0.15
-    """Standard deviation of the weight of a neighbour by difference in colour, in 0 ... 1: a hand and a ball do not
-    share a motion. 0: colours do not count."""
+    """Standard deviation of the Gaussian weight of a neighbour by colour difference (full scale 1), which separates
+    adjacent objects. 0: no weight by colour."""
     inlier_share: float = 0.4
-    """A displacement counts when so much of the flow agrees with it ..."""
+    """Least share of inliers of a valid displacement, over all flow and in each agreeing view."""
     agreeing_views: int = 2
-    """... in so many views; else a mover begins where its last step leads."""
+    """Least number of agreeing views; otherwise a mover takes the motion prior."""
 
 
 @dataclass(frozen=True)
 class LiftedMotion:
-    """Where movers ``[T]`` begin a frame.
+    """Initial displacements of ``T`` movers in a frame.
 
     Args:
-        displacements: ``[T, 3]`` from where they are.
-        lifted: mask ``[T]`` of those that follow flow; the others follow their last step.
+        displacements: ``[T, 3]``.
+        lifted: mask ``[T]`` of those fitted to flow; the others have their prior.
     """
 
     displacements: Tensor
@@ -58,11 +58,11 @@ def lift_motion(
 
     Args:
         evidence: of these movers.
-        centers: ``[T, 3]`` where they are seen.
-        priors: ``[T, 3]`` where they would go by themselves.
+        centers: ``[T, 3]`` visible centres.
+        priors: ``[T, 3]`` displacements expected without flow.
         views: in the evidence's order; flow is in their pixels.
-        config: how.
-        backend: what computes.
+        config: of the fit.
+        backend: the compute back-end.
 
     Raises:
         MissingExtraError: SciPy is not installed.
@@ -92,12 +92,12 @@ def lift_motion(
 
 
 def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The ``count`` of ``among`` (or all of them) nearest to each of ``points``: rows and distances ``[T, N]``."""
+    """Rows and distances ``[T, N]`` of the ``count`` (or all) nearest ``among`` to each of ``points``."""
     try:
         from scipy.spatial import KDTree
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
     count = min(count, len(among))
-    ranks: Any = list(range(1, count + 1))  # A list, so that one neighbour is a column too.
+    ranks: Any = list(range(1, count + 1))  # A list, so that the result has two dimensions even for one neighbour.
     distances, rows = KDTree(among.double().numpy(force=True)).query(points.double().numpy(force=True), k=ranks)
     return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves: only anchors and free Gaussians whose place in the pictures changed are fitted (design, change gate).
+"""Motion segmentation: only anchors and free Gaussians that cover changed pixels are trained (the change gate).
 
-A Gaussian votes in every view that draws it: it may move if it covers changed pixels, and if they are a good part of
-what it covers there. Blending weights are used, so what is hidden behind something does not vote. A pixel has changed
-when it differs from the last frame's, or when the rendering misses there what frame 0 did not miss: change that is too
-slow to be seen between two frames adds up, and what was left behind stays wrong.
+In each view a mover gets a vote if it covers enough changed pixels, in number and as a share of the pixels that it
+covers. Coverage is by blending weight, so occluded Gaussians get no votes. A pixel has changed if it differs from the
+previous picture, or if the rendering's residual there exceeds frame 0's: the residual also finds change that is too
+slow between two frames, and errors that earlier frames left behind.
 """
 
 from collections.abc import Collection, Sequence
@@ -26,62 +26,60 @@ from structgstream.training.views import View, area_mean
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """When something counts as moving."""
+    """Thresholds of motion segmentation; not in the paper."""
 
     enabled: bool = False
-    """Fit only what moves. Off, the paper: everything."""
+    """Train only movers (paper: False, everything is trained)."""
     change_threshold: float = 0.05
-    """Mean absolute difference, in 0 ... 1, of 3 x 3 pixels since the last frame; above the sensors' noise."""
+    """A pixel has changed if its mean absolute difference to the previous picture over 3 x 3 pixels and the channels
+    (full scale 1) exceeds this; above the sensors' noise."""
     residual_threshold: float = 0.0
-    """A pixel has changed too when the rendering misses so much more there than frame 0's did. 0: only differences
-    between frames count."""
+    """A pixel has also changed if its residual exceeds frame 0's by this (full scale 1). 0: residuals are not used."""
     reach_pixels: int = 3
-    """So far around a changed pixel things may have moved."""
+    """Changed pixels are dilated by this many pixels."""
     least_pixels: float = 0.3
-    """A Gaussian votes in a view where it covers so many changed pixels, counted by blending weight ..."""
+    """Least number of changed pixels, summed by blending weight, that a mover covers in a view to get its vote."""
     least_share: float = 0.3
-    """... and so large a part of what it covers."""
+    """Least share of changed pixels among all that a mover covers in a view to get its vote."""
     least_views: int = 2
-    """Votes that let an anchor, or a free Gaussian, move: one picture cannot tell motion from noise."""
+    """Least number of votes of a mover that is trained: two, because one view may have changed by noise."""
     least_views_share: float = 0.0
-    """So large a part of the views that show it must vote too: a wall beside which something passes in a few of them
-    does not move."""
+    """Least share of votes among the views that show the mover; above 0 it excludes static surfaces beside a moving
+    object, which change in few views."""
     moved_ease: float = 1.0
-    """What the last frame changed needs only so many times the pixels and the share: what moves comes to rest in more
-    than a frame, and what is at the edge of a change does not stutter. 1: no memory."""
+    """Factor (hysteresis) on the thresholds of pixels and shares for movers that the last frame changed. 1: none."""
     unseen_pixels: float = 0.0
-    """Free Gaussians that cover less than this in every view, counted by blending weight, are removed. 0: none."""
+    """Free Gaussians that cover fewer pixels than this in every view, by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
-    """Who covers what is found on pictures of this size."""
+    """Scale of width and height of the pictures on which coverage is computed."""
     margin_pixels: int = 8
-    """Tiles this far around what moves are drawn too, so that it finds its loss where it goes."""
+    """Tiles within this many pixels of moving Gaussians are drawn too, so that these get gradients where they move."""
     full_every_frames: int = 0
-    """Everything may move in every so many-th frame: changes too slow to be seen add up. 0: never."""
+    """Interval in frames at which everything is trained, to follow slow changes. 0: never."""
     tiles: bool = True
-    """Draw only the tiles that moving Gaussians reach. Off: whole pictures, for the same result at their cost."""
+    """Draw only the tiles that moving Gaussians reach. False: whole pictures, with the same result."""
 
 
 SHARED_FIELDS: frozenset[FieldName] = frozenset(fields_of("shared", "camera"))
-"""What all anchors share changes only in frames in which everything may move: what stands still depends on it."""
-
+"""Shared fields are trained only in frames in which everything is, because still anchors depend on them."""
 FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS = 0.3, 20.0
-"""Fewer pixels of flow say nothing of a mover, more say no more than so many."""
+"""Bounds of a mover's flow weight in a view, in pixels: below the first it is 0, above the second it is clamped."""
 
 
 @dataclass(frozen=True)
 class MotionSegmentation:
-    """What may move in a frame.
+    """The motion segmentation of a frame.
 
     Args:
-        anchors: mask ``[M]``.
-        free: mask ``[F]``.
-        unseen: mask ``[F]``, apart from ``free``: what no view shows.
-        visible: for each trusted view the Gaussians ``[M * K + F]`` (Note [Ids]) that are not hidden there.
-        trusted: numbers of the views whose pictures can be believed (``trust``); only they were asked.
-        scene_cut: whether everything changed, so that there is no motion to follow.
-        evidence: how all movers were seen to move, if that was asked for ...
-        views_with_flow: ... and the indices of the views that told of it.
-        centers: ``[M + F, 3]`` where all movers are seen, if that was asked for.
+        anchors: mask ``[M]`` of moving anchors.
+        free: mask ``[F]`` of moving free Gaussians.
+        unseen: mask ``[F]`` of free Gaussians, not in ``free``, that no view shows.
+        visible: by index of each trusted view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
+        trusted: positions of the views that are no outliers (``trust``); only their votes count.
+        scene_cut: whether most pictures changed everywhere, so that motion cannot be segmented.
+        evidence: optical flow of all movers, if it was estimated.
+        views_with_flow: indices of the views with flow.
+        centers: ``[M + F, 3]`` visible centres of all movers, if flow was estimated.
     """
 
     anchors: Tensor
@@ -96,12 +94,12 @@ class MotionSegmentation:
 
     @property
     def movers(self) -> Tensor:
-        """Indices (Note [Movers]) of what may move, ascending."""
+        """Indices (Note [Movers]) of the moving ones, ascending."""
         return torch.cat([self.anchors, self.free]).nonzero()[:, 0]
 
 
 def changed_movers(older: Scene, scene: Scene) -> Tensor:
-    """Mask ``[M + F]``, anchors before free Gaussians, of what ``scene`` has otherwise than ``older`` or not at all."""
+    """Mask ``[M + F]``, anchors before free Gaussians, of the movers that ``older`` lacks or has changed."""
 
     def changed_rows(granularity: Granularity, now: object, then: object) -> Tensor:
         names = [p.attribute for p in parameters_of(fields_of(granularity)) if p.step]
@@ -125,7 +123,7 @@ def detect_changes(
     backend: Backend,
     flow_from: Collection[int] = (),
 ) -> list[PictureChange]:
-    """:func:`~structgstream.training.picture_change.detect_picture_changes` as ``config`` asks for them."""
+    """:func:`~structgstream.training.picture_change.detect_picture_changes` with the values of ``config``."""
     return detect_picture_changes(
         views,
         before,
@@ -147,16 +145,16 @@ def segment_motion(
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
 ) -> MotionSegmentation:
-    """What may move between the pictures of the frame before and those of ``views``.
+    """Segments the movers of ``scene`` by the changes of the pictures since the previous frame.
 
     Args:
-        scene: as it was in the frame before.
-        views: of the frame.
-        changes: of each view since the frame before (:func:`detect_changes`).
-        config: what counts as moving.
-        backend: what computes.
-        older: the scene a frame earlier, for ``moved_ease``; None for none.
-        floor: what frame 0 missed, for ``residual_threshold``; None for none.
+        scene: of the previous frame.
+        views: of this frame.
+        changes: of each view since the previous frame (:func:`detect_changes`).
+        config: thresholds.
+        backend: the compute back-end.
+        older: the scene two frames before, for ``moved_ease``; None for none.
+        floor: residuals of frame 0, for ``residual_threshold``; None for none.
     """
     anchors, free = len(scene.anchors), len(scene.free)
     ease = torch.ones(anchors + free, device=scene.anchors.positions.device)
@@ -197,7 +195,7 @@ def segment_motion(
 
 @dataclass(frozen=True)
 class _ViewEvidence:
-    """What one view says: whether it sees movers ``[E]`` and votes for them, what each id covers, and flow."""
+    """One view's measurements: masks ``[E]`` of visible movers and of votes, coverage by id, and flow sums."""
 
     seen: Tensor
     votes: Tensor

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before the first iteration everything that moves is put where the pictures show it (design, motion start).
+"""Motion start: movers are displaced by optical flow before the first iteration.
 
-The loss of a picture tells a Gaussian which way to go only while it still overlaps with where it belongs. Flow tells it
-from further away, so nothing fast smears, and nothing is left behind as a ghost. Two rounds: the flow between the last
-pictures and these, and then, with that motion made, the flow from what is rendered to these pictures, which also finds
-what lagged behind before.
+The gradient of a picture loss only leads a Gaussian to its new position while both overlap in the picture. Optical flow
+covers larger displacements, so that fast motion leaves no blur and no ghosts. There are two rounds: flow from the
+previous pictures to these, and then, after displacing the movers, flow from the rendering to these pictures, which also
+corrects errors of earlier frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,19 +27,19 @@ from structgstream.training.views import View
 
 @dataclass(frozen=True)
 class MotionStartConfig:
-    """Where what moves begins a frame."""
+    """Initial displacement of movers; not in the paper."""
 
     enabled: bool = False
-    """Lift flow. Off, the paper: everything begins where it was."""
+    """Displace movers by optical flow (paper: False, everything starts at its last position)."""
     rounds: int = 2
-    """1: flow between the pictures alone; 2: and from the rendering to the pictures."""
+    """1: flow between pictures only; 2: also from the rendering to the pictures."""
     views: int = 14
-    """Flow is looked for in about so many views at most, in every second or third one of more, by turns."""
+    """Approximate upper bound of the views in which flow is estimated; of more views every second or third, in turn."""
     lift: LiftConfig = field(default_factory=LiftConfig)
 
 
 def flow_views(views: Sequence[View], frame_index: int, config: MotionStartConfig) -> frozenset[int]:
-    """Indices of the views in which flow is looked for in a frame; none when the start is off."""
+    """Indices of the views in which flow is estimated in a frame; none if the motion start is disabled."""
     if not config.enabled:
         return frozenset()
     stride = -(-len(views) // max(config.views, 2))
@@ -48,13 +48,13 @@ def flow_views(views: Sequence[View], frame_index: int, config: MotionStartConfi
 
 @dataclass(frozen=True)
 class InitialMotion:
-    """How the moving part of a scene begins a frame.
+    """The motion start of the moving part of a scene.
 
     Args:
-        displacements: ``[M + F, 3]`` of its movers (Note [Movers]), from where they were.
-        focuses: by view index, where it shows.
-        lifted_count: movers that follow the flow between pictures.
-        corrected_count: movers that follow the flow from the rendering.
+        displacements: ``[M + F, 3]`` of its movers (Note [Movers]) from their last positions.
+        focuses: by view index, the focus on the moving part.
+        lifted_count: number of movers displaced by flow between pictures.
+        corrected_count: number of movers displaced by flow from the rendering.
     """
 
     displacements: Tensor
@@ -72,15 +72,15 @@ def estimate_initial_motion(
     motion: MotionConfig,
     backend: Backend,
 ) -> InitialMotion:
-    """Where the moving part of ``partition`` begins.
+    """The motion start of the moving part of ``partition``.
 
     Args:
-        partition: with the evidence of flow, if the start is enabled.
+        partition: with the evidence of flow, if the motion start is enabled.
         views: of the frame.
-        priors: ``[M + F, 3]`` displacements of the moving part without any evidence.
-        config: how.
-        motion: what counts as moving.
-        backend: what computes.
+        priors: ``[M + F, 3]`` displacements of the moving part expected without flow.
+        config: of the motion start.
+        motion: of the motion segmentation.
+        backend: the compute back-end.
     """
     segmentation = partition.segmentation
     if not config.enabled or segmentation.evidence is None or segmentation.centers is None or not len(priors):
@@ -119,15 +119,15 @@ def residual_motion(
     config: LiftConfig,
     backend: Backend,
 ) -> LiftedMotion:
-    """What the movers of ``moving`` still lack: lifted from the flow from its rendering to the pictures.
+    """Remaining displacements of the movers of ``moving``, from the flow of its rendering to the pictures.
 
     Args:
-        moving: the moving part of a scene, where it is believed to be.
-        views: in which flow is looked for.
-        focuses: by view index, where it shows, with pictures of it as it is now; views without one are not looked at.
-        scale: of the pictures on which is gathered.
-        config: how.
-        backend: what computes.
+        moving: the moving part of a scene after the first round.
+        views: in which flow is estimated.
+        focuses: by view index, with up-to-date renderings; views without one are skipped.
+        scale: of the pictures on which flow is summed by blending weights.
+        config: of the motion start.
+        backend: the compute back-end.
     """
     seen = [view for view in views if view.index in focuses]
     folded = moving.with_folded_appearance()
@@ -139,7 +139,7 @@ def residual_motion(
             image = apply_camera_color(focus.picture, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
             inside = focus.tiles.pixels()
-            # Outside the tiles nothing was drawn: there the picture takes the place of the rendering.
+            # Outside the tiles nothing was drawn: there the picture replaces the rendering.
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)
             maps = [flow_map(picture, view.image, inside, size), torch.ones(*size, 1).to(image), small.colors]

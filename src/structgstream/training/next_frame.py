@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens in and between the iterations of a frame after the first."""
+"""Iterations of a frame after the first: loss with the price of bits, patching, early stopping."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -26,15 +26,15 @@ from structgstream.training.views import View
 
 @dataclass(frozen=True)
 class StartingPoint:
-    """Where the optimisation of a frame starts.
+    """Initial state of a frame's optimisation.
 
     Args:
         scene: the whole scene, or the moving part of ``partition``.
         views: the pictures.
-        displacements: ``[M + F, 3]`` how far from their places its movers (Note [Movers]) start.
-        partition: what the scene is a part of.
-        focuses: the views, by index, that it shows in, and where; None for all of all.
-        new_free: what joins it.
+        displacements: ``[M + F, 3]`` initial displacements of its movers (Note [Movers]).
+        partition: of which the scene is the moving part; None for a whole scene.
+        focuses: by view index, the focus on the scene; None for whole pictures of all views.
+        new_free: free Gaussians to add.
     """
 
     scene: Scene
@@ -46,25 +46,25 @@ class StartingPoint:
 
     @property
     def seen(self) -> list[View]:
-        """The views that show it."""
+        """The views in which the scene is visible."""
         return self.views if self.focuses is None else [view for view in self.views if view.index in self.focuses]
 
 
 @dataclass
 class NextFrameHooks(Hooks[View, SceneLoss]):
-    """What a later frame does in an iteration: pay for bits, patch once, and stop when there is little to gain.
+    """Hooks of a later frame: the loss with the price of bits, patching once, and early stopping.
 
     Args:
-        start: the scene and the pictures.
-        parameters: what stands for the scene.
+        start: the initial state.
+        parameters: of the scene.
         losses: weights of the terms.
-        bit_price: the price of leaving the last frame's bins; None for nothing.
+        bit_price: the price of changing bins; None for none.
         population: of the free Gaussians.
-        early_stopping: tells when there is little to gain.
-        patch_at: the iteration after which free Gaussians die and are born, unless the frame settles before.
-        patches: whether they do.
+        early_stopping: early stopping.
+        patch_at: the iteration after which free Gaussians are pruned and spawned, unless the frame stops before.
+        patches: whether they are.
         last_pass: gets the result of each view.
-        backend: what the iterations run on.
+        backend: the compute back-end.
         watch: seconds by stage.
     """
 

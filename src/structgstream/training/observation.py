@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures say of each thing that can move, gathered by blending weights.
+"""Per-mover measurements in the pictures, as sums over pixels by blending weights.
 
 Note [Movers]
 ~~~~~~~~~~~~~
-A mover is what moves as one: an anchor with its K Gaussians, or a free Gaussian. Movers are numbered anchors first,
-then free Gaussians, ``M + F`` of them. A map of a picture is gathered for a mover by summing it over the pixels with
-the blending weights of its Gaussians, so that what is hidden behind something says nothing.
+A mover is a unit of motion: an anchor with its K Gaussians, or a free Gaussian. Movers are numbered anchors first, then
+free Gaussians, ``M + F`` in all. A map is gathered for a mover as its sum over the pixels, weighted with the blending
+weights of the mover's Gaussians, so that occluded ones get nothing.
 """
 
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ from structgstream.scene.scene import Scene
 
 @dataclass(frozen=True)
 class MotionEvidence:
-    """How movers ``[E]`` were seen to move in each of ``V`` views.
+    """Optical flow of ``E`` movers in each of ``V`` views.
 
     Args:
-        weights: ``[V, E]`` pixels of believable flow that the mover covers.
-        flows: ``[V, E, 2]`` its mean over them, pixels of the full picture.
-        colors: ``[E, 3]`` mean colour of the pictures where it shows, in 0 ... 1.
+        weights: ``[V, E]`` pixels with consistent flow that the mover covers, by blending weight.
+        flows: ``[V, E, 2]`` mean flow over them, pixels of the full picture.
+        colors: ``[E, 3]`` mean colour of the pictures over the pixels that it covers, in 0 ... 1.
     """
 
     weights: Tensor
@@ -35,7 +35,7 @@ class MotionEvidence:
     colors: Tensor
 
     def select(self, movers: Tensor) -> "MotionEvidence":
-        """Those of a mask or of indices."""
+        """The evidence of the movers of a mask ``[E]`` or of indices ``[e]``."""
         return MotionEvidence(self.weights[:, movers], self.flows[:, movers], self.colors[movers])
 
 
@@ -48,15 +48,15 @@ def gather_maps(
     *,
     still: Gaussians | None = None,
 ) -> Tensor:
-    """Sums of ``maps`` ``[h, w, C]`` over the pixels, by id (Note [Ids]): ``[M * K + F, C]``.
+    """Sums of ``maps`` ``[h, w, C]`` over the pixels by blending weight, by id (Note [Ids]): ``[M * K + F, C]``.
 
     Args:
-        gaussians: of ``scene``, as the camera sees it.
-        scene: whose ids.
-        camera: has the maps' size.
-        maps: what is gathered.
-        backend: what computes.
-        still: others, that hide or are hidden and are not told of.
+        gaussians: of ``scene`` for the camera.
+        scene: defines the ids.
+        camera: of the maps' size.
+        maps: to sum.
+        backend: the compute back-end.
+        still: further Gaussians, which only take part in occlusion.
     """
     drawn = gaussians if still is None else concatenate(gaussians, still)
     found = backend.blending_weights(drawn, camera.viewport(drawn.means), maps)
@@ -77,12 +77,12 @@ def sum_by_mover(sums: Tensor, scene: Scene) -> Tensor:
 
 
 def flow_evidence(sums: Sequence[Tensor], *, least_pixels: float, most_pixels: float) -> MotionEvidence:
-    """Evidence from what was gathered in each view of the maps c, c flow_x, c flow_y, 1, r, g and b.
+    """Evidence from the gathered sums of the maps c, c flow_x, c flow_y, 1, r, g and b in each view.
 
     Args:
         sums: by view ``[E, 7]``, in pixels of the full picture.
-        least_pixels: fewer pixels of flow say nothing.
-        most_pixels: more count as so many.
+        least_pixels: fewer pixels of flow get weight 0.
+        most_pixels: upper bound of a weight.
     """
     stacked = torch.stack(list(sums))
     weights, moved, coverage, colors = stacked[..., 0], stacked[..., 1:3], stacked[..., 3], stacked[..., 4:]
@@ -92,10 +92,10 @@ def flow_evidence(sums: Sequence[Tensor], *, least_pixels: float, most_pixels: f
 
 
 def mover_centers(scene: Scene, coverage: Tensor) -> Tensor:
-    """Where each mover is seen to be, ``[M + F, 3]``: the mean of its Gaussians, weighted with what each covers.
+    """Visible centre of each mover, ``[M + F, 3]``: the mean of its Gaussians' means, weighted with their coverage.
 
     Args:
-        scene: whose movers.
+        scene: with the movers.
         coverage: ``[M * K + F]`` pixels, by id.
     """
     anchors, m = scene.anchors, len(scene.anchors) * scene.anchors.offsets_per_anchor

@@ -49,7 +49,7 @@ from structgstream.training.views import View, shuffled_views
 
 @dataclass(frozen=True)
 class OnlineRates:
-    """Learning rates of online frames (paper, section Implementations), in units of the normalised scene."""
+    """Learning rates of online frames (values of the paper, section Implementations), in normalised units."""
 
     anchor_positions: float = 4e-4
     offset_scales: float = 5e-3
@@ -60,38 +60,39 @@ class OnlineRates:
     free_logit_opacities: float = 5e-2
     free_colors: float = 2.5e-3
     base_scales: float = 5e-3
-    """Used only when ``base_scales`` is in the dynamic set, as are the following."""
+    """This and the following are used only if the field is in the dynamic set (not in the paper)."""
     anchor_offsets: float = 1e-3
     anchor_features: float = 2.5e-3
     appearance: float = 2e-2
     opacity_mlp: float = 2e-3
     color_mlp: float = 4e-3
     final_share: float = 1.0
-    """Rates of the anchors and MLPs fall log-linearly to this share within a frame (paper: constant)."""
+    """Learning rates of anchors and MLPs decay log-linearly to this share within a frame (paper: 1, constant)."""
 
 
 @dataclass(frozen=True)
 class OnlineConfig:
-    """How a frame after the first is fitted."""
+    """Configuration of the frames after the first."""
 
     iterations: int = 100
+    """Optimisation steps per frame (paper: 100)."""
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
-    """Rows of the state table that change after frame 0; the paper's ablations edit it."""
+    """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
     appearance_rank: int = 4
-    """Directions in which the features of an anchor may change, if ``appearance`` is dynamic."""
+    """Number of principal components along which features change, if ``appearance`` is dynamic (not in the paper)."""
     losses: LossWeights = field(default_factory=LossWeights)
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     start: MotionStartConfig = field(default_factory=MotionStartConfig)
-    """Where what moves begins a frame; only with ``motion``."""
+    """Initial displacements of movers; only with ``motion``."""
     births: BirthConfig = field(default_factory=BirthConfig)
-    """What is born from geometry, and dies of blame, before the first iteration; only with ``motion``."""
+    """Births of free Gaussians from geometry, and removal of outliers; only with ``motion``."""
     motion_prior: float = 0.0
-    """Anchors that move begin a frame this share of their last step further on (the paper: 0, where they are)."""
+    """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
     least_gain: float = 0.0
-    """A frame ends, and patching comes, early when ``iterations`` at the present pace would lower its loss by less than
-    this share (the paper: 0, never)."""
+    """Early stopping (and early patching): when ``iterations`` steps at the present rate would lower the loss by less
+    than this share (paper: 0, never)."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
 
 
@@ -121,21 +122,21 @@ def fit_next_frame(
     floor: ResidualFloor | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult[Scene]:
-    """Bring ``scene``, the decoded scene of the frame before, to ``frame``.
+    """Fit ``scene``, the decoded scene of the previous frame, to ``frame``.
 
     Args:
-        scene: where to start (Note [Closed loop]).
+        scene: the initial scene (Note [Closed loop]).
         frame: the pictures; only those of ``rig.training`` are read.
         rig: cameras in normalised units.
-        config: what may change, and how.
-        backend: what computes.
-        seed: all randomness comes from it, so a frame can be repeated alone.
-        steps: of what is sent rounded (Note [Bins]); what it names is drawn rounded and comes back so.
-        older: the decoded scene two frames before, for what has a memory (:func:`needs_older`); None for none.
-        floor: what frame 0 missed, for ``config.motion.residual_threshold`` and for births; None for nothing.
-        before: the frame before, which tells what moves (``config.motion``); without it everything may.
-        pictures: of ``frame`` after ``before`` (:func:`~structgstream.training.pictures.pictures_of`), where they were
-            looked at already.
+        config: of online frames.
+        backend: the compute back-end.
+        seed: of all random numbers, so that a frame can be repeated alone.
+        steps: quantization steps (Note [Bins]); the parameters it names are drawn and returned quantized.
+        older: the decoded scene two frames before, if :func:`needs_older`; None for none.
+        floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for births; None for none.
+        before: the previous frame, for motion segmentation (``config.motion``); without it everything is trained.
+        pictures: of ``frame`` and their changes since ``before``
+            (:func:`~structgstream.training.pictures.pictures_of`), if computed already.
         on_step: called after every iteration.
     """
     if config.patching.lifetime == "frame":
@@ -154,7 +155,7 @@ def fit_next_frame(
 
     if backend.device.type != "cuda":
         return fit_with(backend)
-    # The host runs ahead of a GPU as long as no iteration waits for it.
+    # The host can run ahead of a GPU because no iteration synchronises.
     return run_with_pair_budget(
         lambda budget: fit_with(nonblocking(backend, budget)),
         capacity=max(1 << 18, 8 * slot_count(scene)),
@@ -163,13 +164,13 @@ def fit_next_frame(
 
 
 def needs_older(config: OnlineConfig) -> bool:
-    """Whether a frame is fitted after the two before it, instead of one."""
+    """Whether a frame depends on the two decoded frames before it, instead of one."""
     return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
 
 
 @dataclass(frozen=True)
 class _FrameFit:
-    """The optimisation of one frame; ``iteration_backend`` is what the iterations run on."""
+    """The optimisation of one frame; ``iteration_backend`` is the back-end of the iterations."""
 
     config: OnlineConfig
     backend: Backend
@@ -183,7 +184,7 @@ class _FrameFit:
     def optimize(self, start: StartingPoint) -> FitResult[Scene]:
         """Fit the scene of ``start`` to the pictures."""
         config, seen = self.config, start.seen
-        # Each view is looked at as often as in a full frame.
+        # Each view is used as often as in a full frame.
         iterations = math.ceil(config.iterations * len(seen) / len(start.views))
         samples = shuffled_views(seen, self.generator)
         hooks = self._hooks(start, iterations)
@@ -236,7 +237,7 @@ class _FrameFit:
         )
 
     def _parameters(self, start: StartingPoint) -> tuple[Parameters, BitPrice | None]:
-        """The leaves of the scene where it was in the last frame, and the price of leaving that."""
+        """The leaves of the scene as in the previous frame, and the price of changing their bins."""
         config = self.config
         dynamic = config.dynamic if start.partition is None else config.dynamic.difference(SHARED_FIELDS)
         trained = parameters_of_fields(dynamic)
@@ -247,7 +248,7 @@ class _FrameFit:
 
 
 def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], start: StartingPoint) -> None:
-    """Put what is trained where the frame starts, with what is born."""
+    """Set the leaves to the frame's initial state, with the births."""
     values, anchors = parameters.values, len(start.scene.anchors)
     if values["anchor_positions"].requires_grad:
         values["anchor_positions"].data += start.displacements[:anchors]
@@ -261,7 +262,7 @@ def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], star
 
 
 def _prior_displacements(scene: Scene, older: Scene | None, motion_prior: float) -> Tensor:
-    """How far from their places the movers start ``[M + F, 3]``: a share of the anchors' last step."""
+    """Initial displacements ``[M + F, 3]`` of the movers: a share of the anchors' last displacement."""
     displacements = torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions)
     if older is not None and motion_prior:
         displacements[: len(scene.anchors)] = motion_prior * (scene.anchors.positions - older.anchors.positions)
@@ -277,7 +278,7 @@ def _fit_moving_part(
     older: Scene | None,
     floor: ResidualFloor | None,
 ) -> FitResult[Scene]:
-    """Fit what moves in ``scene``, from where the pictures show it, and leave the rest as it is."""
+    """Fit the moving part of ``scene``, after the motion start, and keep the still part."""
     config, backend, watch = fit.config, fit.backend, fit.watch
     displacements = _prior_displacements(scene, older, config.motion_prior)
     with watch.stage("find motion"):

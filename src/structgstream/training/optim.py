@@ -12,18 +12,18 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 
 BETAS = (0.9, 0.999)
-EPS = 1e-15  # As 3D Gaussian splatting: gradients of a mean over pixels are tiny, torch's 1e-8 would damp them.
+EPS = 1e-15  # As in 3D Gaussian splatting: gradients of a mean over pixels are tiny, and torch's 1e-8 would damp them.
 
 
 @dataclass(frozen=True)
 class LearningRate:
-    """A learning rate, log-linear from ``initial`` to ``final`` over a schedule."""
+    """A learning-rate schedule, log-linear from ``initial`` to ``final``."""
 
     initial: float
     final: float
 
     def at(self, share: float) -> float:
-        """The rate after ``share`` (0 to 1) of the schedule."""
+        """The learning rate after ``share`` (0 to 1) of the schedule."""
         if self.initial <= 0.0 or self.final == self.initial:
             return self.initial
         share = min(max(share, 0.0), 1.0)
@@ -31,7 +31,7 @@ class LearningRate:
 
 
 def constant(rate: float) -> LearningRate:
-    """A rate that does not change."""
+    """A constant learning rate."""
     return LearningRate(rate, rate)
 
 
@@ -39,7 +39,7 @@ Name = TypeVar("Name", bound=str)
 
 
 def leaves(values: Mapping[Name, Tensor]) -> dict[Name, Tensor]:
-    """Copies of ``values`` that collect gradients."""
+    """Copies of ``values`` as leaves with gradients."""
     return {name: value.detach().clone().contiguous().requires_grad_() for name, value in values.items()}
 
 
@@ -48,9 +48,9 @@ class Adam(Generic[Name]):
     """Named leaf tensors and Adam's state of each; a fresh one is made for each fit, so no state crosses frames.
 
     Args:
-        backend: what steps.
-        values: the leaves; the mapping is shared with whoever made them, and changed when rows come and go.
-        eps: Adam's.
+        backend: computes the steps.
+        values: the leaves; the mapping is shared with the caller, and updated when rows are added or removed.
+        eps: Adam's epsilon.
     """
 
     backend: Backend
@@ -61,7 +61,7 @@ class Adam(Generic[Name]):
     steps: dict[Name, int] = field(default_factory=dict)
 
     def step(self, gradients: Mapping[Name, Tensor], rates: Mapping[Name, float]) -> None:
-        """Move every leaf that has a gradient and a positive rate."""
+        """Update every leaf that has a gradient and a positive learning rate."""
         for name, gradient in gradients.items():
             rate = rates[name]
             if rate <= 0.0:
@@ -84,7 +84,7 @@ class Adam(Generic[Name]):
             )
 
     def replace_rows(self, added: Mapping[Name, Tensor], *, keep: Tensor) -> None:
-        """In every leaf of ``added`` keep the rows of the mask ``keep`` and append its own, whose state is zero."""
+        """In every leaf of ``added`` keep the rows of the mask ``keep`` and append the new rows with zero moments."""
         for name, rows in added.items():
             old = self.values[name]
             together = torch.cat([old.detach()[keep], rows.detach()])
@@ -95,7 +95,7 @@ class Adam(Generic[Name]):
                     state[name] = torch.cat([kept, kept.new_zeros(rows.shape)])
 
     def replace_values(self, name: Name, value: Tensor) -> None:
-        """Put ``value`` in place of a leaf and forget its moments; its steps are counted on."""
+        """Replace a leaf by ``value`` and reset its moments, but not its step count."""
         self.values[name] = value.detach().clone().contiguous().requires_grad_()
         for state in (self.first, self.second):
             if name in state:

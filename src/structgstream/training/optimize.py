@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of every fit: a view, its loss, one step of Adam.
+"""The optimisation loop of all fits: a view, its loss, one Adam step.
 
-What fits differ in is in their hooks: which loss a view has, and what happens between steps (growing, patching,
-stopping early). ``training/initial.py``, ``training/online.py`` and every peer use this loop.
+Fits differ in their hooks: the loss of a view, and the actions between steps (growing, patching, early stopping).
+``training/initial.py``, ``training/online.py`` and all peers use this loop.
 """
 
 from abc import ABC, abstractmethod
@@ -24,11 +24,11 @@ LossT = TypeVar("LossT", bound=Loss)
 
 @dataclass(frozen=True)
 class Schedule(Generic[Name]):
-    """How long to optimise and how fast.
+    """Number of iterations and learning rates.
 
     Args:
-        iterations: steps at most.
-        rates: learning rate of every leaf in an iteration, counted from 1.
+        iterations: largest number of steps.
+        rates: gives the learning rate of every leaf in an iteration, counted from 1.
         before: steps of the frame in stages before this one, for progress.
         after: steps of the frame in stages after this one, for progress.
     """
@@ -40,20 +40,20 @@ class Schedule(Generic[Name]):
 
 
 class Hooks(ABC, Generic[SampleT, LossT]):
-    """What one kind of fit does in an iteration, counted from 1."""
+    """The parts of an iteration, counted from 1, in which fits differ."""
 
     @abstractmethod
     def loss(self, iteration: int, sample: SampleT) -> LossT:
-        """The loss of a sample: a view of the frame, or whatever else the iterator gives."""
+        """The loss of a sample, which usually is a view of the frame."""
 
     def after_step(self, iteration: int, sample: SampleT, loss: LossT, screen_gradient: Tensor | None) -> None:
-        """What follows the step: statistics, births and deaths.
+        """Called after the step: statistics, spawning, pruning.
 
-        ``screen_gradient`` ``[N, 2]`` is that of the loss by screen positions in pixels; None if it was not tracked.
+        ``screen_gradient`` ``[N, 2]`` is the view-space gradient in pixels; None if it was not tracked.
         """
 
     def finished(self, iteration: int) -> bool:
-        """Whether no step is needed after so many."""
+        """Whether to stop after this iteration."""
         return False
 
     def counts(self) -> tuple[int, int]:
@@ -70,15 +70,15 @@ def optimize(
     watch: Stopwatch,
     on_step: StepListener | None = None,
 ) -> int:
-    """Step the leaves of ``adam`` down the losses of ``samples``; returns the number of iterations done.
+    """Minimise the losses of ``samples`` over the leaves of ``adam``; returns the number of iterations done.
 
     Args:
-        adam: the leaves that collect gradients are moved.
-        samples: without end; one for each iteration.
-        schedule: how long and how fast.
-        hooks: the loss, and what else happens.
+        adam: with the leaves.
+        samples: an endless iterator; one sample per iteration.
+        schedule: number of iterations and learning rates.
+        hooks: the loss, and the actions between steps.
         watch: gets the seconds of stages ``backward`` and ``optimise``.
-        on_step: told of every iteration; on a GPU, which is waited for to know the loss, of every tenth.
+        on_step: called after every iteration; on a GPU, where reading the loss synchronises, after every tenth.
     """
     told_every = 1 if adam.backend.device.type == "cpu" else 10
     total = schedule.before + schedule.iterations + schedule.after
@@ -99,9 +99,9 @@ def optimize(
 def gradients_of(
     loss: Loss, values: Mapping[Name, Tensor], watch: Stopwatch
 ) -> tuple[dict[Name, Tensor], Tensor | None]:
-    """Gradients of the leaves, and of the screen positions ``[N, 2]`` in pixels when they were tracked.
+    """Gradients of the leaves, and the view-space gradient ``[N, 2]`` in pixels if it was tracked.
 
-    A leaf that the view did not touch has no entry; where nothing is drawn there is none at all.
+    Leaves that the loss does not depend on have no entry; if nothing is drawn there are no entries.
     """
     names = [name for name, value in values.items() if value.requires_grad and value.numel()]
     screen = loss.screen_offsets

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene taken apart into the tensors that an optimiser moves, and put together again."""
+"""A scene as the tensors that the optimiser trains, and back."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -25,7 +25,7 @@ from structgstream.training.rounding import round_straight_through
 
 
 def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
-    """What an optimiser can move of the fields of ``granularities``, in the order of the state table."""
+    """The trainable parameters of the fields of ``granularities``, in the order of the state table."""
     return tuple(p.name for p in parameters_of(fields_of(*granularities)) if p.trainable)
 
 
@@ -33,12 +33,12 @@ ANCHOR_ROWS, FREE_ROWS, CAMERA_ROWS = trainable("anchor"), trainable("free"), tr
 
 
 def parameters_of_fields(names: Iterable[FieldName]) -> frozenset[ParameterName]:
-    """What an optimiser can move of the fields ``names``."""
+    """The trainable parameters of the fields ``names``."""
     return frozenset(p.name for p in parameters_of(names) if p.trainable)
 
 
 def values_of_rows(rows: AnchorCloud | FreeGaussians, names: Collection[ParameterName]) -> dict[ParameterName, Tensor]:
-    """The parameters ``names``, of anchors or of free Gaussians, that ``rows`` have."""
+    """The tensors of the parameters ``names``, of anchors or of free Gaussians, in ``rows``."""
     found: dict[ParameterName, Tensor] = {}
     for parameter in PARAMETERS:
         if parameter.name in names and (value := getattr(rows, parameter.attribute)) is not None:
@@ -48,7 +48,7 @@ def values_of_rows(rows: AnchorCloud | FreeGaussians, names: Collection[Paramete
 
 @dataclass
 class Parameters:
-    """Leaf tensors by name. The one mutable thing of a fit; it never leaves it.
+    """Leaf tensors by name: the mutable state of a fit, which is not visible outside of it.
 
     ``values[name].requires_grad`` says whether the name is trained.
     """
@@ -61,7 +61,7 @@ class Parameters:
     def of(
         cls, scene: Scene, *, trained: frozenset[ParameterName], steps: Mapping[ParameterName, float] | None = None
     ) -> "Parameters":
-        """Copies of a scene's tensors; those in ``trained`` collect gradients, those in ``steps`` are drawn rounded."""
+        """Copies of a scene's tensors; ``trained`` ones have gradients, those in ``steps`` are drawn quantized."""
         copies: dict[ParameterName, Tensor] = {
             p.name: value.detach().clone().contiguous().requires_grad_(p.name in trained)
             for p in PARAMETERS
@@ -71,7 +71,7 @@ class Parameters:
         return cls(copies, scene.free.births.clone(), known)
 
     def scene(self, template: Scene) -> Scene:
-        """The scene these parameters stand for; differentiable. ``template`` has what is not trained."""
+        """The scene with these parameters; differentiable. Other attributes are those of ``template``."""
         values: dict[ParameterName, Tensor] = {
             p.name: value for p in PARAMETERS if not p.trainable and (value := tensor_of(template, p)) is not None
         }

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene taken apart into what moves in a frame and what stands still, and put together again.
+"""Partition of a scene into its moving and its still part, and merging.
 
-The moving part is a scene of its own with the same MLPs: a trainer works on it as on any other, at the cost of what
-moves. Its ids are its own (Note [Ids]).
+The moving part is a scene with the same MLPs and its own ids (Note [Ids]); training it costs in proportion to its size.
 """
 
 from collections.abc import Sequence
@@ -29,10 +28,10 @@ class Partition:
     """A scene in two parts.
 
     Args:
-        whole: as it was.
-        segmentation: what the moving part holds.
-        moving: that part.
-        still: the rest, but for free Gaussians that are not seen.
+        whole: the scene.
+        segmentation: the motion segmentation.
+        moving: the moving part.
+        still: the still part, without free Gaussians that no view shows.
     """
 
     whole: Scene
@@ -42,7 +41,7 @@ class Partition:
 
     @classmethod
     def of(cls, scene: Scene, segmentation: MotionSegmentation) -> "Partition":
-        """Take ``scene`` apart."""
+        """Partition ``scene``."""
 
         def part(anchors: Tensor, free: Tensor) -> Scene:
             return replace(scene, anchors=scene.anchors.select(anchors), free=scene.free.select(free))
@@ -51,22 +50,22 @@ class Partition:
         return cls(scene, segmentation, moving, part(~segmentation.anchors, ~(segmentation.free | segmentation.unseen)))
 
     def merge(self, moved: Scene) -> Scene:
-        """The whole scene, its moving part replaced by ``moved``; what stood still keeps its bits.
+        """The whole scene with its moving part replaced by ``moved``; the still part keeps its bits.
 
-        ``moved`` has the anchors of ``moving``; free Gaussians may have come and gone.
+        ``moved`` has the anchors of ``moving``; free Gaussians may have been added and removed.
         """
         free = self.still.free.append(moved.free)
         return replace(
             self.whole,
             anchors=self.whole.anchors.with_rows(self.segmentation.anchors, moved.anchors),
-            free=free.select(free.births.argsort()),  # Births ascend, and are never used twice.
+            free=free.select(free.births.argsort()),  # Births ascend and are unique.
         )
 
 
 def focus_views(
     partition: Partition, views: Sequence[View], *, config: MotionConfig, backend: Backend
 ) -> dict[int, Focus]:
-    """By index, the views that the moving part shows in, and where."""
+    """By view index, the focus on the moving part; views without it have none."""
     segmentation, moving, still = (
         partition.segmentation,
         partition.moving.with_folded_appearance(),
@@ -86,7 +85,7 @@ def _focus(
     still: Scene, moving: Scene, visible: Tensor, camera: Camera, config: MotionConfig, backend: Backend
 ) -> Focus | None:
     in_motion = moving.gaussians(camera, backend)
-    # How far Gaussians reach is as well told by a small picture, which costs a sixteenth.
+    # Extents of Gaussians are measured on a reduced picture, which costs a sixteenth.
     small = camera.resized(*(max(1, round(size * REACH_SCALE)) for size in (camera.width, camera.height)))
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
@@ -95,7 +94,7 @@ def _focus(
         return None
     if not config.tiles:
         tiles = replace(tiles, mask=torch.ones_like(tiles.mask))
-    # The loss looks ten pixels beyond a tile: a ring of tiles around them is drawn once and stays as it is.
+    # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
     around = torch.nn.functional.max_pool2d(tiles.mask[None].float(), 3, stride=1, padding=1)[0] > 0
     ring = replace(tiles, mask=around)
     at_rest = still.with_free_gaussians(still.structured(camera, backend, tiles=ring))
@@ -103,14 +102,14 @@ def _focus(
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
     drawn, behind = concatenate(in_motion, at_rest), still.background(camera)
     rendering = draw(drawn, camera, backend, focus=Focus(ring, empty, nothing), background=behind)
-    # Anchors were culled as a whole; what reaches no tile is not looked at again.
+    # Anchors were culled as a whole; Gaussians that reach no tile are dropped.
     return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
 
 
 def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
-    """The tiles that drawn Gaussians of the mask ``visible`` reach, or could within ``margin_pixels``.
+    """The tiles within ``margin_pixels`` of the drawn Gaussians of the mask ``visible``.
 
-    Two standard deviations of a Gaussian count: what lies beyond hardly shows.
+    Gaussians are truncated at two standard deviations.
     """
     rows, columns = tile_grid(camera.width, camera.height)
     drawn = visible & (rendering.radii > 0)

@@ -20,26 +20,27 @@ BIRTHS_PER_FRAME = 1 << 32  # Birth ids are frame * 2^32 + n, so they never repe
 
 @dataclass(frozen=True)
 class PatchingConfig:
-    """When free Gaussians are born and die."""
+    """Spawning and pruning of free Gaussians."""
 
     spawn: Literal["gradient", "random", "off"] = "gradient"
-    """``gradient`` is the paper's rule, ``random`` its ablation (as many parents, drawn at random)."""
+    """Choice of parents: ``gradient`` (paper), ``random`` (its ablation: as many, drawn at random), ``off``."""
     iteration: int = 50
-    """Patching happens once a frame, after this iteration (paper: 50 of 100)."""
+    """Iteration after which patching is done, once per frame (paper: 50 of 100)."""
     grad_threshold: float = 1e-3
-    """The paper's tau_grad, on the mean view-space gradient, NDC (Note [View-space units])."""
+    """The paper's tau_grad (0.001), on the mean view-space gradient in NDC (Note [View-space units])."""
     collect_from: int = 0
-    """Gradients are collected after this iteration of the frame."""
+    """Iteration of the frame after which gradients are averaged (paper: not stated)."""
     covariance_factor: float = 2.0
-    """A child is drawn from N(mu, factor * Sigma) (paper: 2)."""
+    """Factor on the covariance from which a child's mean is drawn, N(mu, factor * Sigma) (paper: 2)."""
     opacity: float = 0.1
-    """Opacity at birth."""
+    """Opacity at birth (paper: 0.1)."""
     prune_opacity: float | None = 0.005
-    """Free Gaussians with less opacity are removed before spawning; None keeps all ("w/o quantity control")."""
+    """Free Gaussians of less opacity are removed before spawning (paper: 0.005); None: no pruning, the paper's "w/o
+    quantity control"."""
     lifetime: Literal["stream", "frame"] = "stream"
-    """``stream``: inherited by the next frame (global patching); ``frame``: dropped at its start (I1 to I3)."""
+    """``stream``: inherited by the next frame (paper: global patching); ``frame``: dropped at its start (I1 to I3)."""
     max_free: int = 1_000_000
-    """No Gaussian is born beyond this number; those with the largest gradients come first."""
+    """Largest number of free Gaussians; parents with the largest gradients are taken first (paper: no bound)."""
 
 
 def survivor_mask(free: FreeGaussians, config: PatchingConfig) -> Tensor:
@@ -56,8 +57,8 @@ def choose_parents(
 
     Args:
         mean_gradient: ``[slots]`` NDC.
-        count: ``[slots]`` how often each Gaussian was drawn.
-        room: at most this many.
+        count: ``[slots]`` number of views that drew each Gaussian.
+        room: largest number of parents.
         config: the rule.
         generator: for the random rule.
     """
@@ -74,10 +75,10 @@ def choose_parents(
 
 
 def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: Backend) -> Gaussians:
-    """The Gaussians ``ids``, ascending, as the first of ``views`` that generates each of them sees it.
+    """The Gaussians ``ids``, ascending, each generated for the first of ``views`` that draws it.
 
-    Structured Gaussians exist only for a camera; a child copies colour and scale from a view in which its parent is
-    drawn. An id that no view generates (its opacity has fallen to zero) is left out.
+    Structured Gaussians depend on the camera; a child copies colour and scale from a view in which its parent is drawn.
+    Ids that no view draws (opacity 0) are left out.
     """
     found: list[Gaussians] = [_empty_like(scene)]
     slots = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
@@ -113,10 +114,10 @@ def _empty_like(scene: Scene) -> Gaussians:
 def spawn_children(
     parents: Gaussians, *, first_birth: int, config: PatchingConfig, generator: torch.Generator
 ) -> FreeGaussians:
-    """One free Gaussian for each parent, drawn from N(mu, factor * Sigma).
+    """One free Gaussian per parent, with its mean drawn from N(mu, factor * Sigma).
 
-    With Sigma = R S S^T R^T a draw is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
-    parent's, the rotation is the unit quaternion, the opacity ``config.opacity``. Births count from ``first_birth``.
+    With Sigma = R S S^T R^T a sample is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
+    parent's, the rotation is the identity, the opacity ``config.opacity``. Births count from ``first_birth``.
     """
     count = len(parents)
     z = torch.randn(count, 3, generator=generator).to(parents.means)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps frame 0 from learning its few cameras by heart: in every iteration the scene is a little different.
+"""Regularisation of frame 0 against overfitting to the training views: Gaussian dropout and random perturbation.
 
-Cameras of a ring see a surface from few sides. Gaussians that only look right together from exactly there are found
-out when some are missing and none is quite where it was.
+A rig sees a surface from few directions, so combinations of Gaussians can fit the training views and be wrong between
+them. Dropping some Gaussians and perturbing the others in every iteration gives such combinations a large loss.
 """
 
 from dataclasses import dataclass, replace
@@ -15,27 +15,27 @@ from structgstream.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class PerturbationConfig:
-    """How much a scene is disturbed while frame 0 is fitted."""
+    """Dropout and perturbation while frame 0 is trained."""
 
     dropped_share: float = 0.0
-    """So many of the Gaussians are left out of an iteration, and the rest made as much more opaque (paper: 0)."""
+    """Share of the Gaussians dropped in an iteration; the others' opacities are scaled up accordingly (paper: 0)."""
     noise_scales: float = 0.0
-    """Means are shifted by normal noise of so many standard deviations of their Gaussian (paper: 0)."""
+    """Standard deviation of normal noise on the means, in units of each Gaussian's own scale (paper: 0)."""
     until_share: float = 1.0
-    """These two fade out linearly until this share of the iterations."""
+    """The two above decrease linearly to 0 at this share of the iterations."""
     view_noise: float = 0.0
-    """Anchors look as from a place beside the camera: normal noise of so many rig radii (paper: 0)."""
+    """Standard deviation, in rig radii, of normal noise on the camera centre that the MLPs' inputs use (paper: 0)."""
     view_noise_left: float = 1.0
-    """The share of it that is left, falling linearly, at the last iteration; 1: it stays the same."""
+    """Share of ``view_noise`` left at the last iteration, decreasing linearly; 1: constant."""
 
 
 class Perturbation:
-    """Disturbs the Gaussians of one iteration.
+    """Perturbs the Gaussians of one iteration.
 
     Args:
-        config: how much.
-        generator: what is drawn comes from it.
-        strength: 1 for all of it, 0 for nothing.
+        config: amounts of dropout and noise.
+        generator: of the random numbers.
+        strength: factor on the amounts, 0 to 1.
     """
 
     def __init__(self, config: PerturbationConfig, generator: torch.Generator, *, strength: float) -> None:
@@ -51,7 +51,7 @@ class Perturbation:
             opacities = (opacities * kept / (1.0 - dropped)).clamp(max=0.999)
         if noise > 0.0:
             shift = torch.randn(means.shape, generator=self._generator).to(means)
-            # Along the axes of the scene, by the mean extent: it is noise, so no rotation is worth its cost.
+            # Isotropic noise by the mean scale: following each Gaussian's rotation is not worth its cost.
             means = means + noise * gaussians.scales.detach().mean(1, keepdim=True) * shift
         return replace(gaussians, opacities=opacities, means=means)
 
@@ -67,18 +67,18 @@ def perturbed_center(
     config: PerturbationConfig,
     generator: torch.Generator,
 ) -> Tensor | None:
-    """From where the anchors are looked at in ``iteration`` of ``iterations``, ``[3]``; None for the camera itself.
+    """Perturbed origin ``[3]`` of the view direction in ``iteration`` of ``iterations``; None for the camera's centre.
 
-    What the MLPs see of the camera is disturbed, not the projection: looks may then depend on the direction only as
-    slowly as the noise is wide, and cannot tell one training camera from the next.
+    Only the MLPs' inputs are perturbed, not the projection. Appearance then varies slowly with the direction, so that
+    it cannot be fitted to single training cameras.
 
     Args:
-        center: where the camera is, ``[3]``.
+        center: of the camera, ``[3]``.
         radius: of the rig, scene units.
         iteration: from 1 on.
         iterations: of the fit.
-        config: how much.
-        generator: what is drawn comes from it.
+        config: amounts of noise.
+        generator: of the random numbers.
     """
     if not config.view_noise:
         return None
@@ -89,7 +89,7 @@ def perturbed_center(
 def perturbation_at(
     iteration: int, iterations: int, config: PerturbationConfig, generator: torch.Generator
 ) -> Perturbation | None:
-    """The disturbance of ``iteration`` of ``iterations``; None for none."""
+    """The perturbation of ``iteration`` of ``iterations``; None for none."""
     strength = 1.0 - iteration / max(1.0, iterations * config.until_share)
     if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
         return None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What two pictures of one camera tell by themselves: nothing here looks at a scene.
+"""Changed pixels and optical flow between two pictures of one camera, independent of the scene.
 
-So it can be found for the next frame while this one is still being fitted (``lookahead``).
+They can therefore be computed for the next frame while one is fitted (``lookahead``).
 """
 
 from collections.abc import Collection, Sequence
@@ -17,13 +17,13 @@ from structgstream.training.views import View
 
 @dataclass(frozen=True)
 class PictureChange:
-    """How a training picture differs from the one before it.
+    """Change of a training picture since the previous one.
 
     Args:
-        changed: ``[H, W]`` bool, pixels that changed.
+        changed: ``[H, W]`` bool, dilated mask of the changed pixels.
         identical: whether the two are equal bit for bit.
-        flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the picture before to this one, and the picture
-            before in 0 ... 1; None where flow was not looked for.
+        flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the previous picture to this one, and the previous
+            picture in 0 ... 1; None if flow was not estimated.
     """
 
     changed: Tensor
@@ -41,16 +41,16 @@ def detect_picture_changes(
     backend: Backend,
     flow_from: Collection[int] = (),
 ) -> list[PictureChange]:
-    """How each of ``views`` differs from the picture of the same camera in ``before``.
+    """Change of each of ``views`` since the picture of the same camera in ``before``.
 
     Args:
         views: of a frame.
-        before: of the frame before, in the same order.
+        before: of the previous frame, in the same order.
         threshold: mean absolute difference of 3 x 3 pixels, in 0 ... 1, above which a pixel has changed.
         reach_pixels: changed pixels are dilated by this many pixels.
-        scale: of the maps of flow, in sizes of the pictures.
-        backend: what computes.
-        flow_from: indices of the views in which flow is looked for.
+        scale: of the maps of flow, relative to the pictures.
+        backend: the compute back-end.
+        flow_from: indices of the views in which flow is estimated.
     """
     changes = []
     with torch.no_grad():

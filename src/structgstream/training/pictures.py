@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame's fit reads of its pictures, and of the frame before's, before it looks at any scene."""
+"""Scene-independent preprocessing of a frame's pictures: training views and their changes."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class FramePictures:
 
     Args:
         views: in rig order.
-        changes: of each of them since the frame before; None when everything may move.
+        changes: of each of them since the previous frame; None without motion segmentation.
     """
 
     views: list[View]
@@ -34,10 +34,10 @@ def pictures_of(
     start: MotionStartConfig,
     backend: Backend,
 ) -> FramePictures:
-    """The pictures of ``frame``, and how they differ from those of the frame ``before``; None: everything may move.
+    """The pictures of ``frame``, and their changes since the frame ``before`` (None: without motion segmentation).
 
     Raises:
-        MissingExtraError: flow is asked for and OpenCV is not installed.
+        MissingExtraError: flow is needed and OpenCV is not installed.
     """
     views = training_views(frame, rig, backend.device)
     full = motion.full_every_frames > 0 and frame.index % motion.full_every_frames == 0

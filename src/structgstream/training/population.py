@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""In the middle of a frame: free Gaussians die and are born, in the tensors that are being fitted."""
+"""Pruning and spawning of free Gaussians during a frame's optimisation."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ from structgstream.training.views import View
 
 @dataclass
 class Population:
-    """The free Gaussians of one frame's fit: who dies and who is born.
+    """The free Gaussians of one frame's fit, which it prunes and spawns.
 
     Args:
         config: the rule.
@@ -33,13 +33,13 @@ class Population:
         parameters: of the frame.
         adam: of their values.
         statistics: view-space gradients by id.
-        views: which pictures children may take their looks from.
+        views: from which children may copy colour and scale.
         frame_index: of the frame, for births.
-        room: how many free Gaussians there may be.
-        backend: what computes.
-        generator: of what is random.
-        spawned: how many were born so far.
-        pruned: how many died so far.
+        room: largest number of free Gaussians.
+        backend: the compute back-end.
+        generator: of random numbers.
+        spawned: number of spawned ones so far.
+        pruned: number of pruned ones so far.
     """
 
     config: PatchingConfig
@@ -59,9 +59,9 @@ class Population:
         return len(self.parameters.births)
 
     def patch(self, view: View) -> Tensor:
-        """Prunes and spawns; returns the mask of those that survive.
+        """Prunes and spawns; returns the mask of the survivors.
 
-        A child looks as its parent does in ``view``, if that shows it, else in the first of the others that does.
+        A child copies its parent's appearance in ``view``, if that draws it, else in the first other view that does.
         """
         current = self.parameters.scene(self.template)
         keep = survivor_mask(current.free, self.config)
@@ -74,9 +74,9 @@ class Population:
         return keep
 
     def _parents(self, keep: Tensor) -> Tensor:
-        """Ids ``[P]`` that get a child when those without the mask ``keep`` die."""
+        """Ids ``[P]`` that get a child when only those of the mask ``keep`` survive."""
         drawn = self.statistics.count.clone()
-        drawn[len(drawn) - len(keep) :][~keep] = 0.0  # Those that die have no children.
+        drawn[len(drawn) - len(keep) :][~keep] = 0.0  # Pruned ones have no children.
         return choose_parents(
             self.statistics.mean(),
             drawn,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A price in the loss on leaving the last frame's bin (Note [Bins])."""
+"""The rate term of the loss: a price on changing bins since the last frame (Note [Bins])."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,13 +13,13 @@ from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 
 @dataclass(frozen=True)
 class BitPrice:
-    """An estimate of bits, to be paid for in the loss.
+    """An estimate of the bits of changes, as a loss term.
 
     Args:
-        weight: of the mean number of bits of an anchor in the loss.
+        weight: weight in the loss of the bits per anchor.
         before: the last frame's values by name.
-        steps: the steps by name.
-        rows: anchors that may move: what bits are counted by.
+        steps: the quantization steps by name.
+        rows: number of moving anchors, by which the bits are divided.
     """
 
     weight: float
@@ -31,9 +31,9 @@ class BitPrice:
     def of(
         cls, parameters: Parameters, steps: Mapping[ParameterName, float], *, weight: float, free: bool
     ) -> "BitPrice | None":
-        """The price of leaving what ``parameters`` are now; None for nothing.
+        """The price of changing ``parameters`` from their present values; None for none.
 
-        With ``free`` a free Gaussian's bit costs what an anchor's does, else nothing.
+        With ``free``, bits of free Gaussians are priced like those of anchors, else not at all.
         """
         names = (*ANCHOR_ROWS, *FREE_ROWS) if free else ANCHOR_ROWS
         paid: dict[ParameterName, float] = {
@@ -45,15 +45,14 @@ class BitPrice:
         return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
 
     def after_pruning(self, keep: Tensor) -> "BitPrice":
-        """The price after free Gaussians without the mask ``keep`` have died; what was or is born behind those that had
-        one has none."""
+        """The price after free Gaussians outside the mask ``keep`` were pruned; ones born since are not priced."""
         before = {
             name: value[keep[: len(value)]] if name in FREE_ROWS else value for name, value in self.before.items()
         }
         return replace(self, before=before)
 
     def price(self, values: Mapping[ParameterName, Tensor]) -> Tensor:
-        """log2(1 + distance in bins), summed, divided by the number of anchors, weighted."""
+        """Weighted sum of log2(1 + distance in bins), divided by the number of anchors."""
         bits = [
             torch.log2(1.0 + (values[name][: len(self.before[name])] - self.before[name]).abs() / step).sum()
             for name, step in self.steps.items()

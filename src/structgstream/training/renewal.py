@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After everything has moved: free Gaussians that are to blame for what is wrong die, and what emerged is born."""
+"""Renewal of free Gaussians after the motion start: removal of outliers, and births where content is missing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,18 +22,18 @@ from structgstream.training.residuals import ResidualFloor, apply_camera_color
 from structgstream.training.views import View
 
 LEAST_COVERAGE = 0.5
-"""A pixel that is covered less shows nothing that has a depth."""
+"""Pixels with less coverage have no depth."""
 
 
 @dataclass(frozen=True)
 class Renewal:
-    """What became of the free Gaussians of a moving part.
+    """Result of the renewal of a moving part's free Gaussians.
 
     Args:
-        kept: mask ``[F]`` of those that live on.
+        kept: mask ``[F]`` of those that are kept.
         new_free: those that are born.
-        missing_share: of the pixels of all training views.
-        refused: so much was missing that nothing can have emerged there.
+        missing_share: share of missing pixels in all training views.
+        refused: whether too much is missing for births.
     """
 
     kept: Tensor
@@ -54,18 +54,18 @@ def renew_free_gaussians(
     config: BirthConfig,
     backend: Backend,
 ) -> Renewal:
-    """Deaths and births before the first iteration.
+    """Removal and births of free Gaussians before the first iteration.
 
     Args:
-        partition: its moving part where it is believed to be.
+        partition: with its moving part after the motion start.
         views: of the frame.
-        focuses: by view index, where the moving part shows.
+        focuses: by view index, the focus on the moving part.
         frame_index: for the identities of births.
-        floor: what frame 0 missed; None for nothing.
-        room: how many free Gaussians the scene may get.
-        least_pixels: a view that sees less of something says nothing of it.
+        floor: residuals of frame 0; None for none.
+        room: largest number of births.
+        least_pixels: views where a Gaussian covers fewer pixels do not count.
         config: the rules.
-        backend: what computes.
+        backend: the compute back-end.
     """
     moving = partition.moving.with_folded_appearance()
     everything = torch.ones(len(moving.free), dtype=torch.bool, device=moving.free.means.device)
@@ -73,7 +73,7 @@ def renew_free_gaussians(
     if not config.enabled or not focuses:
         return none
     with torch.no_grad():
-        # Places are from before the second round: a view that lacked nothing there is taken to lack nothing.
+        # ``places`` are from before the second round: a view without missing pixels then is assumed to have none now.
         missing = [_view_residual(moving, view, focuses, None, floor=floor, config=config) for view in views]
         if not len(moving.free) and not _enough_views_miss(missing, config):
             return none
@@ -111,7 +111,7 @@ def _has_missing_pixels(entry: ViewResidual) -> bool:
 
 
 def _enough_views_miss(missing: Sequence[ViewResidual], config: BirthConfig) -> bool:
-    """Whether enough views lack something for a birth."""
+    """Whether enough views have missing pixels for a birth."""
     return sum(map(_has_missing_pixels, missing)) > config.least_supports
 
 
@@ -124,9 +124,9 @@ def _view_residual(
     floor: ResidualFloor | None,
     config: BirthConfig,
 ) -> ViewResidual:
-    """What a view's rendering lacks, and nothing where nothing moves.
+    """Missing pixels of a view, none outside the focus.
 
-    Drawn by ``backend``; without one, as it was when ``focuses`` were found.
+    The rendering is drawn by ``backend``, or without one taken from ``focuses``.
     """
     focus, picture = focuses.get(view.index), view.colors
     if focus is not None:
@@ -163,7 +163,7 @@ def _blamed_mask(
 
 
 def _depth_map(parts: Sequence[Scene], camera: Camera, backend: Backend) -> Tensor:
-    """Mean depth along z ``[h, w]`` of what a camera sees of scenes together; infinite where little is."""
+    """Mean depth along z ``[h, w]`` of scenes drawn together; infinite where coverage is low."""
     first, second = (part.gaussians(camera, backend) for part in parts)
     gaussians = concatenate(first, second)
     viewmat = camera.viewport(gaussians.means).viewmat

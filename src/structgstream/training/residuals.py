@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where renderings differ from the training pictures by more than they did in frame 0.
+"""Residuals of renderings against the training pictures, and their floor: the residuals of frame 0.
 
-Every scene misses something everywhere; what frame 0 already missed says nothing about what has happened since.
+Residuals that frame 0 already had do not indicate change.
 """
 
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ from structgstream.training.views import View
 
 SMOOTHED_PIXELS = 3
 FLOOR_PIXELS = 5
-"""A rendering of frame 0 that is wrong here may be wrong this far around in another frame."""
+"""Side, in pixels, of the square over which the floor takes the maximum residual."""
 
 
 @dataclass(frozen=True)
 class ResidualFloor:
-    """What frame 0 missed, for each training view.
+    """Residuals of frame 0 by training view.
 
     Args:
-        scale: size of the maps against the pictures.
-        maps: by view index ``[h, w]``, the largest residual of the 5 x 5 pixels around each, in 0 ... 1.
+        scale: size of the maps relative to the pictures.
+        maps: by view index ``[h, w]``, maximum residual over the 5 x 5 pixels around each, in 0 ... 1.
     """
 
     scale: float
@@ -37,12 +37,12 @@ class ResidualFloor:
 
 
 def apply_camera_color(image: Tensor, color: CameraColor, view_index: int) -> Tensor:
-    """A rendering ``[H, W, 3]`` as the training camera would have recorded it."""
+    """A rendering ``[H, W, 3]`` with the training camera's colour correction."""
     return image * color.gains[view_index] + color.biases[view_index]
 
 
 def box_mean(values: Tensor, pixels: int) -> Tensor:
-    """Mean of ``values`` ``[H, W]`` over the ``pixels`` x ``pixels`` around each that exist."""
+    """Mean of ``values`` ``[H, W]`` over the ``pixels`` x ``pixels`` around each, inside the picture."""
     return avg_pool2d(values[None, None], pixels, stride=1, padding=pixels // 2, count_include_pad=False)[0, 0]
 
 
@@ -59,7 +59,7 @@ def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: 
 
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
-    """What ``scene``, frame 0 as every receiver has it, misses in its pictures, at ``scale`` of their size."""
+    """Residuals of ``scene``, the decoded frame 0, at ``scale`` of the pictures' size."""
     scene = scene.with_folded_appearance()
     maps = {}
     with torch.no_grad():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What fitting one frame gives back, and what it says while it works."""
+"""Result and progress of fitting one frame."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -28,17 +28,17 @@ class FitResult(Generic[SceneT]):
     """A fitted frame.
 
     Args:
-        scene: what was fitted, detached, in normalised units, before it was coded: a ``Scene``, or what another method
-            draws.
+        scene: the fitted scene, detached, in normalised units, before coding: a ``Scene``, or another method's
+            drawable.
         iterations: optimisation steps done.
-        train_psnr: mean over training cameras of the PSNR of the last rendering of each during optimisation, dB, over
-            the pixels that were drawn; NaN when there was nothing to do.
-        moving: anchors that were free to move.
-        grown: anchors added while frame 0 was fitted.
-        removed: anchors taken away while frame 0 was fitted.
+        train_psnr: mean over training cameras of the PSNR of each one's last rendering during optimisation, dB, over
+            the drawn pixels; NaN without iterations.
+        moving: number of trained anchors.
+        grown: anchors added in frame 0.
+        removed: anchors removed in frame 0.
         spawned: free Gaussians added in this frame.
         pruned: free Gaussians removed in this frame.
-        counts: how often each further mechanism acted, by its name.
+        counts: further counts by name.
         seconds: wall-clock seconds by stage (``render``, ``loss``, ``backward``, ``optimise``, ``patch``, ...).
         losses: mean of each loss term over the last pass through the cameras.
     """
@@ -56,5 +56,5 @@ class FitResult(Generic[SceneT]):
     losses: Mapping[str, float] = field(default_factory=dict)
 
     def with_scene(self, scene: OtherT) -> "FitResult[OtherT]":
-        """The same fit, seen as of ``scene``."""
+        """The same result with another ``scene``."""
         return FitResult(**{**vars(self), "scene": scene})

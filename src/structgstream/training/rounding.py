@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What will be sent, already while it is fitted: values on a grid.
+"""Quantization-aware training: dynamic values are quantized while they are trained.
 
 Note [Bins]
 ~~~~~~~~~~~
-A dynamic value is an integer bin times a step. What is fitted moves freely, what is drawn is rounded, and the gradient
-passes the rounding as if it were not there (straight-through). Bins are absolute, so the difference of two frames'
-bins is exact and nothing drifts.
+A dynamic value is sent as an integer bin times a step. Leaves are continuous, renderings use the quantized values, and
+gradients pass the rounding unchanged (straight-through). Bins are absolute, so differences between frames are exact
+integers and errors do not accumulate.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -33,55 +33,59 @@ def round_straight_through(value: Tensor, step: float) -> Tensor:
     return _RoundStraightThrough.apply(value, step)
 
 
-# The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. What frame 0
-# loses every later frame lacks, and its bytes come once: it follows by half. What is no step has a share of 0.
+# The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. For frame 0 it
+# is 0.5, because its errors affect every later frame and its bytes are sent once. Fields that are no steps have 0.
 _HALF_SHARE = {"quality_share": 0.5}
 _NO_STEP = {"quality_share": 0.0}
 
 
 @dataclass(frozen=True)
 class RoundingConfig:
-    """How fine what is sent is, for a stream with the codec ``compact``."""
+    """Quantization steps and price of bits for the codec ``compact``; not in the paper."""
 
     position_pixels: float = 0.25
-    """Step of positions, as seen by a typical camera at a typical distance: less cannot be seen."""
+    """Step of positions of anchors and free Gaussians, in pixels of a median camera at a median distance."""
     log_scale_step: float = 0.02
+    """Step of the logarithms of anchors' scales."""
     appearance_step: float = 1 / 16
-    """In standard deviations of the features along a direction of the basis."""
+    """Step of appearance, in standard deviations of the features along a row of the basis."""
     weight_step: float = 0.002
-    """Of the weights of MLPs."""
+    """Step of the MLPs' weights."""
     free_log_scale_step: float = 0.05
+    """Step of the logarithms of free Gaussians' scales."""
     free_quat_step: float = 1 / 64
+    """Step of the components of free Gaussians' quaternions."""
     free_logit_opacity_step: float = 0.125
+    """Step of the logits of free Gaussians' opacities."""
     free_color_step: float = 1 / 128
+    """Step of free Gaussians' colours, full scale 1."""
     first_noise_levels: float = field(default=0.5, metadata=_HALF_SHARE)
-    """Noise that rounding frame 0 may add to the pictures: root of the mean square, in 8-bit levels."""
+    """Root mean square error that quantizing frame 0 may add to the pictures, in 8-bit levels."""
     first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
-    """Of the weights of MLPs in frame 0."""
+    """Step of the MLPs' weights in frame 0."""
     rate_weight: float = field(default=1.8e-4, metadata=_NO_STEP)
-    """Weight in the loss of the bits of a moving anchor."""
+    """Weight in the loss of the mean bits per moving anchor."""
     free_priced: bool = field(default=False, metadata=_NO_STEP)
-    """Whether a bit of a free Gaussian that was there before costs as much."""
+    """Whether bits of free Gaussians that existed in the last frame are priced too."""
     quality: float = field(default=0.0, metadata=_NO_STEP)
-    """One knob over all of the above: 1 more makes every step half as large, and a bit a quarter as dear. Frame 0
-    follows by half of that."""
+    """Steps are multiplied by 2^-quality and ``rate_weight`` by 4^-quality; frame 0's steps by 2^(-quality / 2)."""
 
     def resolved(self) -> "RoundingConfig":
-        """The same, with the quality put into the other fields and itself 0."""
+        """The configuration with the quality applied to the other fields and set to 0."""
         shares = {f.name: f.metadata.get("quality_share", 1.0) for f in fields(self)}
         finer = {name: getattr(self, name) * 2.0 ** (-self.quality * share) for name, share in shares.items() if share}
         # Errors grow with the square of a step.
         return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
 
     def steps(self, pixel: float) -> dict[ParameterName, float]:
-        """The step of everything that can change, by name; ``pixel`` is what one covers, in units of the scene."""
+        """The step of every dynamic parameter; ``pixel`` is the size of a pixel in scene units (:func:`pixel_size`)."""
         plain = self.resolved()
         units = {"position_pixels": pixel}
         return {p.name: getattr(plain, p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
 
 
 def pixel_size(positions: Tensor, rig: CameraRig) -> float:
-    """What a pixel covers at the median distance of what the median training camera sees, in units of the scene.
+    """Size of a pixel, in scene units, at the median distance of the anchors for the median training camera.
 
     Args:
         positions: ``[M, 3]`` of anchors.

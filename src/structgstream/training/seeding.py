@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scene before its first iteration: points become anchors.
+"""Initialisation of frame 0: anchors from points, random MLPs.
 
 Note [Dead outputs]
 ~~~~~~~~~~~~~~~~~~~
-F_alpha has one output for each of an anchor's K Gaussians, and all anchors share it. Only what is positive is drawn and
-gets a gradient, as behind a ReLU. Drawn at random, about half of the outputs begin below zero for every anchor, since
-all features begin alike, and an output that nobody draws is never pulled up: of K = 5, one to four are left, by chance
-of the seed, and with them the number of Gaussians. So what is wanted is asked for: a smaller K whose outputs all begin
-above zero.
+F_alpha has one output for each of an anchor's K Gaussians, shared by all anchors. Only Gaussians of positive opacity
+are drawn and get a gradient, as with a ReLU. With random weights about half of the outputs are initially negative for
+every anchor, because all features start equal, and an output that no anchor draws stays dead: of K = 5, one to four
+survive, depending on the seed. ``all_drawn`` avoids this: a smaller K, with all outputs initially positive.
 """
 
 import math
@@ -42,7 +41,7 @@ def neighbor_distances(points: Tensor) -> Tensor:
 
 
 def random_head(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> HeadWeights:
-    """Weights drawn as torch's linear layers draw theirs: uniform within 1 / sqrt(inputs)."""
+    """Random weights as in torch's linear layers: uniform within 1 / sqrt(inputs)."""
 
     def layer(rows: int, columns: int) -> tuple[Tensor, Tensor]:
         bound = 1.0 / math.sqrt(columns)
@@ -68,7 +67,7 @@ def seeded_scene(
     """A scene of untrained anchors at ``points`` ``[P, 3]``, normalised units.
 
     Offsets and features start at zero, both scales at the distance to the neighbours, the MLPs at random (Scaffold-GS).
-    With ``all_drawn`` the last layer of F_alpha has no negative weight, so that no Gaussian begins transparent.
+    With ``all_drawn`` the last layer of F_alpha has no negative weight, so that every Gaussian is initially drawn.
 
     Raises:
         CaptureError: fewer than four distinct points.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes surfaces of frame 0 solid: Gaussians along a ray are drawn together.
+"""A regulariser of frame 0 that concentrates the Gaussians along a ray in depth.
 
-A haze of faint Gaussians before and behind a surface can look right from every training camera and wrong from any
-other. Its depth tells: along a ray it is spread. (Deviation of depth along a ray relative to its mean; compare the
-distortion loss of Mip-NeRF 360, Barron et al., CVPR 2022.)
+A haze of faint Gaussians around a surface can fit every training view and be wrong in all others; its depths along a
+ray are spread. The loss is the standard deviation of depth relative to its mean (compare the distortion loss of
+Mip-NeRF 360, Barron et al., CVPR 2022).
 """
 
 from dataclasses import dataclass, replace
@@ -16,34 +16,34 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 
 COVERED = 0.5
-"""Rays with less coverage have no surface."""
+"""Rays with less coverage are not counted."""
 
 
 @dataclass(frozen=True)
 class SolidityConfig:
-    """When and how much depth is drawn together."""
+    """Weight and schedule of the depth regulariser; not in the paper."""
 
     weight: float = 0.0
-    """Of the spread of depth in the loss, as if it were added in every iteration (paper: 0)."""
+    """Mean weight of the depth spread in the loss per iteration (paper: 0)."""
     from_share: float = 0.3
-    """Of the iterations are over before it begins: first there must be surfaces."""
+    """Share of the iterations before it starts, in which surfaces form."""
     every: int = 2
-    """It is added in one iteration of so many, with as many times the weight."""
+    """It is computed in every ``every``-th iteration, with ``every`` times the weight."""
     scale: float = 0.5
-    """Depth is drawn in this share of the picture's width and height."""
+    """Scale of width and height of the pictures in which depth is drawn."""
 
     def weight_at(self, iteration: int, iterations: int) -> float:
-        """What the spread of depth counts in ``iteration`` of ``iterations``; 0: it need not be known."""
+        """Weight of the depth spread in ``iteration`` of ``iterations``; 0: it is not computed."""
         if iteration <= self.from_share * iterations or iteration % self.every:
             return 0.0
         return self.weight * self.every
 
 
 def depth_spread(gaussians: Gaussians, camera: Camera, *, scale: float, backend: Backend) -> Tensor:
-    """How far from each other the Gaussians lie that a pixel shows, ``[]``.
+    """Relative spread of depth along rays, ``[]``.
 
-    The standard deviation of depth by blending weights as a share of the mean depth, averaged over the pixels that are
-    covered by more than :data:`COVERED`. Drawn with the "colours" z, z^2 and 1 this is one more picture.
+    The standard deviation of depth, weighted by blending weights, relative to the mean depth, averaged over the pixels
+    with coverage above :data:`COVERED`. It takes one more rendering, with "colours" z, z^2 and 1.
     """
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     viewport = small.viewport(gaussians.means)
@@ -52,7 +52,7 @@ def depth_spread(gaussians: Gaussians, camera: Camera, *, scale: float, backend:
     image = backend.rasterize(replace(gaussians, colors=moments), viewport).image
     first, second, coverage = image.unbind(-1)
     covered = coverage.detach() > COVERED
-    divisor = coverage.clamp(min=COVERED)  # Not NaN where nothing is drawn, though that does not count.
+    divisor = coverage.clamp(min=COVERED)  # Avoids NaN in pixels that are not counted.
     mean = (first / divisor).clamp(min=small.near)
     variance = (second / divisor - mean.square()).clamp(min=0.0)
     spread = (variance + 1e-8).sqrt() / mean

@@ -33,5 +33,5 @@ class GradientStatistics:
         self.count.index_add_(0, ids, drawn)
 
     def mean(self) -> Tensor:
-        """Mean gradient norm for each slot, 0 where nothing was drawn, ``[slots]`` in NDC units."""
+        """Mean gradient norm of each slot, ``[slots]`` in NDC; 0 if it was never drawn."""
         return self.total / self.count.clamp(min=1.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One view's loss: what every fit computes in every iteration."""
+"""The loss of one view, computed in every iteration of every fit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ class Loss:
 
     @property
     def screen_offsets(self) -> Tensor | None:
-        """``[N, 2]`` the positions on the screen whose gradient is wanted, if any."""
+        """``[N, 2]`` offsets whose gradient is the view-space gradient; None if it is not tracked."""
         return None
 
 
@@ -61,11 +61,11 @@ class ViewLoss(Loss):
 
     @property
     def image(self) -> Tensor:
-        """The rendering as the camera would have recorded it: what was compared, ``[H, W, 3]``."""
+        """The rendering with the camera's colour correction, as compared with the picture, ``[H, W, 3]``."""
         return self.rendering.image * self.gains + self.biases
 
     def squared_error(self, view: View) -> Tensor:
-        """Mean squared error of the clamped rendering against the picture, where it was drawn, ``[]``."""
+        """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels."""
         with torch.no_grad():
             squares = (self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square()
             if self.focus is None:
@@ -80,7 +80,7 @@ class SceneLoss(ViewLoss):
 
     Args:
         structured: the Gaussians of its anchors.
-        unperturbed: all its Gaussians before they were disturbed.
+        unperturbed: all its Gaussians before perturbation.
     """
 
     structured: StructuredGaussians
@@ -99,18 +99,18 @@ def picture_loss(
     focus: Focus | None = None,
     background: Tensor | None = None,
 ) -> ViewLoss:
-    """Draw ``gaussians`` as ``view`` sees them and compare with its picture, or what ``focus`` names of it.
+    """Draw ``gaussians`` for ``view`` and compare with its picture, or with the tiles of ``focus``.
 
     Args:
         gaussians: the drawable set.
         view: the picture.
         color: correction of the training cameras.
-        backend: what computes.
-        weights: of L1 and of 1 - SSIM; the others are for scenes.
+        backend: the compute back-end.
+        weights: of L1 and of 1 - SSIM; the other weights are not used here.
         track_screen: keep the view-space positional gradient.
         watch: gets the seconds of stages ``rasterise`` and ``loss``.
         focus: see ``scene.render.draw``.
-        background: ``[3]`` what is behind them; None for black.
+        background: ``[3]`` background colour; None for black.
     """
     with watch.stage("rasterise"):
         rendering = draw(gaussians, view.camera, backend, track_screen=track_screen, focus=focus, background=background)
@@ -119,7 +119,7 @@ def picture_loss(
         gains, biases = color.gains[view.index], color.biases[view.index]
         if gains.requires_grad:
             l1, ssim = backend.l1_ssim(image * gains + biases, view.image, tiles=tiles)
-        else:  # A constant correction costs nothing inside the loss.
+        else:  # The loss kernel applies a constant correction at no cost.
             l1, ssim = backend.l1_ssim(image, view.image, gains=gains, biases=biases, tiles=tiles)
         terms = {"l1": l1, "ssim": 1.0 - ssim}
         total = weights.l1 * l1 + weights.ssim * terms["ssim"]
@@ -140,10 +140,10 @@ def view_loss(
     background: Tensor | None = None,
     seen_from: Tensor | None = None,
 ) -> SceneLoss:
-    """Render ``view`` and compare it with its picture (paper, equations for L and L_init), or what ``focus`` names.
+    """Render ``view`` and compare it with its picture, or the tiles of ``focus`` (paper, equations for L and L_init).
 
-    What is drawn is ``perturbation``, if that is given, and looks as from ``seen_from`` ``[3]``, before ``background``
-    ``[3]`` instead of the scene's environment.
+    Optionally the Gaussians are perturbed by ``perturbation``, view directions start at ``seen_from`` ``[3]``, and
+    ``background`` ``[3]`` replaces the scene's environment.
     """
     with watch.stage("generate"):
         tiles = None if focus is None else focus.tiles

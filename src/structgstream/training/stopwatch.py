@@ -9,7 +9,7 @@ import torch
 
 
 class Stopwatch:
-    """Adds up wall-clock seconds by stage name; on a GPU the stage's own work is waited for only when asked."""
+    """Adds up wall-clock seconds by stage name; synchronises with a GPU only if configured."""
 
     def __init__(self, device: torch.device, *, synchronise: bool = False) -> None:
         self.seconds: dict[str, float] = {}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pictures of a frame can be believed: cameras fail, are bumped, and somebody switches on the light.
+"""Detection of outlier views: failing or moved cameras, and global changes of light.
 
-One picture that has changed everywhere while the others hardly did tells of its camera, not of the scene; so does one
-that is wrong everywhere, or equal to the last one to the bit while others changed. When all have changed everywhere,
-nothing can be followed from one picture to the next.
+A view is an outlier if its picture changed, or has large residuals, nearly everywhere while the median view did not, or
+if it is identical to the last one while others changed (a frozen camera). If most views changed everywhere, motion
+between the frames cannot be segmented.
 """
 
 from collections.abc import Sequence
@@ -11,21 +11,21 @@ from dataclasses import dataclass
 from statistics import median
 
 WHOLE_PICTURE_SHARE = 0.5
-"""A picture has changed, or is wrong, everywhere when more than this share of it is."""
+"""Share of changed, or wrong, pixels above which a picture counts as changed, or wrong, everywhere."""
 MEDIAN_SHARE = 0.25
-"""... and that is the camera's doing when it is not so in the median view, by this share."""
+"""An outlier requires that the median view's share is below this."""
 FROZEN_SHARE = 0.005
-"""So much must have changed in the median view for a picture without any change to count as frozen, which at most one
-in four may be."""
+"""Least share of changed pixels in the median view for an identical picture to count as frozen; at most one view in
+four may be."""
 
 
 @dataclass(frozen=True)
 class ViewChange:
-    """How one view's picture differs.
+    """Change of one view's picture.
 
     Args:
         changed_share: share of its pixels that changed since the last frame.
-        wrong_share: share of its pixels that the rendering misses beyond frame 0's residual.
+        wrong_share: share of its pixels with a residual above frame 0's.
         identical: whether it equals the last picture bit for bit.
     """
 
@@ -35,7 +35,7 @@ class ViewChange:
 
 
 def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
-    """For each view whether its picture tells of the scene. At least two views are believed, or all are."""
+    """For each view whether it is no outlier. If fewer than two views are left, none counts as an outlier."""
     usual_change, usual_wrong = median(c.changed_share for c in changes), median(c.wrong_share for c in changes)
     few_same = 4 * sum(c.identical for c in changes) <= len(changes)
     found = [
@@ -50,5 +50,5 @@ def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
 
 
 def is_scene_cut(changes: Sequence[ViewChange]) -> bool:
-    """Whether most pictures have changed everywhere: there is no motion to follow."""
+    """Whether most pictures changed everywhere, so that motion cannot be segmented."""
     return median(c.changed_share for c in changes) > WHOLE_PICTURE_SHARE

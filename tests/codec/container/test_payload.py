@@ -27,7 +27,7 @@ def test_what_is_packed_comes_back() -> None:
 
 @pytest.mark.parametrize("seconds", [math.nan, math.inf])
 def test_a_time_that_is_none(seconds: float) -> None:
-    with pytest.raises(StreamError, match="Packet 3 has the presentation time .*, which is no time"):
+    with pytest.raises(StreamError, match="Packet 3 has the presentation time .*; it is damaged"):
         parse_packet(struct.pack("<Id", 3, seconds), PacketKind.KEY)
 
 

@@ -72,7 +72,7 @@ def test_numbers_that_no_decoder_takes_are_refused_by_the_encoder() -> None:
     encoder = AdaptiveEncoder(Models(), where="Packet 7")
     with pytest.raises(StreamError, match="beyond 31 bits"):
         encoder.numbers("c", np.array([LARGEST_NUMBER + 1]), [np.zeros(1, int)], counts=(1,))
-    with pytest.raises(StreamError, match=r"Packet 7 changes more than a\.x can; take a larger step"):
+    with pytest.raises(StreamError, match=r"Packet 7 changes a\.x by more than can be coded; take a larger step"):
         encoder.residuals("a.x", np.array([[2**23 + 1]], np.int32), last=LAST[:1, :1] * 0, others=SIZES[:1])
 
 

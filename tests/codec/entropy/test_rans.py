@@ -263,8 +263,8 @@ def test_an_encoder_is_told_what_does_not_fit() -> None:
     tables = FrequencyTables(np.array([[4095, 1, 0]], np.uint16))
     zero = np.zeros(2, np.uint16)
     cases: list[tuple[list[int], np.ndarray, str]] = [
-        ([0, 2], zero, "no frequency"),
-        ([0, 3], zero, "no frequency"),
+        ([0, 2], zero, "has frequency 0"),
+        ([0, 3], zero, "has frequency 0"),
         ([0], zero, "one for each"),
         ([0, 0], zero + 1, "Context 1 has no table"),
         ([0, 0], zero.astype(np.int64), "must be uint16"),

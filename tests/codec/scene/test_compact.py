@@ -260,9 +260,9 @@ def test_a_raw_block_in_a_compact_packet_and_the_other_way_round() -> None:
     scene = small_scene(3, free=2)
     raw = replace(header, codec="raw", steps={}, reference={})
     packet = SceneEncoder(raw).encode(scene, index=0, pts_seconds=0.0, kind=PacketKind.KEY).packet
-    with pytest.raises(StreamError, match="holds field anchor_positions as it is, where it should be coded"):
+    with pytest.raises(StreamError, match="holds field anchor_positions raw; expected coded"):
         SceneDecoder(header).decode(packet)
-    with pytest.raises(StreamError, match="holds field anchor_positions coded, where its numbers as they are belong"):
+    with pytest.raises(StreamError, match="holds field anchor_positions coded; expected raw"):
         SceneDecoder(raw).decode(packets[0])
 
 

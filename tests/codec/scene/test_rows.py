@@ -137,7 +137,9 @@ def test_a_group_of_frames_is_near_the_entropy_of_its_noise() -> None:
 def test_a_residual_beyond_23_bits_cannot_be_coded() -> None:
     residuals = np.zeros((3, 3), np.int32)
     residuals[1, 2] = 2**23 + 1
-    with pytest.raises(StreamError, match=r"Frame 0 changes more than offset_scales\.change can; take a larger step"):
+    with pytest.raises(
+        StreamError, match=r"Frame 0 changes offset_scales\.change by more than can be coded; take a larger step"
+    ):
         written(Models(), residuals, Change.none(3, 3))
 
 

@@ -57,5 +57,5 @@ def test_mlps_of_different_hidden_widths() -> None:
     fields = state_of(small_scene())
     inputs, outputs, hidden = 6, 2, 5
     wider = torch.zeros(hidden * (inputs + 1) + outputs * (hidden + 1))
-    with pytest.raises(StreamError, match="not the same as in the other MLPs"):
+    with pytest.raises(StreamError, match="not the size of the other MLPs"):
         check({**fields, "opacity_mlp": wider})

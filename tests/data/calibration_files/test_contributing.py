@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The worked example of CONTRIBUTING.md, "Adding a capture format", is a converter that works."""
+"""The worked example of CONTRIBUTING.md, "A capture format", is a converter that works."""
 
 import csv
 import re
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[3]
 
 @pytest.fixture
 def converter() -> dict[str, Any]:
-    section = (ROOT / "CONTRIBUTING.md").read_text().split("## Adding a capture format")[1].split("\n## ")[0]
+    section = (ROOT / "CONTRIBUTING.md").read_text().split("### A capture format")[1].split("\n##")[0]
     (code,) = re.findall(r" *```python\n(.*?)```", section, re.DOTALL)
     known: dict[str, Any] = {
         "csv": csv, "Path": Path, "readable": readable, "each_camera": each_camera, "EXPECTED": "a row a camera",
@@ -54,7 +54,7 @@ def test_the_example_reads_what_it_says(converter: dict[str, Any], tmp_path: Pat
 
 def test_the_files_it_names_exist_or_are_its_own() -> None:
     """At most three."""
-    section = (ROOT / "CONTRIBUTING.md").read_text().split("## Adding a capture format")[1].split("\n## ")[0]
+    section = (ROOT / "CONTRIBUTING.md").read_text().split("### A capture format")[1].split("\n##")[0]
     steps = re.findall(r"^\d\. `([^`]+)`", section, re.MULTILINE)
     assert len(steps) == 3
     assert [(ROOT / path).is_file() for path in steps] == [False, True, True]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Field blocks: one tensor of the scene as bytes (docs/bitstream.md, section Field blocks).
 
-Coding 0 (``raw``) stores the little-endian numbers as they are: float32, or int64 for identities. Coding 1 (``coded``)
-stores bytes that only the codec of the stream understands.
+Coding 0 (``raw``) stores little-endian numbers: float32, or int64 for identities. Coding 1 (``coded``) stores bytes
+that are defined by the stream's codec.
 """
 
 import math
@@ -31,9 +31,9 @@ _CODES: dict[FieldName, int] = {field.name: field.code for field in STATE_TABLE}
 
 @dataclass(frozen=True)
 class Block:
-    """Where one field is in a payload: its first byte, its first number's, and the byte after it.
+    """Offsets of one field in a payload: of its block, of its data, and of the byte after it.
 
-    Nothing is copied or allocated; everything stated has been checked against the payload.
+    The stated sizes have been checked against the payload; nothing is copied.
     """
 
     name: FieldName
@@ -63,7 +63,7 @@ def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[B
     """Every block from byte ``start`` to the end.
 
     Raises:
-        StreamError: an unknown field or coding, a field that comes twice, or a size that does not fit the payload.
+        StreamError: an unknown field or coding, a repeated field, or a size beyond the payload.
     """
     seen: set[int] = set()
     while start < len(payload):
@@ -101,7 +101,7 @@ def unpack_raw_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldNa
     values: dict[FieldName, Tensor] = {}
     for block in iterate_blocks(payload, start, where=where):
         if block.coding != RAW:
-            raise StreamError(f"{where} holds field {block.name} coded, where its numbers as they are belong.")
+            raise StreamError(f"{where} holds field {block.name} coded; expected raw.")
         values[block.name] = _numbers(payload, block)
     return values
 
@@ -109,7 +109,7 @@ def unpack_raw_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldNa
 def unpack_blocks(
     payload: bytes, start: int, *, where: str
 ) -> tuple[dict[FieldName, Tensor], dict[FieldName, memoryview]]:
-    """The tensors of all blocks from byte ``start`` to the end that are not coded, and the bytes of those that are.
+    """The tensors of the raw blocks, and the bytes of the coded ones, from byte ``start`` to the end.
 
     Raises:
         StreamError: as :func:`iterate_blocks`.
@@ -125,15 +125,15 @@ def unpack_blocks(
 
 
 def coded_payloads(payload: bytes, start: int, *, where: str) -> dict[FieldName, memoryview]:
-    """The bytes of all blocks from byte ``start`` to the end, every one coded.
+    """The bytes of all blocks from byte ``start`` to the end, which must be coded.
 
     Raises:
-        StreamError: as :func:`iterate_blocks`, or a block is not coded.
+        StreamError: as :func:`iterate_blocks`, or a block is raw.
     """
     found: dict[FieldName, memoryview] = {}
     for block in iterate_blocks(payload, start, where=where):
         if block.coding != CODED:
-            raise StreamError(f"{where} holds field {block.name} as it is, where it should be coded.")
+            raise StreamError(f"{where} holds field {block.name} raw; expected coded.")
         found[block.name] = memoryview(payload)[block.data : block.end]
     return found
 

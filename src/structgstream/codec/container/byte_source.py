@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes that are looked up by place: in memory, in a file that stays on the disk, or a part of either."""
+"""Random-access bytes: in memory, in a file that is read on demand, or a part of either."""
 
 import threading
 import weakref
@@ -11,7 +11,7 @@ from structgstream.errors import StreamError
 
 
 class ByteSource(Protocol):
-    """What ``bytes``, ``memoryview``, :class:`FileBytes` and :class:`ByteSlice` share: a length, and slices."""
+    """Length and slices, which ``bytes``, ``memoryview``, :class:`FileBytes` and :class:`ByteSlice` have."""
 
     def __len__(self) -> int: ...
 
@@ -19,20 +19,20 @@ class ByteSource(Protocol):
 
 
 class FileBytes:
-    """A file, read piece by piece; only the piece asked for is ever in memory.
+    """A file whose slices are read on demand.
 
-    The length is that at opening: what a running reconstruction appends later is not seen. Several threads may read.
-    The file is closed by :meth:`close`, or when the object is gone.
+    The length is that at opening; bytes appended later by a running reconstruction are not visible. Thread-safe. The
+    file is closed by :meth:`close` or when the object is collected.
 
     Raises:
-        StreamError: it cannot be read; when a piece is asked for, also that it is closed or has become shorter.
+        StreamError: it cannot be read; on slicing also if it is closed or has become shorter.
     """
 
     def __init__(self, path: Path | str) -> None:
         self._path = path
         try:
             self._file = FileIO(path)
-            # The finalizer holds the file itself, so that a reader that nobody closes leaves no open file behind.
+            # The finalizer refers to the file, not to this object, so that an unclosed reader leaks no open file.
             self._finalizer = weakref.finalize(self, self._file.close)
             self._size = self._file.seek(0, 2)
         except OSError as error:
@@ -54,7 +54,7 @@ class FileBytes:
             raise StreamError(f"Cannot read {self._path}: it has been closed; open it again.") from error
 
     def _read(self, count: int) -> bytes:
-        """``count`` bytes from where the file stands; an operating system may hand over fewer at a time."""
+        """``count`` bytes from the file's position; the operating system may return fewer per call."""
         pieces = []
         while count:
             if not (piece := self._file.read(count)):
@@ -77,7 +77,7 @@ class FileBytes:
 
 
 class ByteSlice:
-    """The bytes from ``start`` to ``end`` of others, without a copy."""
+    """A view of the bytes from ``start`` to ``end``."""
 
     def __init__(self, data: ByteSource, start: int, end: int) -> None:
         self._data = data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a stream goes on after damage (docs/bitstream.md, section Damage)."""
+"""Resynchronisation after a damaged record (docs/bitstream.md, section Damage)."""
 
 import math
 import re
@@ -19,11 +19,11 @@ _HEAD = re.compile(rb"[\x02-\x04].\x00\x00", re.DOTALL)
 
 @dataclass(frozen=True)
 class Damage:
-    """A record that is not whole although others follow it.
+    """A damaged record that whole records follow.
 
     Args:
         offset: its first byte.
-        frames: those that cannot be shown for it: its own, and what follows up to the next key packet.
+        frames: the frames lost to it: its own, and those up to the next key packet.
     """
 
     offset: int
@@ -31,17 +31,17 @@ class Damage:
 
 
 def next_index(record: Record) -> int:
-    """The frame that a packet is, or that would follow an index."""
+    """A packet's frame number; for an index, the number of frames."""
     if record.type == RecordType.INDEX:
         return len(record.payload) // INDEX_ENTRY.size
     return int(FRAME.unpack_from(record.payload)[0])
 
 
 class PacketSearch:
-    """Finds what follows damage in ``data``.
+    """Finds whole records after damage in ``data``.
 
-    One is made for each stream: with all its calls it verifies checksums of no more than four times the stream's
-    bytes, so that a file made for it cannot make a reader work for long.
+    Use one object per stream: all its calls together verify checksums of at most four times the stream's bytes, which
+    bounds the work that a malicious file can cause.
     """
 
     def __init__(self, data: ByteSource) -> None:
@@ -53,8 +53,8 @@ class PacketSearch:
 
         Args:
             damaged: where that record begins.
-            expected: the frame that would come next.
-            after_seconds: when the last one is presented.
+            expected: number of the next frame.
+            after_seconds: presentation time of the last frame.
         """
         for offset in self._heads(damaged + 1):
             if not self._fits(offset, damaged, expected, after_seconds):
@@ -69,7 +69,7 @@ class PacketSearch:
         return None
 
     def _heads(self, start: int) -> Iterator[int]:
-        """Every byte from ``start`` on where the head of a packet or an index may begin."""
+        """Offsets from ``start`` on that may be the head of a packet or an index."""
         while start + RECORD.size <= len(self._data):
             chunk = bytes(self._data[start : start + _CHUNK_BYTES])
             at = 0
@@ -79,7 +79,7 @@ class PacketSearch:
             start += max(len(chunk) - RECORD.size + 1, 1)
 
     def _fits(self, offset: int, damaged: int, expected: int, after_seconds: float) -> bool:
-        """Whether what would begin at ``offset`` can come after ``expected`` frames and the damage."""
+        """Whether a record at ``offset`` is consistent with ``expected`` frames before the damage."""
         if (head := read_head(self._data, offset)) is None:
             return False
         kind, length = head

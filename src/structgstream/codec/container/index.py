@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Index and footer: where packets are without reading them (docs/bitstream.md, section Index record and footer)."""
+"""Index and footer: offsets of packets for random access (docs/bitstream.md, section Index record and footer)."""
 
 import struct
 from array import array
@@ -23,15 +23,15 @@ INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 
 
 def pack_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
-    """Index record and footer for byte ``offset``, from each packet's frame index, record type and offset."""
+    """Index record, to be written at byte ``offset``, and footer; entries: frame index, record type, offset."""
     index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
     return packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC)
 
 
 def read_index_offsets(data: ByteSource, start: int) -> "array[int] | None":
-    """Offsets of the packets that follow byte ``start``, by the index; None when the stream must be scanned.
+    """Offsets, from the index, of the packets from byte ``start`` on; None if the stream must be scanned.
 
-    That is when footer or index is not intact, or they are not what the heads of the records say, one after another.
+    The index is not used if footer or index is damaged, or disagrees with the heads of the records.
     """
     end = footer_offset(data)
     if end is None or end < start:
@@ -46,7 +46,7 @@ def read_index_offsets(data: ByteSource, start: int) -> "array[int] | None":
 
 
 def _by_heads(data: ByteSource, start: int, end: int) -> bytearray | None:
-    """What the index should say, from the records' heads; None when they do not follow each other as packets must."""
+    """The expected entries of the index, from the records' heads; None if the sequence of packets is invalid."""
     entries = bytearray()
     before_seconds = 0.0
     while start < end:

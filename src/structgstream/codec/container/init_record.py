@@ -47,11 +47,11 @@ def first_block(payload: bytes) -> int:
 
 
 def read_description(payload: bytes) -> dict[str, Any]:
-    """The description, whose stated size is looked at before anything is unpacked.
+    """The description; its stated size is checked before anything is unpacked.
 
     Raises:
         StreamError: as :func:`first_block`.
-        ValueError: it is too long, or no JSON.
+        ValueError: it is too long, or not JSON.
     """
     packed = payload[LENGTH.size : first_block(payload)]
     try:
@@ -64,10 +64,10 @@ def read_description(payload: bytes) -> dict[str, Any]:
 
 
 def field_sizes(payload: bytes) -> dict[str, int]:
-    """What each field takes in the payload.
+    """Bytes of each field in the payload.
 
     Raises:
-        StreamError: it contradicts the format.
+        StreamError: the payload violates the format.
     """
     blocks = iterate_blocks(payload, first_block(payload), where="The init record")
     return {block.name: block.end - block.start for block in blocks}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The payload of a packet's record: which frame it is, when it is presented, and its field blocks."""
+"""The payload of a packet's record: frame index, presentation time, field blocks."""
 
 import math
 import struct
@@ -16,7 +16,7 @@ FRAME = struct.Struct("<Id")  # index, presentation time in seconds
 def packet_from_blocks(
     blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind
 ) -> Packet:
-    """The packet of a frame with these field blocks, in their order."""
+    """The packet of a frame with these field blocks, in this order."""
     payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())
     return Packet(kind, index, pts_seconds, payload, {name: len(block) for name, block in blocks.items()})
 
@@ -25,12 +25,12 @@ def parse_packet(payload: bytes, kind: PacketKind) -> Packet:
     """The packet in a key or delta record.
 
     Raises:
-        StreamError: the payload contradicts the format.
+        StreamError: the payload violates the format.
     """
     if len(payload) < FRAME.size:
         raise StreamError("A packet is too short to hold its index and time.")
     index, pts_seconds = FRAME.unpack_from(payload)
     if not math.isfinite(pts_seconds):
-        raise StreamError(f"Packet {index} has the presentation time {pts_seconds}, which is no time.")
+        raise StreamError(f"Packet {index} has the presentation time {pts_seconds}; it is damaged.")
     blocks = iterate_blocks(payload, FRAME.size, where=f"Packet {index}")
     return Packet(kind, index, pts_seconds, payload, {block.name: block.end - block.start for block in blocks})

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records: the frame of everything in a stream file (docs/bitstream.md, section Records).
+"""Records, the containers of all data in a stream file (docs/bitstream.md, section Records).
 
-A file is the magic, the version, and records one after another. A record that is cut or damaged ends what can be read;
-everything before it stands.
+A file is the magic, the version, and a sequence of records. Records before a truncated or damaged one stay readable.
 """
 
 import struct
@@ -25,7 +24,7 @@ MAX_RECORD_BYTES = 2**32 - 1
 
 
 class RecordType(IntEnum):
-    """Readers skip the types they do not know."""
+    """Types of records; readers skip unknown ones."""
 
     INIT = 1
     KEY = 2
@@ -35,7 +34,7 @@ class RecordType(IntEnum):
 
 @dataclass(frozen=True)
 class Record:
-    """One record: its type, payload, and where its first byte is in the file."""
+    """One record: its type, its payload, and the offset of its first byte in the file."""
 
     type: int
     payload: bytes
@@ -56,7 +55,7 @@ def packed(kind: RecordType, payload: bytes) -> bytes:
     """A record as bytes: header, payload, CRC-32 of both.
 
     Raises:
-        StreamError: the payload is longer than a record can say.
+        StreamError: the payload is longer than a record can hold.
     """
     if len(payload) > MAX_RECORD_BYTES:
         raise StreamError(f"A record of {len(payload)} bytes is too long; the format holds {MAX_RECORD_BYTES}.")
@@ -65,15 +64,15 @@ def packed(kind: RecordType, payload: bytes) -> bytes:
 
 
 def check_prefix(data: ByteSource, name: str) -> None:
-    """Refuse what is not a stream of this major version.
+    """Check that ``data`` is a stream of this major version.
 
     Raises:
-        StreamError: with what was found and what to do.
+        StreamError: it is not.
     """
     if not prefix().startswith(bytes(data[: len(MAGIC)])):
         raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
     if len(data) < PREFIX.size:
-        raise StreamError(f"{name} is cut at byte {len(data)}, before anything that can be shown.")
+        raise StreamError(f"{name} is cut at byte {len(data)}, before its first frame.")
     _, major, minor = PREFIX.unpack(data[: PREFIX.size])
     if major != MAJOR:
         newer, older = (
@@ -85,7 +84,7 @@ def check_prefix(data: ByteSource, name: str) -> None:
 
 
 def read_head(data: ByteSource, offset: int) -> tuple[int, int] | None:
-    """Type and payload length that the record at ``offset`` states, when it is long enough to hold them."""
+    """Type and payload length stated by the record at ``offset``; None if the data ends before them."""
     if offset + RECORD.size + CHECKSUM.size > len(data):
         return None
     kind, _, _, length = RECORD.unpack(data[offset : offset + RECORD.size])
@@ -93,7 +92,7 @@ def read_head(data: ByteSource, offset: int) -> tuple[int, int] | None:
 
 
 def read_record(data: ByteSource, offset: int) -> Record | None:
-    """The whole, undamaged record at ``offset``, or None. Nothing is allocated before its length is known to fit."""
+    """The record at ``offset``, or None if truncated or damaged. Its length is checked before anything is allocated."""
     if (head := read_head(data, offset)) is None:
         return None
     start = offset + RECORD.size
@@ -106,9 +105,9 @@ def read_record(data: ByteSource, offset: int) -> Record | None:
 
 
 def footer_offset(data: ByteSource) -> int | None:
-    """Where the index record begins that a stream ends with; None while the stream is still being written, or is cut.
+    """Offset of the index record at the end of a complete stream; None if the stream is unfinished or truncated.
 
-    Only the footer and the head of the index are looked at, which is what a server that follows a file can afford.
+    Reads only the footer and the head of the index, so that a server can poll a growing file.
     """
     at = len(data) - FOOTER.size
     if at < PREFIX.size:
@@ -123,7 +122,7 @@ def footer_offset(data: ByteSource) -> int | None:
 
 
 def incomplete_reason(data: ByteSource, offset: int) -> str:
-    """What is at ``offset``, where :func:`read_record` found no whole record."""
+    """Why :func:`read_record` found no whole record at ``offset``, as a clause of a message."""
     if offset == len(data):
         return f"it ends at byte {offset} without an index"
     if offset + RECORD.size <= len(data):
@@ -134,7 +133,7 @@ def incomplete_reason(data: ByteSource, offset: int) -> str:
 
 
 def scan_records(data: ByteSource, offset: int = PREFIX.size) -> Iterator[Record]:
-    """Every record from byte ``offset`` on, up to the first that is cut or damaged."""
+    """Every record from byte ``offset`` on, up to the first truncated or damaged one."""
     while (record := read_record(data, offset)) is not None:
         yield record
         offset = record.end

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One description of a packet, two directions (``section_coder.py``, Note [Two directions]), adaptive decisions."""
+"""Coders of packets, with adaptive binary decisions (``section_coder.py``, Note [Two directions])."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -23,31 +23,31 @@ from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
 Inputs = Sequence[NDArray[np.integer]]
-"""The contexts ``[n]`` of each input."""
+"""Contexts ``[n]``, one array per input of a model."""
 
 
 class AdaptiveCoder(Protocol):
-    """Encodes or decodes arrays; names tell whose models are used, and before the dot in which field."""
+    """Encodes or decodes arrays; the name selects the model, its part before the dot the field."""
 
     def activity(self, name: str, active: Flags | None, *, history: NDArray[np.uint8], sizes: Bins) -> Flags:
-        """Which of the rows ``[n]`` are active, given their history and the sizes of their last residuals."""
+        """Mask ``[n]`` of the active rows, with their history and the sizes of their last residuals as contexts."""
         ...
 
     def residuals(self, name: str, values: Bins | None, *, last: Bins, others: Bins) -> Bins:
-        """Residuals ``[n, c]`` of active rows, given their last ones and sizes ``[n]`` of groups before."""
+        """Residuals ``[n, c]`` of active rows; contexts: their last residuals, and sizes ``[n]`` of earlier groups."""
         ...
 
     def flags(self, name: str, values: Flags | None, inputs: Inputs, *, counts: Sequence[int]) -> Flags:
-        """Yes or no ``[n]``, each with contexts below ``counts``, one for each input."""
+        """Flags ``[n]``; each input has contexts below its entry of ``counts``."""
         ...
 
     def numbers(self, name: str, values: Naturals | None, inputs: Inputs, *, counts: Sequence[int]) -> Naturals:
-        """Signed numbers ``[n]`` of 32 bits."""
+        """Signed 32-bit numbers ``[n]``; ``inputs`` and ``counts`` as in :meth:`flags`."""
         ...
 
 
 class _Adaptive(ABC):
-    """What both directions have in common: arrays that are filled in place."""
+    """Common part of both directions: arrays are read or filled in place."""
 
     def __init__(self, models: Models, *, where: str) -> None:
         self._models = models
@@ -56,7 +56,7 @@ class _Adaptive(ABC):
 
     @abstractmethod
     def _code(self, name: str) -> ArithmeticState:
-        """The arithmetic code that a name belongs to."""
+        """The arithmetic code of a name's field."""
 
     def activity(self, name: str, active: Flags | None, *, history: NDArray[np.uint8], sizes: Bins) -> Flags:
         values = np.zeros(len(history), np.uint8) if active is None else active.astype(np.uint8)
@@ -95,20 +95,20 @@ class _Adaptive(ABC):
 
     @abstractmethod
     def _check_coded(self, name: str, sound: bool) -> None:
-        """What is to be done once a name has been coded, and whether its numbers made sense."""
+        """Called after a name has been coded; ``sound``: whether its numbers are within bounds."""
 
 
 class AdaptiveEncoder(_Adaptive):
-    """Writes; what a name says before its dot is the field whose bytes grow."""
+    """Encodes; the part of a name before the dot is the field that the bytes are appended to."""
 
     def numbers(self, name: str, values: Naturals | None, inputs: Inputs, *, counts: Sequence[int]) -> Naturals:
         assert values is not None
         if len(values) and int(np.abs(values).max()) > LARGEST_NUMBER:
-            raise StreamError("A number is beyond 31 bits; the step it was divided by is too small.")
+            raise StreamError("A number is beyond 31 bits; take a larger quantization step.")
         return super().numbers(name, values, inputs, counts=counts)
 
     def fields(self) -> dict[str, bytes]:
-        """The bytes of each field; the encoder is done."""
+        """The bytes of each field; finishes the encoder."""
         return {name: code.finished() for name, code in self._codes.items()}
 
     def _code(self, name: str) -> ArithmeticState:
@@ -116,7 +116,7 @@ class AdaptiveEncoder(_Adaptive):
 
     def _check_coded(self, name: str, sound: bool) -> None:
         if not sound:
-            raise StreamError(f"{self._where} changes more than {name} can; take a larger step.")
+            raise StreamError(f"{self._where} changes {name} by more than can be coded; take a larger step.")
 
 
 class AdaptiveDecoder(_Adaptive):
@@ -127,7 +127,7 @@ class AdaptiveDecoder(_Adaptive):
         self._codes = {name: ArithmeticState(data) for name, data in fields.items()}
 
     def end(self) -> None:
-        """All bytes must have been taken.
+        """Checks that all bytes have been read.
 
         Raises:
             StreamError: there are more, or fewer.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as bits, the highest first, and Exp-Golomb codes (docs/entropy.md, section Bits)."""
+"""Numbers as bits, highest first, and Exp-Golomb codes (docs/entropy.md, section Bits)."""
 
 from collections.abc import Iterable
 from typing import TypeVar
@@ -13,7 +13,7 @@ Whole = TypeVar("Whole", int, NDArray[np.int64])
 
 
 def pack_bits(pieces: Iterable[str]) -> bytes:
-    """Texts of ``0`` and ``1`` one after another as bytes, the last filled with zeros."""
+    """Concatenates strings of ``0`` and ``1`` to bytes, the last padded with zeros."""
     text = "".join(pieces)
     size = -(-len(text) // 8)
     return int(text.ljust(8 * size, "0") or "0", 2).to_bytes(size, "big")
@@ -25,23 +25,23 @@ def fixed(value: int, width: int) -> str:
 
 
 def golomb(value: int, *, order: int) -> str:
-    """Exp-Golomb: of ``value + 2^order`` the binary digits, after one zero for each beyond ``order + 1``."""
+    """Exp-Golomb: the binary digits of ``value + 2^order``, after one zero for each digit beyond ``order + 1``."""
     digits = f"{value + (1 << order):b}"
     return "0" * (len(digits) - order - 1) + digits
 
 
 def signed_golomb(value: int, *, order: int) -> str:
-    """Exp-Golomb of 0, -1, 1, -2, 2 ... counted in this order."""
+    """Exp-Golomb of the index of ``value`` in 0, -1, 1, -2, 2 ..."""
     return golomb(zigzag(value), order=order)
 
 
 def zigzag(values: Whole) -> Whole:
-    """The places of values of 63 bits in 0, -1, 1, -2, 2 ..."""
+    """Indices of values (63 bits) in 0, -1, 1, -2, 2 ..."""
     return values << 1 ^ values >> 63
 
 
 def unzigzag(places: Whole) -> Whole:
-    """The values at these places, see :func:`zigzag`."""
+    """Inverse of :func:`zigzag`."""
     return places >> 1 ^ -(places & 1)
 
 
@@ -51,17 +51,17 @@ def bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def unpack_numbers(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
-    """Numbers int64 ``[n]`` of the widths 0 to 56 ``[n]`` that fill ``data``, but for zeros in the last byte.
+    """Numbers int64 ``[n]`` with widths ``[n]`` of 0 to 56 bits that fill ``data`` up to zero padding in the last byte.
 
     Raises:
-        StreamError: there are fewer bytes or more, or something else behind the last number.
+        StreamError: there are fewer or more bytes, or the padding is not zero.
     """
     ends = np.cumsum(widths)
     bits = int(ends[-1]) if len(ends) else 0
     if len(data) != -(-bits // 8) or (bits % 8 and data[-1] & 0xFF >> bits % 8):
         raise StreamError(f"{where} has {len(data)} bytes for {bits} bits of numbers; it is damaged.")
     starts = ends - widths
-    # The eight bytes from the one where a number begins hold all of it.
+    # The eight bytes from the byte where a number starts contain all of it.
     stored = np.frombuffer(bytes(data) + bytes(8), np.uint8)
     words = np.lib.stride_tricks.sliding_window_view(stored, 8)[starts >> 3]
     found = np.ascontiguousarray(words).view(">u8")[:, 0].astype(np.uint64) << (starts & 7).astype(np.uint64)
@@ -95,10 +95,10 @@ class BitReader:
         return value
 
     def golomb(self, *, order: int, most_zeros: int) -> int:
-        """An Exp-Golomb code with at most ``most_zeros`` zeros in front.
+        """An Exp-Golomb code with at most ``most_zeros`` leading zeros.
 
         Raises:
-            StreamError: it has more, or is cut.
+            StreamError: it has more, or is truncated.
         """
         first = self._text.find("1", self._position, self._position + most_zeros + 1)
         if first < 0:
@@ -115,10 +115,10 @@ class BitReader:
         return unzigzag(self.golomb(order=order, most_zeros=most_zeros))
 
     def end(self) -> None:
-        """Nothing but the zeros that fill the last byte is left.
+        """Checks that only zero padding of the last byte is left.
 
         Raises:
-            StreamError: something is.
+            StreamError: more is left.
         """
         rest = self._text[self._position :]
         if len(rest) > 7 or "1" in rest:

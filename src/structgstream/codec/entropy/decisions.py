@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive decisions in either direction, in C++ where it is (docs/entropy.md, Decisions).
+"""Adaptive binary decisions in either direction, in C++ if available (docs/entropy.md, Decisions).
 
-What is coded is an array that an encoder reads and a decoder fills. Both leave models and arithmetic code as they are
-behind it.
+An encoder reads the array of values, a decoder fills it. Both update models and arithmetic code in place.
 """
 
 import ctypes
@@ -28,15 +27,15 @@ def code_activity(
     active: NDArray[np.uint8],
     native: bool | None = None,
 ) -> None:
-    """Which rows are active (docs/bitstream.md, section Rows).
+    """Codes which rows are active (docs/bitstream.md, section Rows).
 
     Args:
         arithmetic: of the field.
         models: of blocks and of rows.
-        history: ``[n]``: bit 0 is what the last frame did, bits 1 and 2 what those before did.
-        sizes: ``[n]``, of each row's last residuals together.
-        active: ``[n]``.
-        native: C++ or Python; None takes C++ where it is.
+        history: ``[n]``: bit 0 is the row's activity in the last frame, bits 1 and 2 in the two before.
+        sizes: ``[n]``, sum of the magnitudes of each row's last residuals.
+        active: ``[n]``, read or filled.
+        native: C++ or Python; None takes C++ if available.
     """
     arithmetic.reserve(len(active))
     if not uses_native(native):
@@ -62,14 +61,14 @@ def code_residuals(
     residuals: NDArray[np.int32],
     native: bool | None = None,
 ) -> bool:
-    """Residuals of active rows (docs/bitstream.md, section Rows); whether they are sound.
+    """Codes residuals of active rows (docs/bitstream.md, section Rows); returns whether they are within bounds.
 
     Args:
         arithmetic: of the field.
         model: of the group of columns.
         last: ``[n, c]``, the rows' last residuals.
-        others: ``[n]``, sizes of the residuals in the groups before.
-        residuals: ``[n, c]``.
+        others: ``[n]``, sizes of the residuals in earlier groups.
+        residuals: ``[n, c]``, read or filled.
         native: as in :func:`code_activity`.
     """
     arithmetic.reserve(residuals.size)
@@ -96,14 +95,14 @@ def code_numbers(
     flags: bool = False,
     native: bool | None = None,
 ) -> bool:
-    """Signed numbers of 32 bits, or flags; whether they are sound.
+    """Codes signed 32-bit numbers, or flags; returns whether they are within bounds.
 
     Args:
         arithmetic: of the field.
-        model: with an input for each column of the contexts.
-        contexts: ``[n, K]``, each below what the model has for its input.
-        values: ``[n]``.
-        flags: whether they are 0 and 1, with a model of one node.
+        model: with one input per column of the contexts.
+        contexts: ``[n, K]``, each below the model's number of contexts for its input.
+        values: ``[n]``, read or filled.
+        flags: whether the values are 0 and 1, with a model of one node.
         native: as in :func:`code_activity`.
     """
     arithmetic.reserve(len(values))
@@ -128,11 +127,11 @@ def _address(array: np.ndarray) -> int:
 
 
 def _check(result: int) -> bool:
-    """Whether what was coded is sound.
+    """Whether the coded values are within bounds.
 
     Raises:
-        OutOfMemoryError: memory does not suffice.
-        StreamError: a model does not fit.
+        OutOfMemoryError: there is not enough memory.
+        StreamError: a model has the wrong shape.
     """
     if result == _NO_MEMORY:
         raise OutOfMemoryError("to code decisions")

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What both sides hold of adaptive decisions: chances, weights and bytes (docs/entropy.md, Decisions).
+"""State of adaptive decisions: probabilities, mixing weights, arithmetic codes (docs/entropy.md, Decisions).
 
 Note [One state a field]
 ~~~~~~~~~~~~~~~~~~~~~~~~
-A packet is small, so nothing in it is told that can be learned: chances are those of the packets before in the group,
-and go on with every decision. Each field of a packet is one arithmetic code, at most two bytes above what its decisions
-take.
+Packets are small, so they carry no tables: probabilities are adapted by every decision and continue from packet to
+packet of a group. Each field of a packet is one arithmetic code, at most two bytes longer than the information content
+of its decisions.
 """
 
 import ctypes
@@ -26,12 +26,12 @@ LARGEST_RESIDUAL = 2**23
 BLOCK_CONTEXTS = (90, 198)
 ACTIVITY_CONTEXTS = (255, 108, 360)
 AHEAD = 3
-"""Bytes that a decoder has taken behind the last one when it is done."""
-_NUMBER_BYTES = 64  # more than a number or two flags can take
+"""Bytes that a decoder reads past the end of the data."""
+_NUMBER_BYTES = 64  # upper bound of the bytes of a number or of two flags
 
 
 def residual_contexts(columns: int) -> tuple[int, ...]:
-    """How many contexts each input has for residuals in so many columns."""
+    """Number of contexts of each input for residuals in ``columns`` columns."""
     return 17 * columns, 81, 31 * 5, 60 * columns, 96 * columns, 343
 
 
@@ -63,13 +63,13 @@ class NativeArithmetic(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What is expected of decisions; it changes with each.
+    """An adaptive model of decisions; each decision updates it.
 
     Args:
-        chances: u16 ``[rows, nodes]``, of yes, in 65536.
-        seen: u8 ``[rows, nodes]``, how many decisions each has seen, up to 255.
-        weights: i32 ``[nodes, inputs]``, in 65536.
-        starts: i32 ``[inputs]``, the row where each input's contexts begin.
+        chances: u16 ``[rows, nodes]``, probability of 1 in units of 1/65536.
+        seen: u8 ``[rows, nodes]``, number of decisions so far, up to 255.
+        weights: i32 ``[nodes, inputs]``, mixing weights in units of 1/65536.
+        starts: i32 ``[inputs]``, the row of each input's first context.
     """
 
     chances: NDArray[np.uint16]
@@ -79,7 +79,7 @@ class Model:
 
     @classmethod
     def new(cls, counts: Sequence[int], *, nodes: int) -> "Model":
-        """A model that has seen nothing, with ``counts`` contexts of each input."""
+        """A fresh model with ``counts`` contexts of each input."""
         inputs, rows = len(counts), sum(counts)
         return cls(
             np.full((rows, nodes), HALF, np.uint16),
@@ -89,37 +89,37 @@ class Model:
         )
 
     def copy(self) -> "Model":
-        """The same, to go on with apart."""
+        """An independent copy."""
         return Model(self.chances.copy(), self.seen.copy(), self.weights.copy(), self.starts)
 
     @property
     def nodes(self) -> int:
-        """Decisions of a number."""
+        """Number of binary decisions (nodes) of a value."""
         return self.chances.shape[1]
 
     @cached_property
     def native(self) -> NativeModel:
-        """The same memory, for C++."""
+        """The same memory as a C structure."""
         arrays = (self.chances, self.seen, self.weights, self.starts)
         return NativeModel(*(array.ctypes.data for array in arrays), len(self.starts), self.nodes)
 
 
 class Models:
-    """The models that both sides hold, by name."""
+    """The models of encoder and decoder, by name."""
 
     def __init__(self, known: "Models | None" = None) -> None:
         self._before: dict[str, Model] = {} if known is None else known.all()
         self._now: dict[str, Model] = {}
 
     def get(self, name: str, counts: Sequence[int], *, nodes: int) -> Model:
-        """The model of this name, which may be changed: another :class:`Models` made of this one keeps its own."""
+        """The model of this name, which may be changed; it is copied from ``known``, whose models stay unchanged."""
         if name not in self._now:
             found = self._before.get(name)
             self._now[name] = Model.new(counts, nodes=nodes) if found is None else found.copy()
         return self._now[name]
 
     def all(self) -> dict[str, Model]:
-        """All of them; not to be changed."""
+        """All models, read-only."""
         return self._before | self._now
 
 
@@ -127,7 +127,7 @@ class ArithmeticState:
     """The arithmetic code of one field, in either direction.
 
     Args:
-        data: what to decode; None encodes.
+        data: the bytes to decode; None to encode.
     """
 
     def __init__(self, data: bytes | memoryview | None) -> None:
@@ -137,7 +137,7 @@ class ArithmeticState:
         self.place = self.low = self.range = self.started = 0
 
     def reserve(self, numbers: int) -> None:
-        """Room for so many more numbers."""
+        """Makes room for this many more numbers."""
         need = self.place + _NUMBER_BYTES * (numbers + 1)
         if self.encodes and need > self.size:
             grown = np.empty(need, np.uint8)
@@ -145,23 +145,23 @@ class ArithmeticState:
             self.buffer, self.size = grown, need
 
     def native(self) -> NativeArithmetic:
-        """The state, for C++; :meth:`take` takes it back."""
+        """The state as a C structure; :meth:`take` reads it back."""
         return NativeArithmetic(self.buffer.ctypes.data, self.size, self.place, self.low, self.range, self.started)
 
     def take(self, state: NativeArithmetic) -> None:
-        """What C++ made of :meth:`native`."""
+        """Takes over the state after a C++ call."""
         self.place, self.low, self.range, self.started = state.place, state.low, state.range, state.started
 
     def is_exhausted(self) -> bool:
-        """Whether a decoder has taken all bytes and no more than it must."""
+        """Whether a decoder has read exactly all bytes."""
         return self.place == self.size + AHEAD if self.started else not self.size
 
     def is_overrun(self) -> bool:
-        """Whether a decoder has taken more bytes than an encoder can have meant."""
+        """Whether a decoder has read further than any valid code allows."""
         return self.place > self.size + AHEAD
 
     def finished(self) -> bytes:
-        """All bytes of an encoder, which is done."""
+        """Finishes an encoder and returns its bytes."""
         if not self.started:
             return b""
         self.reserve(1)
@@ -173,7 +173,7 @@ class ArithmeticState:
 
 
 def carry(data: "bytearray | NDArray[np.uint8]", end: int) -> None:
-    """One more in the number that the bytes before ``end`` are."""
+    """Propagates a carry: adds 1 to the big-endian number in the bytes before ``end``."""
     while True:
         end -= 1
         data[end] = (int(data[end]) + 1) & 255

@@ -13,22 +13,22 @@ from structgstream.kernels._load import native_library, native_reason
 
 MAX_SYMBOLS = 2**31 - 1
 LANES = (1, 4, 32)
-"""By the code in a section's head."""
+"""Number of lanes, by the code in a section's head."""
 
 _NO_MEMORY = 1
-_LANE_BYTES = 3  # what a lane costs: half of its final state, and half of what is left of the other half
-_MOST_SHARE = 512  # a section spends up to a 512th on its lanes
+_LANE_BYTES = 3  # cost of a lane: half of its final state, and half of what is left of the other half
+_MOST_SHARE = 512  # lanes cost at most a 512th of a section
 
 
 def lanes_for(symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables) -> int:
-    """How many lanes the encoder takes: as many as cost less than a 512th of what the symbols will."""
+    """Number of lanes that the encoder takes: the most that cost less than a 512th of the symbols' bytes."""
     used = np.bincount(tables.rows[contexts, symbols], minlength=TOTAL + 1)
     size_bytes = int(used @ code_costs()) >> COST_BITS + 3
     return max(lanes for lanes in LANES if (lanes - 1) * _LANE_BYTES * _MOST_SHARE <= size_bytes)
 
 
 def has_native() -> bool:
-    """Whether the native library, and with it this coder, is there."""
+    """Whether the native library, and with it the C++ coder, is available."""
     return native_reason() is None
 
 
@@ -45,19 +45,19 @@ def encode(
     Args:
         symbols: u8 ``[n]``, each below A and with a frequency of 1 or more in its context.
         contexts: u16 ``[n]``, each below C.
-        tables: what both sides have.
-        lanes: 1, 4 or 32; None takes what :func:`lanes_for` says.
-        native: C++ or NumPy, which give the same bytes; None takes C++ where it is.
+        tables: of encoder and decoder.
+        lanes: 1, 4 or 32; None takes :func:`lanes_for`.
+        native: C++ or NumPy, which give the same bytes; None takes C++ if available.
 
     Raises:
-        StreamError: symbols, contexts and tables do not fit each other.
+        StreamError: symbols, contexts and tables are inconsistent.
     """
     contexts = _checked_contexts(contexts, tables)
     symbols = np.ascontiguousarray(symbols, np.uint8)
     if symbols.shape != contexts.shape:
         raise StreamError(f"{symbols.shape} symbols cannot be coded with {contexts.shape} contexts; give one for each.")
     if (symbols >= tables.alphabet).any() or not tables.rows[contexts, symbols].all():
-        raise StreamError("A symbol to encode has no frequency in its context; count it before making the tables.")
+        raise StreamError("A symbol to encode has frequency 0 in its context; count it before making the tables.")
     if lanes is not None and lanes not in LANES:
         raise StreamError(f"Sections have 1, 4 or 32 lanes, not {lanes}.")
     if not len(symbols):
@@ -80,14 +80,14 @@ def decode(
     """The symbols u8 ``[n]`` of a section that fills ``data``.
 
     Args:
-        data: what :func:`encode` gave.
-        contexts: u16 ``[n]``, as in encoding; their number is what the section must state.
+        data: result of :func:`encode`.
+        contexts: u16 ``[n]``, as in encoding; the section must state this number of symbols.
         tables: as in encoding.
         where: subject of error messages.
         native: as in :func:`encode`.
 
     Raises:
-        StreamError: the section is damaged, or has not this number of symbols.
+        StreamError: the section is damaged, or states another number of symbols.
     """
     contexts = _checked_contexts(contexts, tables)
     count, word_count, lanes, start = _head(data, where=where)
@@ -106,7 +106,7 @@ def decode(
 
 
 def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbols") -> int:
-    """How many bytes the section at the beginning of ``data`` takes; it may be followed by anything.
+    """Length in bytes of the section at the start of ``data``, which may be longer.
 
     Raises:
         StreamError: the section is longer than the data.
@@ -119,20 +119,20 @@ def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbol
 
 
 def _head(data: bytes | memoryview, *, where: str) -> tuple[int, int, int, int]:
-    """Numbers of symbols, words and lanes, and where the states begin."""
+    """Numbers of symbols, words and lanes, and the offset of the states."""
     count, start = _read_varint(data, 0, where=where)
     if count == 0:
         return 0, 0, 0, start
     value, start = _read_varint(data, start, where=where)
     word_count, lane_code = value >> 2, value & 3
-    # A symbol takes one word at most.
+    # A symbol takes at most one word.
     if count > MAX_SYMBOLS or word_count > count or lane_code >= len(LANES):
         raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
     return count, word_count, LANES[lane_code], start
 
 
 def _varint(value: int) -> bytes:
-    """Seven bits a byte, the lowest first; the high bit says that more follow."""
+    """LEB128: seven bits per byte, lowest first; the high bit marks that more follow."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -159,10 +159,10 @@ def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> 
 
 
 def uses_native(native: bool | None) -> bool:
-    """Whether C++ is to be taken; None takes it where it is.
+    """Whether to use C++; None uses it if available.
 
     Raises:
-        StreamError: it is asked for and not there.
+        StreamError: it is requested and not available.
     """
     if native and not has_native():
         raise StreamError("The installed native library has no entropy coder; install structgstream again.")

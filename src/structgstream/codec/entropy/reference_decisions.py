@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive decisions in Python, one after the other: the oracle, and what runs without a compiler (docs/entropy.md)."""
+"""Adaptive binary decisions in Python: the oracle, used when the C++ is not built (docs/entropy.md)."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -27,13 +27,13 @@ SQUASHED = (
 )
 """65536 / (1 + exp(-j / 4)), rounded."""
 PASSES = ((0, 16), (8, 16), (4, 8), (2, 4), (1, 2))
-"""First row and step; neighbours that are known are as far away as the first row is from 0, in pass 0 none are."""
+"""First row and step of each pass. Coded neighbours are as far away as the first row is from 0; pass 0 has none."""
 BLOCK = 32
 _LIMIT = (1 << 19) - 1
 
 
 def squashed(logit: int) -> int:
-    """The chance in 65536 for a logit in 256."""
+    """The probability, in units of 1/65536, of a logit in units of 1/256."""
     size = min(abs(logit), FAR)
     place = size >> 6
     chance = SQUASHED[place] + ((SQUASHED[place + 1] - SQUASHED[place]) * (size & 63) >> 6)
@@ -42,7 +42,7 @@ def squashed(logit: int) -> int:
 
 @cache
 def stretched() -> list[int]:
-    """The logit for each chance in 4096."""
+    """The logit, in units of 1/256, of each probability in units of 1/4096."""
     found, logit = [], -FAR
     for i in range(4096):
         while logit < FAR and squashed(logit) < 16 * i + 8:
@@ -52,9 +52,9 @@ def stretched() -> list[int]:
 
 
 class _Coder:
-    """The decisions of one model; use as a context, which puts the state back.
+    """Codes decisions with one model; a context manager, which writes the state back on exit.
 
-    Chances and weights are lists on the way: numbers of NumPy would be many times slower.
+    Probabilities and weights are Python lists meanwhile, many times faster than NumPy scalars.
     """
 
     def __init__(self, arithmetic: ArithmeticState, model: Model) -> None:
@@ -92,7 +92,7 @@ class _Coder:
         self._place += 1
 
     def even(self, yes: int) -> int:
-        """A decision that is as likely as not."""
+        """Codes a decision of probability one half."""
         return self._told(yes, HALF)
 
     def _told(self, yes: int, chance: int) -> int:
@@ -118,7 +118,7 @@ class _Coder:
         return yes
 
     def decide(self, yes: int, contexts: Sequence[int], node: int) -> int:
-        """One decision, and what is learned from it."""
+        """Codes one decision and updates the model."""
         weights, chances, seen, stretch = self._weights[node], self._chances, self._seen, stretched()
         cells = [(start + context) * self._nodes + node for start, context in zip(self._starts, contexts, strict=True)]
         logits = [stretch[chances[cell] >> 4] for cell in cells]
@@ -134,7 +134,7 @@ class _Coder:
         return yes
 
     def number(self, value: int, contexts: Sequence[int]) -> int:
-        """A signed number, which may be out of bounds."""
+        """Codes a signed number; a decoded one may be out of bounds."""
         if not self.decide(int(value != 0), contexts, 0):
             return 0
         negative = self.decide(int(value < 0), contexts, 1)
@@ -155,7 +155,7 @@ class _Coder:
 
 
 def size_class(size: int) -> int:
-    """Sizes as classes 0 to 15: each its own below 8, then two an octave."""
+    """Classes 0 to 15 of sizes: one per size below 8, then two per octave."""
     if size < 8:
         return size
     top = size.bit_length() - 1

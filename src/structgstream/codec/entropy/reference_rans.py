@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interleaved rANS in NumPy, all lanes at a time: the oracle, and what runs without a compiler (docs/entropy.md)."""
+"""Interleaved rANS in NumPy, all lanes at once: the oracle, used when the C++ is not built (docs/entropy.md)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from structgstream.codec.entropy.tables import FREQUENCY_BITS, TOTAL, FrequencyTables
 
 LOW = 1 << 16
-"""Least state, and the state before the first symbol that is encoded."""
+"""Lowest state, and the state before the first encoded symbol."""
 
 
 def encode_lanes(
@@ -32,7 +32,7 @@ def encode_lanes(
 def decode_lanes(
     words: NDArray[np.uint16], states: NDArray[np.uint32], contexts: NDArray[np.uint16], tables: FrequencyTables
 ) -> NDArray[np.uint8] | None:
-    """The symbols u8 ``[n]``, or None where states and words contradict each other. Contexts have been checked."""
+    """The symbols u8 ``[n]``, or None if states and words are inconsistent. Contexts have been checked."""
     lanes = len(states)
     used, rows = np.unique(contexts, return_inverse=True)
     slots = np.repeat(np.tile(np.arange(tables.alphabet, dtype=np.uint8), len(used)), tables.rows[used].reshape(-1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signed residuals as symbols of an alphabet of 16, and the rare large ones beside them (docs/entropy.md)."""
+"""Signed residuals as symbols of an alphabet of 16, with escape codes for the rare large ones (docs/entropy.md)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uin
     """
     values = residuals.astype(np.int64)
     if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
-        raise StreamError("A residual is beyond 32 bits; the step it was divided by is too small.")
+        raise StreamError("A residual is beyond 32 bits; take a larger quantization step.")
     size = np.abs(values)
     symbols = np.where(size > LARGEST, ESCAPE, zigzag(values)).astype(np.uint8)
     large = values[size > LARGEST].tolist()
@@ -35,17 +35,17 @@ def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uin
 def symbols_to_residuals(
     symbols: NDArray[np.uint8], escapes: bytes | memoryview, *, where: str = "A section of escapes"
 ) -> NDArray[np.int32]:
-    """Residuals int32 ``[n]`` from what :func:`residuals_to_symbols` gave.
+    """Inverse of :func:`residuals_to_symbols`: residuals int32 ``[n]``.
 
     Raises:
-        StreamError: a symbol is above 15, the section has more or fewer values than there are escapes, or a value is
-            beyond 32 bits.
+        StreamError: a symbol is above 15, the number of values differs from that of escapes, or a value is beyond 32
+            bits.
     """
     if (symbols > ESCAPE).any():
         raise StreamError(f"{where} belongs to symbols above {ESCAPE}; they are damaged.")
     values = unzigzag(symbols.astype(np.int64))
     places = np.flatnonzero(symbols == ESCAPE)
-    # An escape takes 4 bits at least and 61 at most.
+    # An escape takes 4 to 61 bits.
     if not 4 * len(places) <= 8 * len(escapes) <= 61 * len(places) + 7:
         raise StreamError(f"{where} has {len(escapes)} bytes for {len(places)} values; it is damaged.")
     reader = BitReader(escapes, where=where)

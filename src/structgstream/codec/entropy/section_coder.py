@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One description of what is coded, two directions.
+"""Coders of the init record's sections, with one description of the format for both directions.
 
 Note [Two directions]
 ~~~~~~~~~~~~~~~~~~~~~
-A format is written down once, as a function that hands values to a :class:`SectionCoder` and goes on with what it gets
-back. An encoder is handed the true values and returns them; a decoder is handed None and returns what the bytes say. So
-the two cannot disagree about order or contexts. Here are the sections of the init record; ``adaptive.py`` has packets.
+A format is described once, as a function that passes values to a :class:`SectionCoder` and continues with what it
+returns. An encoder gets the true values and returns them; a decoder gets None and returns the decoded values. So both
+directions use the same order and contexts. This module codes the init record, ``adaptive.py`` packets.
 """
 
 from collections.abc import Mapping
@@ -26,29 +26,29 @@ from structgstream.scene.state import FieldName
 
 CLASSES = 32
 """Alphabet of the bit lengths of natural numbers below 2^31."""
-_FLAT = 128  # of the geometric rows: what is expected of a context that has not been seen
+_FLAT = 128  # the geometric row that a context starts with
 
 
 class SectionCoder(Protocol):
-    """Encodes or decodes arrays of whole numbers, one section after another; names tell whose tables are used."""
+    """Encodes or decodes arrays of integers, one section after another; the name selects the frequency tables."""
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
-        """Small signed numbers ``[n]``: up to 7 costs its entropy, what is larger more."""
+        """Small signed numbers ``[n]``: entropy-coded symbols from -7 to 7, escape codes for larger ones."""
         ...
 
     def naturals(
         self, name: str, values: NDArray[np.int64] | None, contexts: Contexts, *, count: int
     ) -> NDArray[np.int64]:
-        """Numbers ``[n]`` from 0 to below 2^31 of any size: the entropy of their bit length, and the bits below."""
+        """Numbers ``[n]`` from 0 to 2^31 - 1: entropy-coded bit length, then the bits below the highest."""
         ...
 
     def number(self, name: str, value: int | None) -> int:
-        """One number from 0 to below 2^32."""
+        """One number from 0 to 2^32 - 1."""
         ...
 
 
 class Tables:
-    """The frequency tables that both sides hold, by name; what was not used yet is a geometric guess."""
+    """The frequency tables of encoder and decoder, by name; initially geometric."""
 
     def __init__(self) -> None:
         self._sets: dict[str, FrequencyTables] = {}
@@ -61,12 +61,12 @@ class Tables:
         return found
 
     def put(self, name: str, tables: FrequencyTables) -> None:
-        """What the set is from now on."""
+        """Replaces the set of this name."""
         self._sets[name] = tables
 
 
 class SectionEncoder:
-    """Writes; what a name says before its dot is the field whose bytes in :attr:`fields` grow."""
+    """Encodes; the part of a name before the dot is the field of :attr:`fields` that the bytes are appended to."""
 
     def __init__(self, tables: Tables) -> None:
         self._tables = tables
@@ -82,7 +82,7 @@ class SectionEncoder:
     def naturals(self, name: str, values: Naturals | None, contexts: Contexts, *, count: int) -> Naturals:
         assert values is not None
         if len(values) and not 0 <= int(values.min()) <= int(values.max()) < 2**31:
-            raise StreamError("A number is beyond 31 bits; the step it was divided by is too small.")
+            raise StreamError("A number is beyond 31 bits; take a larger quantization step.")
         lengths = bit_lengths(values)
         self._section(name, lengths.astype(np.uint8), contexts, count=count, alphabet=CLASSES)
         rest = pack_bits(
@@ -144,10 +144,10 @@ class SectionDecoder:
         return found
 
     def end(self) -> None:
-        """Nothing may be left.
+        """Checks that all bytes have been read.
 
         Raises:
-            StreamError: something is.
+            StreamError: some have not.
         """
         if left := [name for name, data in self._left.items() if len(data)]:
             raise StreamError(f"{self._where} has more bytes of {left[0]} than it should; it is damaged.")
@@ -170,7 +170,7 @@ class SectionDecoder:
 
 
 def varint(value: int) -> bytes:
-    """A number from 0 to below 2^32, seven bits a byte, the lowest first; all but the last have their highest bit."""
+    """LEB128 of a number from 0 to 2^32 - 1: seven bits per byte, lowest first; the high bit marks that more follow."""
     out = bytearray()
     while value >= 128:
         out.append(value & 127 | 128)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which tables to send: the encoder's choice, row by row, of what makes table and symbols together shortest.
+"""The encoder's choice of tables: for each row the coding that minimises the bits of table and symbols together.
 
-Costs are integers in units of 2^-16 bit, so the choice is the same on every machine. Decoders need nothing of this.
+Costs are integers in units of 2^-16 bit, so the choice is the same on every machine. Decoders do not need this.
 """
 
 from dataclasses import dataclass
@@ -37,14 +37,14 @@ _EXPLICIT_BITS = 2 + 1 + PRECISION_BITS + 1 + 1
 
 @dataclass(frozen=True)
 class _Explicit:
-    """Explicit rows of one kind for all contexts.
+    """Explicitly coded rows of one kind for all contexts.
 
     Args:
         rows: ``[C, A]`` frequencies.
-        cost: ``[C]`` of row and symbols.
+        cost: ``[C]`` of row and symbols, 2^-16 bit.
         levels, references, present: ``[C, A]``.
         number: ``[C]`` geometric row that is the reference, or None for the previous row.
-        bitmap: whether presence is told symbol by symbol.
+        bitmap: whether presence is coded as one flag per symbol.
     """
 
     rows: NDArray[np.int64]
@@ -71,14 +71,14 @@ class _Explicit:
 
 
 def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
-    """Tables for symbols that were counted, and the bits that make them of the previous ones.
+    """Tables for counted symbols, and their coding relative to the previous ones.
 
     Args:
-        counts: ``[C, A]``, how often each symbol occurs in each context.
-        previous: what the decoder has; a row stays where a new one would not pay for itself.
+        counts: ``[C, A]``, number of occurrences of each symbol in each context.
+        previous: the decoder's tables; a row is kept where a new one would cost more bits than it saves.
 
     Raises:
-        StreamError: counts do not fit the previous tables.
+        StreamError: counts have another shape than the previous tables, or are too large.
     """
     counts = counts.astype(np.int64)
     if counts.shape != previous.rows.shape or (counts < 0).any() or int(counts.sum()) >= 1 << 31:
@@ -92,7 +92,7 @@ def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
     keep, parametric = _data_cost(counts, kept) + (1 << COST_BITS), of_family.min(1)
     rows, cost = np.where((parametric < keep)[:, None], family[number], kept), np.minimum(keep, parametric)
     pieces = ["10" + fixed(g, NUMBER_BITS) if new else "0" for g, new in zip(number.tolist(), parametric < keep)]
-    # Where even exact frequencies would not pay for the head of an explicit row, none is tried.
+    # Explicit rows are tried only where exact frequencies would save more than the head of such a row.
     least = _data_cost(counts, normalize_counts(counts).rows.astype(np.int64)) + (
         _EXPLICIT_BITS + COUNT_BITS << COST_BITS
     )
@@ -115,10 +115,10 @@ def _explicit(
     precision: int,
     order: int,
 ) -> list[_Explicit]:
-    """The rows with presence as a number of symbols, and symbol by symbol.
+    """Explicit rows with both codings of presence: as a number of symbols, and as a flag per symbol.
 
-    With the scale of the weights given (that of the reference), the best level of a symbol does not depend on the
-    others': it balances ``count log2(weight)``, what the weight takes from all others, and the bits of the step.
+    With a fixed scale of the weights (the reference's), the best level of each symbol is independent of the others: it
+    balances ``count log2(weight)``, the share that the weight takes from all others, and the bits of the level.
     """
     references = levels_of(reference_rows, precision=precision)
     every = np.arange(1, top_level(precision) + 1)

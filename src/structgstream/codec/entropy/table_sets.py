@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Table sets as bits, relative to those that both sides have: what a decoder does (docs/entropy.md, Table sets).
+"""Decoding of table sets, relative to the previous ones (docs/entropy.md, Table sets).
 
-Frequencies travel as levels, floating-point numbers with ``p`` bits of mantissa: level 0 is none, level
-``1 + e 2^p + r`` stands for ``(2^p + r) 2^e``. A row gets the precision that its number of symbols is worth.
+Frequencies are coded as levels, floating-point numbers with ``p`` bits of mantissa: level 0 is frequency 0, level
+``1 + e 2^p + r`` is ``(2^p + r) 2^e``. The precision ``p`` of a row depends on its number of symbols.
 """
 
 import numpy as np
@@ -16,18 +16,18 @@ NUMBER_BITS = 8
 PRECISION_BITS = 2
 COUNT_BITS = 5
 MOST_ZEROS = 8
-_MOST_ROW_BYTES = 72  # 14 bits, 32 present or not, and 32 levels of 17 bits at most
+_MOST_ROW_BYTES = 72  # 14 bits, 32 presence flags, and 32 levels of at most 17 bits
 
 
 def levels_of(frequencies: NDArray[np.integer], *, precision: int) -> NDArray[np.int64]:
-    """Levels, rounded down, of frequencies 0 to 4096; that of 0 is 1: only levels of present symbols are coded."""
+    """Levels, rounded down, of frequencies 0 to 4096; 0 gives level 1, because only present symbols' are coded."""
     f = np.maximum(frequencies.astype(np.int64), 1)
     exponent = np.frexp(f.astype(np.float64))[1].astype(np.int64) - 1  # exact for integers
     return 1 + (exponent << precision) + (f << precision >> exponent) - (1 << precision)
 
 
 def weights_of(levels: NDArray[np.int64], *, precision: int) -> NDArray[np.int64]:
-    """What levels from 1 on stand for, in units of ``2^-precision``; 0 for level 0."""
+    """The frequencies of levels, in units of ``2^-precision``; 0 for level 0."""
     place = np.maximum(levels - 1, 0)
     mantissa = (1 << precision) + (place & (1 << precision) - 1)
     return np.where(levels > 0, mantissa << (place >> precision), 0)
@@ -41,7 +41,7 @@ def top_level(precision: int) -> int:
 def decode_tables(
     data: bytes | memoryview, previous: FrequencyTables, *, where: str = "A table set"
 ) -> FrequencyTables:
-    """The tables that ``data`` makes of the previous ones, which have the same contexts and alphabet.
+    """The tables coded in ``data`` relative to the previous ones, which have the same contexts and alphabet.
 
     Raises:
         StreamError: the set is damaged.
@@ -49,7 +49,7 @@ def decode_tables(
     if len(data) > _MOST_ROW_BYTES * previous.contexts:
         raise StreamError(f"{where} has {len(data)} bytes for {previous.contexts} contexts; it is damaged.")
     if not len(data):
-        return previous  # the rule where there is little to tell
+        return previous  # empty data: all rows stay
     reader = BitReader(data, where=where)
     family = geometric_family(previous.alphabet)
     rows = previous.rows.copy()

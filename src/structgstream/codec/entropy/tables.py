@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frequency tables of the entropy coder: integers throughout, so that every decoder has the same (docs/entropy.md)."""
+"""Frequency tables of the entropy coder, in integers, so that every decoder has the same (docs/entropy.md)."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -19,13 +19,13 @@ COST_BITS = 16
 
 @dataclass(frozen=True, eq=False)
 class FrequencyTables:
-    """One row of frequencies for each context.
+    """One row of frequencies per context.
 
     Args:
         rows: u16 ``[C, A]``, each row summing to 4096; C at most 4096, A at most 32.
 
     Raises:
-        StreamError: they are anything else.
+        StreamError: ``rows`` does not satisfy this.
     """
 
     rows: NDArray[np.uint16]
@@ -64,11 +64,11 @@ class FrequencyTables:
 
 
 def normalize_counts(counts: NDArray[np.integer]) -> FrequencyTables:
-    """Frequencies for counted symbols that make the code nearly as short as it can be; a row without any is even.
+    """Frequencies that nearly minimise the code length of counted symbols; a row without counts is uniform.
 
-    Symbols that occur get at least 1, others 0. From the floors of the quotas on, each further unit goes to the symbol
-    where ``count / (2 frequency + 1)`` is largest (Sainte-Lague's divisors: to second order the greatest gain in code
-    length), or comes from where ``count / (2 frequency - 1)`` is least; ties go to the lower symbol.
+    Symbols that occur get at least 1, others 0. Starting from the floors of the quotas, each missing unit is added to
+    the symbol where ``count / (2 frequency + 1)`` is largest (Sainte-Lague divisors: to second order the greatest gain
+    in code length), each surplus unit taken where ``count / (2 frequency - 1)`` is least; ties go to the lower symbol.
 
     Args:
         counts: ``[C, A]``, not negative, a row's sum below 2^40.
@@ -85,13 +85,13 @@ def normalize_counts(counts: NDArray[np.integer]) -> FrequencyTables:
         rows[short, _largest(n[short], 2 * rows[short] + 1)] += 1
     while len(over := np.flatnonzero(rows.sum(1) > TOTAL)):
         f = rows[over]
-        # The least of n / d is the largest of d / n; a frequency of 1 stays.
+        # The least n / d is the largest d / n; a frequency of 1 is kept.
         rows[over, _largest(np.where(f > 1, 2 * f - 1, 0), np.maximum(n[over], 1))] -= 1
     return FrequencyTables(rows.astype(np.uint16))
 
 
 def _largest(numerators: NDArray[np.int64], denominators: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where in each row the fraction is largest, the first of equals; exact, by cross-multiplication."""
+    """Index of the largest fraction of each row, the first of equals; exact, by cross-multiplication."""
     best = np.zeros(len(numerators), np.int64)
     n, d = numerators[:, 0], denominators[:, 0]
     for column in range(1, numerators.shape[1]):
@@ -104,8 +104,8 @@ def _largest(numerators: NDArray[np.int64], denominators: NDArray[np.int64]) -> 
 def weighed(weights: NDArray[np.int64]) -> NDArray[np.int64]:
     """Frequencies ``[..., A]`` for integer weights: the floors of the quotas, at least 1 where the weight is positive.
 
-    What is missing from 4096, or too much, the first of the largest weights gets or gives. This is what a decoder does
-    with the weights in a table set; :func:`normalize_counts` is for counts.
+    The difference to 4096 is added to the first of the largest weights. Decoders apply this to the weights of a table
+    set; :func:`normalize_counts` is for counts.
     """
     rows = np.where(weights > 0, np.maximum(weights * TOTAL // weights.sum(-1, keepdims=True), 1), 0)
     peak = weights.argmax(-1)[..., None]
@@ -146,7 +146,7 @@ def geometric(numbers: NDArray[np.integer], *, alphabet: int) -> FrequencyTables
 
 @cache
 def geometric_family(alphabet: int) -> NDArray[np.uint16]:
-    """All 256 geometric rows ``[256, A]``, not to be written to."""
+    """All 256 geometric rows ``[256, A]``, read-only."""
     rows = geometric(np.arange(GEOMETRIC_ROWS), alphabet=alphabet).rows
     rows.setflags(write=False)
     return rows
@@ -154,7 +154,7 @@ def geometric_family(alphabet: int) -> NDArray[np.uint16]:
 
 @cache
 def logs() -> NDArray[np.int64]:
-    """log2 of 0 to 8191 in units of 2^-16, rounded down digit by digit; 0 for 0."""
+    """log2 of 0 to 8191 in units of 2^-16, rounded down bit by bit; 0 for 0."""
     n = np.maximum(np.arange(2 * TOTAL), 1)
     whole = np.frexp(n.astype(np.float64))[1].astype(np.int64) - 1
     x = (n.astype(np.uint64) << np.uint64(31)) >> whole.astype(np.uint64)  # 1 to 2, with 31 bits after the point
@@ -169,7 +169,7 @@ def logs() -> NDArray[np.int64]:
 
 @cache
 def code_costs() -> NDArray[np.int64]:
-    """What a symbol of frequency 0 to 4096 costs, in units of 2^-16 bit; for encoders' choices."""
+    """Cost of a symbol of frequency 0 to 4096, in units of 2^-16 bit; for encoders' choices."""
     costs = (FREQUENCY_BITS << COST_BITS) - logs()[: TOTAL + 1]
     costs[0] = 1 << 28  # not to be coded at all
     return costs

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene's dynamic fields as bins: whole numbers times a step (docs/bitstream.md, section Bins).
+"""Quantization of a scene's dynamic fields: integers (bins) times a step (docs/bitstream.md, section Bins).
 
-The value of a bin is the product of two float32 numbers, rounded as IEEE 754 rounds it: the same in every decoder.
+A dequantized value is the float32 product of bin and step, rounded by IEEE 754, so every decoder gets the same bits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from structgstream.scene.state import FIELDS, FREE_COLUMNS, FieldName, Granulari
 
 FREE_PARAMETERS = FIELDS["free"].parameters
 LARGEST = 2**22
-"""Of bins: with their products rounded to float32, the nearest bin of a value is still the one it was made of."""
+"""Largest magnitude of a bin: up to here, quantizing the rounded float32 product gives the same bin again."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class FreeBins:
     Args:
         births: int64 ``[F]``, ascending.
         bins: ``[F, 14]``.
-        change: what the last frame did to them; what was born in it did not change.
+        change: by the last frame; zero for Gaussians born in it.
     """
 
     births: NDArray[np.int64]
@@ -43,20 +43,20 @@ class FreeBins:
         return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
 
     def without_change(self) -> "FreeBins":
-        """The same, without a last change: what a key frame starts from."""
+        """The same bins with zero change, as after a key packet."""
         return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
 
 
 @dataclass(frozen=True)
 class SceneBins:
-    """The dynamic part of a scene, and what the last frame did to it.
+    """The quantized dynamic fields of a scene, and their change by the last frame.
 
     Args:
         anchors: ``[M, columns of the dynamic anchor fields]``.
         columns: ``(name, first column, end)`` of each of these fields.
-        change: of the anchors.
-        weights: by field, ``[P, 1]``.
-        weight_changes: by field.
+        change: of ``anchors``.
+        weights: of MLPs and other shared fields, by field, ``[P, 1]``.
+        weight_changes: of ``weights``, by field.
         free: the free Gaussians.
     """
 
@@ -68,7 +68,7 @@ class SceneBins:
     free: FreeBins
 
     def without_change(self) -> "SceneBins":
-        """The same without a last change."""
+        """The same bins with zero change."""
         return replace(
             self,
             change=Change.none(*self.anchors.shape),
@@ -78,17 +78,17 @@ class SceneBins:
 
 
 def quantized_fields(granularity: Granularity) -> tuple[FieldName, ...]:
-    """The fields that can change as bins: the anchors' as rows, shared ones as weights, in the order of the table."""
+    """The fields of a granularity that packets can carry as bins, in the order of the table."""
     return tuple(name for name in fields_of(granularity) if FIELDS[name].quantized)
 
 
 def quantize_state(
     state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]
 ) -> SceneBins:
-    """The nearest bins of a state's dynamic fields.
+    """Quantizes the dynamic fields of a state.
 
     Raises:
-        StreamError: a value is too many steps from zero.
+        StreamError: a bin is beyond :data:`LARGEST`.
     """
     names: list[FieldName] = [name for name in quantized_fields("anchor") if name in dynamic]
     rows = [quantize(state[name], steps[name]) for name in names]
@@ -113,7 +113,7 @@ def quantize_state(
 def dequantize_state(
     bins: SceneBins, dynamic: frozenset[FieldName], steps: Mapping[str, float]
 ) -> dict[FieldName, Tensor]:
-    """The dynamic fields that bins stand for."""
+    """Dequantizes the dynamic fields."""
     state: dict[FieldName, Tensor] = {}
     for name, first, end in bins.columns:
         state[name] = dequantize(bins.anchors[:, first:end], steps[name])
@@ -126,10 +126,10 @@ def dequantize_state(
 
 
 def round_to_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
-    """The fields that have a step, as their nearest bins stand for them; all others as they are.
+    """Quantizes and dequantizes the fields that have a step; others are returned as they are.
 
     Raises:
-        StreamError: a value is too many steps from zero.
+        StreamError: a bin is beyond :data:`LARGEST`.
     """
     return {
         name: dequantize(quantize(value, steps[name]), steps[name]) if name in steps else value
@@ -143,10 +143,10 @@ def _free_steps(steps: Mapping[str, float]) -> NDArray[np.float32]:
 
 
 def quantize(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
-    """The bin nearest to every number of a tensor.
+    """Quantizes a tensor: each value to the nearest bin.
 
     Raises:
-        StreamError: one is too many steps from zero.
+        StreamError: a bin is beyond :data:`LARGEST`.
     """
     found = np.rint(value.detach().cpu().numpy().astype(np.float64) / np.asarray(step, np.float32))
     if found.size and not np.abs(found).max() <= LARGEST:
@@ -155,5 +155,5 @@ def quantize(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
 
 
 def dequantize(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
-    """What bins stand for."""
+    """Dequantizes bins: float32 products of bin and step."""
     return torch.from_numpy(bins.astype(np.float32) * np.asarray(step, np.float32))

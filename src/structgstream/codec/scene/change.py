@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame did to rows of bins."""
+"""The change of rows of bins by a frame."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from numpy.typing import NDArray
 
 from structgstream.codec.arrays import Bins, Flags
 
-_MOST = 255  # of a size that counts
+_MOST = 255  # a residual's magnitude is clamped to this in a size
 
 
 @dataclass(frozen=True)
 class Change:
-    """What a frame did to rows of bins, and whether those before it did anything.
+    """The change of rows of bins by a frame, and which rows the two frames before changed.
 
     Args:
         residuals: ``[n, C]``, zero in rows that did not change.
-        history: u8 ``[n]``: bit 0 says whether this frame changed the row, bits 1 and 2 whether those before did.
-        sizes: i32 ``[n]``: of each row's residuals together.
+        history: u8 ``[n]``: bit 0 is set if this frame changed the row, bits 1 and 2 if the two before did.
+        sizes: i32 ``[n]``: sum of the magnitudes of each row's residuals.
     """
 
     residuals: Bins
@@ -27,25 +27,25 @@ class Change:
 
     @property
     def active(self) -> Flags:
-        """``[n]``, the rows that changed."""
+        """Mask ``[n]`` of the rows that changed."""
         return (self.history & 1).astype(np.bool_)
 
     @classmethod
     def none(cls, rows: int, columns: int) -> "Change":
-        """Nothing changed."""
+        """A change of zero."""
         return cls(np.zeros((rows, columns), np.int32), np.zeros(rows, np.uint8), np.zeros(rows, np.int32))
 
     @classmethod
     def of(cls, residuals: Bins) -> "Change":
-        """What these residuals ``[n, C]`` make."""
+        """The change with these residuals ``[n, C]`` and no history."""
         return cls(residuals, (residuals != 0).any(axis=1).astype(np.uint8), row_sizes(residuals))
 
     def select(self, rows: NDArray[np.bool_]) -> "Change":
-        """Of the rows of a mask."""
+        """The change of the rows of a mask ``[n]``."""
         return Change(self.residuals[rows], self.history[rows], self.sizes[rows])
 
     def extended(self, rows: int) -> "Change":
-        """With so many rows more, which did not change."""
+        """The change with ``rows`` unchanged rows appended."""
         more = Change.none(rows, self.residuals.shape[1])
         return Change(
             np.concatenate([self.residuals, more.residuals]),
@@ -55,5 +55,5 @@ class Change:
 
 
 def row_sizes(residuals: Bins) -> Bins:
-    """Of each row's residuals together; no context tells so large ones apart that the limit matters."""
+    """Sum of the magnitudes of each row's residuals, clamped at 255, where contexts no longer distinguish them."""
     return np.minimum(np.abs(residuals), _MOST) @ np.ones(residuals.shape[1], np.int32)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact).
+"""The compact codec: bins predicted from the previous frame's, entropy coded (docs/bitstream.md, section Compact).
 
-A key packet follows the header's reference state instead, with models that have seen nothing: it stands alone, and so
-does the group of packets up to the next one.
+A key packet is predicted from the header's reference state and starts with fresh models, so each group of packets (a
+key packet and the delta packets up to the next one) can be decoded by itself.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName, fields_of, parameters_of
 
 FREE_FIELDS: frozenset[FieldName] = frozenset(fields_of("free"))
-"""What becomes of free Gaussians is coded as a whole: all of these are dynamic, or none."""
+"""Births, deaths and changes of free Gaussians are coded together: these fields are all dynamic, or none is."""
 CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized_fields("shared")) | FREE_FIELDS
 """Fields that may be dynamic."""
 
@@ -30,10 +30,10 @@ CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized
 def code_scene(
     coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, *, has_free: bool, where: str
 ) -> SceneBins:
-    """Codes the bins of a frame after those of ``before``.
+    """Codes the bins of a frame given those of the frame ``before``, in either direction.
 
     Raises:
-        StreamError: what is decoded contradicts itself.
+        StreamError: decoded values are out of range or inconsistent.
     """
     given = None if after is None else Change.of(after.anchors - before.anchors)
     change = code_change(coder, given, before.change, groups=before.columns)
@@ -49,13 +49,13 @@ def code_scene(
         free = code_free(coder, None if after is None else after.free, before.free, where=where)
     for found in (anchors, *weights.values(), free.bins):
         if found.size and not -LARGEST <= int(found.min()) <= int(found.max()) <= LARGEST:
-            raise StreamError(f"{where} has a bin beyond 22 bits, which no value stands for; it is damaged.")
+            raise StreamError(f"{where} has a bin beyond 22 bits, the largest allowed; it is damaged.")
     return SceneBins(anchors, before.columns, change, weights, changes, free)
 
 
 @dataclass(frozen=True)
 class CompactState:
-    """What both sides know after a packet."""
+    """The state that encoder and decoder share after a packet."""
 
     index: int
     bins: SceneBins
@@ -63,7 +63,7 @@ class CompactState:
 
 
 class _Compact:
-    """What encoder and decoder have in common: where a packet starts from.
+    """State that encoder and decoder share: the prediction of each packet.
 
     Raises:
         StreamError: the header has another codec, dynamic fields that cannot be coded, or no step or reference for one.
@@ -87,7 +87,7 @@ class _Compact:
             raise StreamError("The header's reference state does not hold the dynamic fields of anchors and MLPs.")
         self._header = header
         known: dict[FieldName, Tensor] = {**header.static, **header.reference}
-        # What is not dynamic is not looked at; free Gaussians begin as none.
+        # Static fields are not read; a key packet starts without free Gaussians.
         self._reference = quantize_state(known, rows, header.steps)
         self.state: CompactState | None = None
 
@@ -103,7 +103,7 @@ class _Compact:
         return code_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
 
     def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
-        # What a key packet changes is everything since the reference, and tells nothing of what comes next.
+        # Residuals of a key packet are relative to the reference, so they do not predict those of the next packet.
         self.state = CompactState(index, bins.without_change() if kind is PacketKind.KEY else bins, models)
 
 
@@ -111,7 +111,7 @@ class CompactEncoder(_Compact):
     """Encodes the frames of one stream, in order."""
 
     def replay(self, state: CompactState | None) -> None:
-        """Go on from what a decoder knows."""
+        """Continue from a decoder's state."""
         self.state = state
 
     def encode(self, state: Mapping[FieldName, Tensor], *, kind: PacketKind, index: int) -> dict[FieldName, bytes]:
@@ -134,7 +134,7 @@ class CompactEncoder(_Compact):
 
 
 class CompactDecoder(_Compact):
-    """Decodes the frames of one stream, in order, beginning at any key packet."""
+    """Decodes the frames of one stream in order, starting at any key packet."""
 
     def decode(
         self, fields: Mapping[FieldName, bytes | memoryview], *, kind: PacketKind, index: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free Gaussians from frame to frame: some die, some change, some are born (docs/bitstream.md, section Free 3DGs)."""
+"""Coding of free Gaussians: deaths, changes and births (docs/bitstream.md, section Free 3DGs)."""
 
 from itertools import accumulate
 
@@ -18,14 +18,14 @@ from structgstream.scene.state import FREE_COLUMNS
 _ENDS = tuple(accumulate(parameter.columns for parameter in FREE_PARAMETERS))
 GROUPS = tuple((p.path, end - p.columns, end) for p, end in zip(FREE_PARAMETERS, _ENDS, strict=True))
 MOST_FREE = 2**18
-"""Free Gaussians that a scene may have: a symbol can take less than a bit, so bytes do not bound their number."""
-_MEANS = range(6, 11)  # quaternions and opacities
-_LED = (12, 13)  # green and blue
+"""Largest number of free Gaussians of a scene: symbols can cost less than a bit, so bytes do not bound it."""
+_MEANS = range(6, 11)  # columns predicted from the mean: quaternions and opacities
+_LED = (12, 13)  # columns predicted from the change in the column before: green and blue
 _FRAME_BITS = 32  # a birth is frame * 2^32 + number
 
 
 def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
-    """Codes what becomes of ``before``; of ``after``, births and bins are looked at.
+    """Codes deaths, changes and births from ``before`` to ``after``, whose births and bins are read.
 
     Raises:
         StreamError: births do not ascend or are out of range, or there are too many.
@@ -57,7 +57,7 @@ def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *,
 
 
 def _code_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
-    """What is born, given the bins of what is alive."""
+    """Codes the births, given the bins of the survivors."""
     given = None if new is None else np.array([len(new.births)])
     count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
     if not 0 <= count <= MOST_FREE - len(alive):
@@ -88,14 +88,14 @@ def _code_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, whe
 
 
 def _code_birth_gaps(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
-    """The bins ``[count, 14]`` of what is born, column by column.
+    """Codes the bins ``[count, 14]`` of newborn Gaussians, column by column.
 
-    Most are like those of the row before, the last of what is alive before the first. What hardly differs between free
-    Gaussians is told as the difference from the mean of what is alive, and green and blue change as the colour before.
+    Most columns are predicted from the row before (the first from the last survivor). Quaternions and opacities, which
+    vary little, are predicted from the survivors' mean; green and blue also by the change of the colour before.
     """
     start = alive[-1].astype(np.int64) if len(alive) else np.zeros(FREE_COLUMNS, np.int64)
     found = np.zeros((count, FREE_COLUMNS), np.int64)
-    one, two = np.zeros((2, count), np.int64)  # errors in the columns before
+    one, two = np.zeros((2, count), np.int64)  # prediction errors in the two columns before
     for column in range(FREE_COLUMNS):
         has_mean = column in _MEANS
         mean = int(alive[:, column].sum(dtype=np.int64)) // len(alive) if has_mean and len(alive) else 0
@@ -127,7 +127,7 @@ def _length(errors: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _restarted_sums(steps: NDArray[np.int64], fresh: Flags) -> NDArray[np.int64]:
-    """Running sums that begin again at every fresh row; the first row is where the first begins."""
+    """Running sums that restart at the first row and at every fresh row."""
     total = np.cumsum(steps)
     starts = np.flatnonzero(fresh | (np.arange(len(steps)) == 0))
     group = np.searchsorted(starts, np.arange(len(steps)), side="right") - 1

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of bins that mostly stay: which ones change, and by how much (docs/bitstream.md, section Rows).
+"""Changes of rows of bins: which rows are active, and their residuals (docs/bitstream.md, section Rows).
 
-Rows stand in an order in which neighbours belong together. Passes go from every sixteenth row to every second, so that
-each row but the first ones has a neighbour on either side that is known.
+Neighbouring rows are correlated, as anchors are in Z-order. Passes go from every sixteenth row to every second, so that
+each row except those of the first pass has coded neighbours on both sides as context.
 """
 
 from collections.abc import Sequence
@@ -18,13 +18,14 @@ _REMEMBERED = 7  # activity of three frames
 def code_change(
     coder: AdaptiveCoder, change: Change | None, before: Change, *, groups: Sequence[tuple[str, int, int]]
 ) -> Change:
-    """Codes a change, which is like the one ``before``.
+    """Codes a change, with the rows' previous change as context.
 
     Args:
-        coder: either direction.
-        change: what to code; None when decoding.
-        before: the same rows' last change.
-        groups: ``(name, first column, end)`` of columns that have models of their own, all columns in their order.
+        coder: an encoder or a decoder.
+        change: the change to encode; None when decoding.
+        before: the same rows' previous change.
+        groups: ``(name, first column, end)`` of the groups of columns with a model each; they cover all columns in
+            order.
     """
     if not groups:
         return before

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the fields of a scene fit together (docs/bitstream.md, section Fields): one letter, one size."""
+"""Consistency of the shapes of a scene's fields (docs/bitstream.md, section Fields): each letter has one size."""
 
 from collections.abc import Mapping
 
@@ -10,16 +10,16 @@ from structgstream.errors import StreamError
 from structgstream.scene.state import FIELDS, FieldName
 
 ENVIRONMENT_ROWS = (1, 4, 9)
-"""Spherical harmonics up to degree 0, 1 and 2."""
+"""Numbers of spherical harmonics up to degree 0, 1 and 2."""
 
 
 def check_shapes(
     fields: Mapping[FieldName, Tensor], *, distance_input: bool, training_cameras: int, where: str
 ) -> None:
-    """Refuse fields that contradict each other. Of the init record's fields only those that are there are looked at.
+    """Check that the shapes of the fields present are consistent.
 
     Raises:
-        StreamError: naming the first field that does not fit, its shape and what was expected.
+        StreamError: naming the first field of another shape, its shape and the expected one.
     """
     sizes: dict[str, int] = {"V": training_cameras}
     for name, value in fields.items():
@@ -29,7 +29,9 @@ def check_shapes(
     if not {"K", "D"} <= set(sizes):
         return
     if sizes["K"] < 1 or sizes["D"] < 1:
-        raise StreamError(f"{where} has {sizes['K']} Gaussians and {sizes['D']} features an anchor; both must be 1 up.")
+        raise StreamError(
+            f"{where} has {sizes['K']} Gaussians and {sizes['D']} features an anchor; expected at least 1."
+        )
     inputs = sizes["D"] + 3 + int(distance_input)
     hidden: int | None = None
     for name, row in FIELDS.items():
@@ -39,8 +41,8 @@ def check_shapes(
         units, rest = divmod(weights - outputs, inputs + 1 + outputs)
         if rest or units < 1 or units != (hidden or units):
             raise StreamError(
-                f"{where} has an MLP of {weights} weights, which is no hidden layer between {inputs} inputs and "
-                f"{outputs} outputs, or not the same as in the other MLPs."
+                f"{where} has an MLP of {weights} weights, which fits no hidden layer between {inputs} inputs and "
+                f"{outputs} outputs, or not the size of the other MLPs' hidden layer."
             )
         hidden = units
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The init record's fields as bins, entropy coded (docs/bitstream.md, section Coded init fields).
+"""The init record's fields as entropy-coded bins (docs/bitstream.md, section Coded init fields).
 
 Note [Shifts]
 ~~~~~~~~~~~~~
-What an anchor's numbers are worth differs by powers of ten: most are behind others, far away or nearly transparent.
-So a row's bins may all be multiples of a power of two, the row's shift, which is coded first: one step a field, and
-coarse rows where that does not show. A decoder needs no more for it than a shift to the left.
+The sensitivity of renderings to an anchor's values varies by orders of magnitude, because most anchors are occluded,
+far away or nearly transparent. So each row has a shift: all its bins are multiples of 2^shift, which gives insensitive
+rows a coarser effective step while a field has one step. The shift is coded before the row; a decoder shifts left.
 """
 
 import math
@@ -28,20 +28,20 @@ from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, InitCoding
 MOST_ANCHORS = 2**22
 MOST_WEIGHTS = 2**20
 FREE_NUMBERS, NUMBERS_A_BYTE = 2**20, 64
-"""Numbers that the coded fields may have together, whatever their bytes, and how many more with each byte: a symbol can
-take next to nothing, so a few bytes could stand for gigabytes. What is fitted has 5 to 9 numbers a byte."""
+"""Limits memory: all coded fields together may have 2^20 numbers plus 64 per byte. A symbol can cost nearly no bits, so
+a few bytes could decode to gigabytes. Trained scenes have 5 to 9 numbers per byte."""
 _MOST_GAUSSIANS, _MOST_OTHERS = 64, 256
-"""Of an anchor: the size K and all other sizes that a letter stands for."""
+"""Largest K, and largest value of every other letter of a shape."""
 UNCODED_FIELDS: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if row.init_coding == "uncoded")
-"""Fields that the init record holds as numbers with either codec."""
+"""Fields that the init record stores raw with either codec."""
 SHIFTS = 8
-_SIZES = 5  # classes of what the two columns before hold: 0, 1, 2 to 3, 4 to 7, 8 and more
-_HALF = 30  # bits of a key's lower part
+_SIZES = 5  # context classes of the magnitudes in the two columns before: 0, 1, 2 to 3, 4 to 7, 8 and more
+_HALF = 30  # bits of the lower half of a Z-order key
 _WHERE = "The init record"
 
 
 class _Budget:
-    """How many numbers are still allowed."""
+    """Counts down the numbers that are still allowed."""
 
     def __init__(self, left: int) -> None:
         self._left = left
@@ -49,7 +49,7 @@ class _Budget:
     def take(self, count: int) -> None:
         self._left -= count
         if self._left < 0:
-            raise StreamError(f"{_WHERE} has more than {NUMBERS_A_BYTE} numbers a byte; it is damaged.")
+            raise StreamError(f"{_WHERE} has more than {NUMBERS_A_BYTE} numbers per byte; it is damaged.")
 
 
 def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
@@ -57,15 +57,15 @@ def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
 
 
 def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
-    """The bytes of every field that is coded.
+    """The bytes of every field that has a coding.
 
     Args:
         fields: of the init record, by name.
-        steps: of those that are coded.
+        steps: quantization steps, by field.
 
     Raises:
-        StreamError: there is no step for one, a value is not that of a bin, or there are more numbers than allowed,
-            also for the bytes that they take.
+        StreamError: a field has no step, a value is not a multiple of its step, or there are too many numbers, in
+            absolute terms or for their bytes.
     """
     bins: dict[FieldName, Bins] = {}
     for name in _coded_names(fields.keys()):
@@ -73,14 +73,14 @@ def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, 
             raise StreamError(f"The header states no step for {name} in the init record.")
         found = quantize(fields[name], steps[name])
         if dequantize(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
-            raise StreamError(f"The header's {name} are no multiples of their step {steps[name]:g}; round them first.")
+            raise StreamError(f"The header's {name} are no multiples of the step {steps[name]:g}; quantize them first.")
         bins[name] = found
     encoder = SectionEncoder(Tables())
     numbers = sum(found.size for found in bins.values())
     _code_fields(encoder, bins, bins.keys(), _Budget(numbers))
     if numbers > (most := _most_numbers(encoder.fields.values())):
         raise StreamError(
-            f"The header has {numbers} numbers that cost nothing; at most {most} are allowed. Take smaller steps."
+            f"The header has {numbers} numbers, more than the {most} that its bytes allow; take smaller steps."
         )
     return {name: encoder.fields[name] for name in bins}
 
@@ -95,7 +95,7 @@ def decode_fields(
     """
     names = _coded_names(coded.keys())
     if len(names) < len(coded):
-        raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & UNCODED_FIELDS))} coded; it has no coding.")
+        raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & UNCODED_FIELDS))} coded; expected raw.")
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
     decoder = SectionDecoder(Tables(), coded, where=_WHERE)
@@ -113,7 +113,7 @@ def _of_coding(coding: InitCoding, names: Set[FieldName]) -> list[FieldName]:
 
 
 def most_columns(name: FieldName) -> int:
-    """How many columns a field may have that is coded as rows."""
+    """Largest number of columns of a field that is coded as rows."""
     most = {"K": _MOST_GAUSSIANS}
     sizes = (size if isinstance(size, int) else most.get(size, _MOST_OTHERS) for size in FIELDS[name].shape[1:])
     return math.prod(sizes)
@@ -122,7 +122,7 @@ def most_columns(name: FieldName) -> int:
 def _code_fields(
     coder: SectionCoder, bins: Mapping[FieldName, Bins] | None, names: Set[FieldName], budget: _Budget
 ) -> dict[FieldName, Bins]:
-    """Codes the fields ``names``, the anchors' one after another and then the others."""
+    """Codes the fields ``names``: anchor fields, then the others."""
     given: Mapping[FieldName, Bins] = bins or {}
     found: dict[FieldName, Bins] = {}
     positions = _code_positions(coder, given.get("anchor_positions"), budget)
@@ -138,17 +138,17 @@ def _code_fields(
 
 
 def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
-    """The same in the shapes of the state table; a size is what the first field that has it makes of its numbers."""
+    """Reshapes bins to the shapes of the state table; the first field with a letter determines its size."""
     tellers: dict[str | int, FieldName] = {size: row.name for row in reversed(STATE_TABLE) for size in row.shape}
     sizes: dict[str | int, int] = {}
     for name in _coded_names(found.keys()):
         bins, wanted = found[name], FIELDS[name].shape
-        # Rows are told apart even where there are none of them; other numbers are counted as a whole.
+        # Coded rows keep their number even without columns; of other fields only the total count is known.
         rows, count = ((len(bins),), math.prod(bins.shape[1:])) if bins.ndim > 1 else ((), bins.size)
         rest: list[int | None] = []
         for size in wanted[len(rows) :]:
             if isinstance(size, str) and size not in sizes and tellers[size] != name:
-                raise StreamError(f"{_WHERE} holds {name} without {tellers[size]}, which tells its shape.")
+                raise StreamError(f"{_WHERE} holds {name} without {tellers[size]}, which determines its shape.")
             rest.append(size if isinstance(size, int) else sizes.get(size))
         left = count // max(1, math.prod(size for size in rest if size is not None))
         columns = tuple(left if size is None else size for size in rest)
@@ -160,9 +160,9 @@ def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
 
 
 def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> Bins:
-    """Cells by how far each is from the one before along a Z-order curve.
+    """Codes cells by the differences of successive Z-order keys.
 
-    Note that rows need not be in this order; if they are not, signs are told too.
+    Rows need not be in Z-order; if they are not, signs are coded too.
     """
     given = None if bins is None else len(bins)
     count = _bounded(coder.number("anchor_positions.rows", given), MOST_ANCHORS, "anchors")
@@ -196,7 +196,7 @@ def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> 
     steps = (far << _HALF) + near
     if descends:
         steps = unzigzag(steps)
-    # The sums of both halves stay below 2^53, however damaged.
+    # The sums of both halves stay below 2^53 even in damaged data.
     low = np.cumsum(steps & (1 << _HALF) - 1)
     high = np.cumsum(steps >> _HALF) + (low >> _HALF)
     if not 0 <= int(high.min()) <= int(high.max()) < 1 << 3 * CELL_BITS - _HALF:
@@ -208,7 +208,7 @@ def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> 
 def _code_rows(
     coder: SectionCoder, name: FieldName, bins: Bins | None, like: NDArray[np.int32], *, budget: _Budget
 ) -> tuple[Bins, NDArray[np.int32]]:
-    """Rows ``[n, C]``, column by column, and their shifts, which are like those of another field."""
+    """Codes rows ``[n, C]``, column by column, and their shifts, in the context of another field's shifts ``like``."""
     given = None if bins is None else bins.shape[1]
     columns = _bounded(coder.number(f"{name}.columns", given), most_columns(name), f"columns of {name}")
     budget.take(columns * len(like))
@@ -231,11 +231,11 @@ def _code_rows(
 
 
 def _code_values(coder: SectionCoder, name: FieldName, values: Naturals | None, contexts: Contexts) -> Naturals:
-    """Signed numbers ``[n]``: those up to 6 as they are, 7 for all above, and what these have more than 7."""
+    """Codes signed numbers ``[n]``: magnitudes up to 6 as symbols, larger ones as symbol 7 and the excess over 7."""
     clipped = None if values is None else np.clip(values, -LARGEST_SYMBOL, LARGEST_SYMBOL).astype(np.int32)
     found = coder.residuals(f"{name}.value", clipped, contexts, count=SHIFTS * _SIZES).astype(np.int64)
     if len(found) and int(np.abs(found).max()) > LARGEST_SYMBOL:
-        raise StreamError(f"{_WHERE} holds {name} beyond {LARGEST_SYMBOL} where the rest follows; it is damaged.")
+        raise StreamError(f"{_WHERE} holds {name} beyond {LARGEST_SYMBOL} before an excess; it is damaged.")
     large = np.flatnonzero(np.abs(found) == LARGEST_SYMBOL)
     more = None if values is None else np.abs(values[large]).astype(np.int64) - LARGEST_SYMBOL
     more = coder.naturals(f"{name}.more", more, np.zeros(len(large), np.uint16), count=1)
@@ -244,7 +244,7 @@ def _code_values(coder: SectionCoder, name: FieldName, values: Naturals | None, 
 
 
 def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The largest power of two that divides each row; what a row of zeros has does not matter."""
+    """Largest shift of each row, up to 7, such that 2^shift divides its bins; rows of zeros take that of ``like``."""
     together = np.bitwise_or.reduce(bins, axis=1) if bins.shape[1] else np.zeros(len(bins), np.int32)
     lowest = together & -together
     shifts = np.minimum(bit_lengths(lowest.astype(np.int64)) - 1, SHIFTS - 1)
@@ -252,7 +252,7 @@ def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def _code_numbers(coder: SectionCoder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
-    """Numbers ``[n]`` of any size."""
+    """Codes numbers ``[n]`` of any size."""
     count = _bounded(
         coder.number(f"{name}.count", None if bins is None else len(bins)), MOST_WEIGHTS, f"numbers of {name}"
     )
@@ -275,5 +275,5 @@ def _bounded(number: int, most: int, what: str) -> int:
 
 def _checked(bins: Naturals) -> Bins:
     if bins.size and not -LARGEST <= int(bins.min()) <= int(bins.max()) <= LARGEST:
-        raise StreamError(f"{_WHERE} has a bin beyond 22 bits, which no value stands for; it is damaged.")
+        raise StreamError(f"{_WHERE} has a bin beyond 22 bits, the largest allowed; it is damaged.")
     return bins.astype(np.int32)

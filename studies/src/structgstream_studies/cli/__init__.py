@@ -3,5 +3,5 @@
 
 COMMANDS = {
     "ablate": "run the paper's ablations on a capture, ours beside the paper's figures",
-    "compare": "run several methods on a capture and score their files alike",
+    "compare": "run several methods on a capture and score their files",
 }

@@ -18,12 +18,12 @@ TableName = Literal["structured", "free", "patching", "distance", "readings", "e
 
 @dataclass(frozen=True)
 class Ablate(ExperimentOptions):
-    """Runs the paper's ablations on a capture, and prints ours beside the paper's figures; or what each part of the
-    compact stream is worth (effects), and its quality against its bytes (rates).
+    """Runs the paper's ablations on a capture, and prints our results beside the paper's figures; or the effect of each
+    part of the compact stream (effects), and its rate-distortion curve (rates).
 
-    Variants of one seed begin with the same frame 0. FOLDER gets TABLE.md, TABLE-curves.png and TABLE-detail.png for
-    each table (and rates.png), results/ with everything that was measured as JSON, and streams/. Ctrl-C, or a crash,
-    loses no frame: the same command goes on.
+    Variants of one seed share frame 0. FOLDER gets TABLE.md, TABLE-curves.png and TABLE-detail.png for each table (and
+    rates.png), results/ with all results as JSON, and streams/. After Ctrl-C or a crash the same command continues
+    without losing a frame.
 
     Example: structgstream ablate basketball --table free -o ablations --frames 20
 
@@ -40,11 +40,11 @@ class Ablate(ExperimentOptions):
         "patching",
         "distance",
     )
-    """structured (what is trained online), free (generation and pruning), patching (inherited or independent),
-    distance (the regularisation of frame 0); readings (what the paper leaves open); effects (of the switches of the
-    compact stream); rates (the compact stream at five qualities). Default: the first four."""
+    """structured (fields trained online), free (generation and pruning), patching (inherited or independent),
+    distance (the regularisation of frame 0); readings (points that the paper leaves open); effects (of the switches of
+    the compact stream); rates (the compact stream at five qualities). Default: the first four."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """The full method, of which the variants are edits. Default: rig, and compact for effects and rates."""
+    """The full method that the variants edit. Default: rig, and compact for effects and rates."""
 
 
 def main(arguments: list[str]) -> None:

@@ -14,10 +14,10 @@ from structgstream_studies.cli.experiment import ExperimentOptions, capture_part
 
 @dataclass(frozen=True)
 class Compare(ExperimentOptions):
-    """Runs several methods on one capture and scores the files that they write, by the same evaluator.
+    """Runs several methods on one capture and scores their files with the same evaluator.
 
-    FOLDER gets methods.md, methods.png (quality against bytes and seconds) and methods-detail.png, results/ with
-    everything that was measured as JSON, and streams/. The same command goes on after an interruption.
+    FOLDER gets methods.md, methods.png (quality against bytes and seconds) and methods-detail.png, results/ with all
+    results as JSON, and streams/. After an interruption the same command continues.
 
     Example: structgstream compare basketball -o methods --frames 20 --methods rig held 3dgstream
     """
@@ -31,10 +31,10 @@ class Compare(ExperimentOptions):
         "scaffold-gs",
         "3dgs",
     )
-    """Presets of ours (rig, motion, fast, ...), held (frame 0 for ever), 3dgstream (cache of transformations for each
-    frame and additions), and scaffold-gs and 3dgs (every frame from scratch)."""
+    """Presets of ours (rig, motion, fast, ...), held (frame 0 repeated), 3dgstream (a transformation cache per frame
+    and added Gaussians), and scaffold-gs and 3dgs (every frame from scratch)."""
     scratch_every: int = 5
-    """Methods that fit every frame from scratch do so for every so many-th frame, which takes hours enough."""
+    """Step between the frames of methods that fit every frame from scratch, which takes hours."""
 
 
 def main(arguments: list[str]) -> None:

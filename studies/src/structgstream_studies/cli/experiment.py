@@ -30,26 +30,26 @@ class ExperimentOptions:
     """Options of every experiment."""
 
     output: Annotated[Path, tyro.conf.arg(metavar="FOLDER", aliases=["-o"])]
-    """Where streams, results, tables and pictures go. What is done there is not done again."""
+    """Folder of streams, results, tables and pictures. Finished runs in it are not repeated."""
     seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N ...]", help_behavior_hint="")] = (0, 1, 2)
-    """Seeds of frame 0 and of all that follows; every result is given with its spread over them."""
+    """Random seeds; every result is given with its spread over them."""
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """How many runs at a time, each on its share of the cores. Default: one for each core, or one for each GPU."""
+    """Number of parallel runs, each on its share of the cores. Default: one per core, or one per GPU."""
     device: Device = "auto"
     """What computes."""
     scored: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
         None
     )
-    """Held-out cameras that count, so that choices are made by some and reported by others. Default: all of them."""
+    """Held-out cameras to score, so that choices and reports can use different ones. Default: all held-out ones."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
 
 
 def capture_part(scene: Folder, asked: ExperimentOptions) -> tuple["CapturePart", int]:
-    """The part of the capture that the options name, and its number of frames.
+    """The part of the capture that the options select, and its number of frames.
 
     Raises:
-        CaptureError: it is not there.
-        UsageError: it holds out no camera, so that nothing could be scored.
+        CaptureError: it does not exist.
+        UsageError: it has no held-out camera to score.
     """
     from structgstream_studies.experiments.captures import CapturePart
 
@@ -72,7 +72,7 @@ def capture_part(scene: Folder, asked: ExperimentOptions) -> tuple["CapturePart"
 
 
 def run_sweep(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
-    """Does what is not done, and says what fails and how to go on.
+    """Runs the unfinished tasks, and reports failures and how to continue.
 
     Raises:
         ExperimentError: tasks failed; the others are done.
@@ -100,7 +100,7 @@ def run_sweep(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
 
 
 class Display:
-    """Running steps on a terminal; a line for each that begins or ends elsewhere."""
+    """Shows running steps on a terminal, or else a line when each starts or ends."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -117,7 +117,7 @@ class Display:
             self._live.stop()
 
     def show(self, progress: "Progress") -> None:
-        """Shows how far everything is."""
+        """Shows the progress."""
         counts = f"{progress.finished} of {progress.total} steps done"
         failed = f", failed: {', '.join(progress.failed)}" if progress.failed else ""
         if self._console.is_terminal:

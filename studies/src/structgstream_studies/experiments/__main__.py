@@ -9,7 +9,7 @@ from structgstream_studies.experiments.documents import refresh
 
 
 def main(arguments: list[str]) -> int:
-    """Says which documents changed."""
+    """Renews the tables and prints which documents changed."""
     if len(arguments) < 2:
         print(__doc__, file=sys.stderr)
         return 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two rate-distortion curves in one number: how many bytes less for the same quality, or how many dB more for the same.
+"""Bjontegaard differences of two rate-distortion curves: bytes at equal quality, or quality at equal rate.
 
 After Bjontegaard (VCEG-M33, 2001), with a curve that is a monotone piecewise cubic over the logarithm of the rate
 (Fritsch and Carlson 1980; one polynomial through all points swings between them), integrated in closed form.
@@ -44,7 +44,7 @@ def bd_psnr(ours: Points, theirs: Points) -> float:
 
 
 def rate_at(points: Points, quality: float) -> float | None:
-    """What ``quality`` (dB) costs on a curve; None outside of it.
+    """The rate of a curve at ``quality`` (dB); None outside of it.
 
     Raises:
         ConfigError: as :func:`bd_rate`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pictures an experiment works on, and a fingerprint that says whether two experiments saw the same ones."""
+"""The pictures of an experiment, and a fingerprint by which two experiments' pictures are compared."""
 
 import hashlib
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ class CapturePart:
         scale: size of the pictures relative to the stored ones.
         start: first frame.
         frames: number of frames; None for all.
-        near: nothing nearer is drawn, in the capture's units; None for the capture's own.
-        every: only every so many-th of these frames, for methods that fit each frame alone.
-        scored: the held-out cameras that count; None for all of them. Choices are made by some, reports by others.
+        near: distance of the near plane, in the capture's units; None for the capture's own.
+        every: step between frames, for methods that fit each frame alone.
+        scored: the held-out cameras to score; None for all. Choices and reports use different ones.
     """
 
     folder: Path
@@ -55,7 +55,7 @@ class CapturePart:
 
 
 def capture_facts(part: CapturePart, source: "FrameSource") -> dict[str, Any]:
-    """What a result says of its capture, as plain values; equal facts mean the same pictures and cameras."""
+    """Facts of a capture for results, as plain values; equal facts mean the same pictures and cameras."""
     sizes = sorted({(source.rig[name].width, source.rig[name].height) for name in source.rig})
     return {
         "name": source.name,

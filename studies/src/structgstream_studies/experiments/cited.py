@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures that the paper prints of itself and of other methods: cited, letter by letter, and never measured here.
+"""Figures that the paper prints for itself and other methods: cited unchanged, not measured here.
 
-They are of captures, cameras, machines and programs that this project does not have, so they stand in tables of their
-own. The paper does not say which of them it measured itself, but of 3DGStream's pictures a second.
+They were obtained with captures, cameras, machines and programs that this project does not have, so they are in
+separate tables. The paper states only for 3DGStream's frame rate that it was measured again by its authors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +19,13 @@ class CitedRow:
     """One method as the paper prints it; means over the frames of all scenes.
 
     Args:
-        kind: fitted anew for every frame, offline on the whole sequence, or online.
+        kind: every frame from scratch, offline on the whole sequence, or online.
         method: its name there.
         psnr: dB.
-        megabytes: a frame, without the initial model where the paper tells both.
-        with_initial: a frame, "considering the initial model": the paper's star.
-        minutes: of training, a frame.
-        fps: pictures a second.
+        megabytes: per frame, without the initial model if the paper has both.
+        with_initial: per frame, "considering the initial model": the paper's star.
+        minutes: training time per frame.
+        fps: rendered pictures per second.
     """
 
     kind: str
@@ -124,6 +124,6 @@ def cited_sheet(name: str) -> Sheet:
 
 
 def cited_words(name: str) -> str:
-    """What stands above the table: whose figures these are, and of what."""
+    """The text above the table: source and data set of the figures."""
     table = CITED[name]
     return " ".join([f"**Cited from the paper, not measured here:** {table.data}.", *table.remarks]) + "\n"

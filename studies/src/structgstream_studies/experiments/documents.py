@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of documents, made from results: what stands between two markers is replaced, the rest stays.
+"""Generates the tables of documents from results: text between two markers is replaced.
 
 A marker is a comment of Markdown on a line of its own::
 
@@ -10,7 +10,7 @@ A marker is a comment of Markdown on a line of its own::
 with ``ablation TABLE STUDY``, ``methods STUDY``, ``folds STUDY OTHER``, ``cited DATA``, ``readings STUDY``, ``effects
 STUDY``, ``rates STUDY``, ``bd-rate STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE STUDY``, ``plot
 STUDY`` and ``rate-plot STUDY`` for pictures, which go to ``images/`` beside the document. A study is a folder of
-results of one capture and one full method, named after the capture or after what is asked of it.
+results of one capture and one full method, named after the capture or the study.
 """
 
 import re
@@ -40,7 +40,7 @@ def refresh(documents: Sequence[Path], results: Path) -> list[Path]:
     """Renews the tables of ``documents`` from the results below a folder; returns the documents that changed.
 
     Raises:
-        ConfigError: a marker asks for something that is not known.
+        ConfigError: a marker is unknown.
         StorageError: a result cannot be read.
     """
     found = read_studies(results)
@@ -83,7 +83,7 @@ def refresh_text(text: str, studies: Studies) -> str:
     """``text`` with every marked part made from the results of ``studies``.
 
     Raises:
-        ConfigError: a marker asks for something that is not known, or has no end.
+        ConfigError: a marker is unknown, or has no end.
     """
 
     def renewed(match: re.Match[str]) -> str:
@@ -138,7 +138,7 @@ def _effects(words: Sequence[str], studies: Studies) -> str:
 
 
 def _rates(words: Sequence[str], studies: Studies) -> str:
-    """The points, and where there is something to compare them with, that too."""
+    """The points of the curve, and their comparison with other methods if there are results."""
     mine = studies.get(words[0], ())
     versus, remarks = versus_sheet(mine)
     return markdown(rates_sheet(mine)) + (f"\n{markdown(versus)}{bullet_list(remarks)}" if versus.rows else "")
@@ -163,7 +163,7 @@ def _readings(words: Sequence[str], studies: Studies) -> str:
 
 
 def _made_by(words: Sequence[str], studies: Studies) -> str:
-    """Commits, machines and pictures behind the numbers, in a sentence each."""
+    """Commits, machines and pictures of the results, in a sentence each."""
     mine = studies.get(words[0], ())
     if not mine:
         return "No result yet.\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each part of the compact stream is worth: the whole, and the whole with one switch thrown at a time."""
+"""The effect of each part of the compact stream: the whole preset, and variants with one switch changed."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -19,14 +19,14 @@ EFFECTS_TABLE = "effects"
 WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
 BETTER_FIRST = "paper-better-first"
-"""Key of paper mode on the frame 0 that the compact stream begins with."""
+"""Key of paper mode with the compact stream's frame 0."""
 DISTURBANCE_FIELDS = ("initial.disturbance.dropped_share", "initial.disturbance.noise_scales")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
-"""What is tried where the whole has it not."""
+"""Values of switches that are off in the whole preset."""
 PAPER_ITERATIONS = 100
 REFRESH_FRAMES = 5
-"""MLPs can change only in frames in which everything may move; this often, where one is trained."""
+"""Interval of frames in which everything is trained, for the variant that trains an MLP."""
 
 _COLUMNS = (
     ("psnr_changed", "psnr_changed"),
@@ -47,7 +47,7 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
 
     Args:
         full: the compact stream with everything.
-        paper: what it is measured against, with its key :data:`~structgstream_studies.experiments.variants.FULL`.
+        paper: paper mode, with the key :data:`~structgstream_studies.experiments.variants.FULL`.
 
     Raises:
         ConfigError: ``full`` is no compact stream.
@@ -75,18 +75,25 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     rows.append(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
     undisturbed = replace(full.initial.disturbance, dropped_share=0.0, noise_scales=0.0)
     calm = replace(full.initial, disturbance=undisturbed)
-    row(f"{WHOLE}-without-disturbance", "frame 0 not disturbed", replace(full, initial=calm), *DISTURBANCE_FIELDS)
+    row(
+        f"{WHOLE}-without-disturbance",
+        "frame 0 w/o dropout and perturbation",
+        replace(full, initial=calm),
+        *DISTURBANCE_FIELDS,
+    )
     lively = replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False)
-    title = f"{PAPER_OFFSETS} Gaussians an anchor, of which half begin undrawn"
+    title = f"{PAPER_OFFSETS} Gaussians an anchor, of which about half are never drawn"
     row(f"{WHOLE}-offsets", title, replace(full, initial=lively), *OFFSET_FIELDS)
     gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
     share = 0.0 if motion.least_views_share else VIEWS_SHARE
     title = (
-        f"what moves changes in {share:.0%} of the views that show it" if share else "what moves changes in two views"
+        f"movers cover changed pixels in {share:.0%} of their views"
+        if share
+        else "movers cover changed pixels in two views"
     )
     gated("views-share", title, replace(motion, least_views_share=share), "least_views_share")
     eased = EASED if motion.moved_ease == 1.0 else 1.0
-    title = "the gate remembers what moved" if eased != 1.0 else "the gate remembers nothing"
+    title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
     gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
     priced("without-rate", "w/o rate penalty", replace(rounding, rate_weight=0.0), "rate_weight")
     dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
@@ -94,10 +101,10 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     online(f"rank-{rank}", f"appearance in {rank} directions", replace(whole, appearance_rank=rank), "appearance_rank")
     dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
     prior = 0.0 if whole.motion_prior else 1.0
-    title = "motion prior: the last step again" if prior else "w/o motion prior"
+    title = "with motion prior" if prior else "w/o motion prior"
     online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
     gain = 0.0 if whole.least_gain else LEAST_GAIN
-    title = "a frame ends when it has settled" if gain else "all iterations in every frame"
+    title = "early stopping of frames" if gain else "all iterations in every frame"
     online("settling", title, replace(whole, least_gain=gain), "least_gain")
     paced = replace(whole, iterations=PAPER_ITERATIONS, patching=replace(patching, iteration=PAPER_ITERATIONS // 2))
     online("more-iterations", f"{PAPER_ITERATIONS} iterations in a frame", paced, "iterations", "patching.iteration")
@@ -105,16 +112,16 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     online("without-start", "w/o motion start", replace(whole, start=replace(start, enabled=False)), "start.enabled")
     online("one-round", "motion start in one round", replace(whole, start=replace(start, rounds=1)), "start.rounds")
     alike = replace(start, lift=replace(start.lift, color_bandwidth=0.0))
-    online("colors-alike", "neighbours of any colour", replace(whole, start=alike), "start.lift.color_bandwidth")
-    gated(
-        "without-residuals", "the gate sees no residuals", replace(motion, residual_threshold=0.0), "residual_threshold"
+    online(
+        "colors-alike", "displacements w/o weights by colour", replace(whole, start=alike), "start.lift.color_bandwidth"
     )
+    gated("without-residuals", "gate w/o residuals", replace(motion, residual_threshold=0.0), "residual_threshold")
     spawn = "gradient" if patching.spawn == "off" else "off"
     title = "births by gradients too" if spawn == "gradient" else "w/o births by gradients"
     online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
     spawnless = replace(whole, births=replace(births, enabled=False), patching=replace(patching, spawn="off"))
     online("without-free", "w/o free 3DGs", spawnless, "births.enabled", "patching.spawn")
-    priced("free-unpriced", "bits of free 3DGs cost nothing", replace(rounding, free_priced=False), "free_priced")
+    priced("free-unpriced", "free 3DGs not priced", replace(rounding, free_priced=False), "free_priced")
     gated("unseen-kept", "unseen free 3DGs are kept", replace(motion, unseen_pixels=0.0), "unseen_pixels")
     refreshed = replace(
         whole,
@@ -127,10 +134,10 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
 
 
 def require_compact(config: StreamConfig) -> None:
-    """Refuses a configuration whose streams are not compact.
+    """Check that a configuration's codec is ``compact``.
 
     Raises:
-        ConfigError: it says so.
+        ConfigError: it is not.
     """
     if config.codec != "compact":
         raise ConfigError(

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same comparison with other cameras held out, so that no choice of cameras decides.
+"""Cross-validation of a comparison with other held-out cameras.
 
 Note [Second fold]
 ~~~~~~~~~~~~~~~~~~
-Which cameras are held out the second time is a matter of where they stand and of nothing else: of the cameras that no
-other fold scores and no choice was made by, those from which no camera of the rig is far (:func:`even_cameras`). No
-picture and no result is looked at.
+The held-out cameras of the second fold are chosen by their positions only, without pictures or results: among the
+cameras that no other fold scores and that were not used for choices, the most evenly spread ones
+(:func:`even_cameras`).
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -35,12 +35,12 @@ class PeerRun:
 
     @property
     def name(self) -> str:
-        """What it is called in logs and files."""
+        """Its name in logs and files."""
         return f"{self.key}.seed{self.seed}"
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Nothing comes before it."""
+        """It depends on no other task."""
         return ()
 
     @property
@@ -54,7 +54,7 @@ class PeerRun:
         return self.folder / "results" / f"{self.name}.json"
 
     def done(self) -> bool:
-        """Whether there is a result for this very question."""
+        """Whether there is a result with the same identity."""
         return is_result_of(self.result, self._identity(), self.capture, frames=self.frames)
 
     def _identity(self) -> dict[str, Any]:
@@ -69,7 +69,7 @@ class PeerRun:
         return open_peer(self.stream)
 
     def run(self, backend: "Backend") -> None:
-        """Reconstructs what is missing of the file, then scores it."""
+        """Reconstructs the missing frames of the file, then scores it."""
         self._reconstruct(backend)
         write_result(
             self.result,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality against bytes: the compact stream at several qualities as a curve, and what lies beside it.
+"""Rate-distortion: the compact stream at several qualities as a curve, compared with other methods.
 
-Rates are bytes of packets after the first, framing and key packets included, as everywhere in these tables. A curve is
-compared over the seeds that all its points have, and a method over those of them that it has too, since seeds differ
-more than methods (``summary.py``, Note [Paired differences]).
+Rates are bytes of packets after the first, including framing and key packets. Curves are compared over the seeds that
+all their points have, and with a method over those of them that it has too, because seeds differ more than methods
+(``summary.py``, Note [Paired differences]).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,16 +21,16 @@ from structgstream_studies.experiments.variants import FULL, Variant
 RATES_TABLE = "rates"
 QUALITIES = (-2, -1, 0, 1, 2)
 OTHERS: Mapping[str, str] = {FULL: "paper mode", "3dgstream": "3DGStream's method"}
-"""Methods of one point that the curve is compared with, where a study has them."""
+"""Methods with a single point that the curve is compared with, if a study has them."""
 JUDGED: Mapping[str, str] = {"psnr": "PSNR", "psnr_changed": "PSNR of changed pixels"}
-"""Scores that rates are compared by."""
+"""Scores for which rates are compared."""
 
 Point = tuple[float, float]
 """Kilobytes a frame, and decibels."""
 
 
 def qualities(full: StreamConfig) -> dict[str, Variant]:
-    """The points of the curve by key, from the coarsest on; that of ``full`` itself has the key of its other tables.
+    """The points of the curve by key, coarsest first; the point of ``full`` has the key that it has in other tables.
 
     Raises:
         ConfigError: ``full`` is no compact stream.
@@ -61,7 +61,7 @@ def curve_titles() -> dict[str, str]:
 
 
 def rates_sheet(results: Iterable[Result]) -> Sheet:
-    """A row for each point of the curve, with dashes where there is no result, and for each method beside it."""
+    """A row for each point of the curve, with dashes for missing results, and for each other method."""
     shown = [result for result in results if result.key in curve_titles()]
     found = summaries(shown)
     fps = next((float(result.identity["capture"]["fps"]) for result in shown), 0.0)
@@ -109,7 +109,7 @@ def versus_sheet(results: Iterable[Result]) -> tuple[Sheet, list[str]]:
 
 
 def _versus(found: Mapping[str, Summary], key: str, score: str) -> tuple[list[str], list[str]]:
-    """Cells of a method, none where nothing was measured, and why some are dashes."""
+    """Cells of a method, none without a result, and the reasons of dashes."""
     seeds = common_seeds(found) & (found[key].results.keys() if key in found else set())
     its = _point(found[key], score, seeds) if seeds else None
     if its is None:
@@ -158,7 +158,7 @@ def common_seeds(found: Mapping[str, Summary]) -> set[int]:
 
 
 def curve_of(found: Mapping[str, Summary], score: str, seeds: set[int]) -> tuple[list[Point], list[str]]:
-    """The curve, its rate and quality rising, and a sentence for each point that another one betters in both."""
+    """The curve by increasing rate and quality, and a sentence for each dominated point."""
     points: list[tuple[Point, str]] = []
     for quality in QUALITIES:
         key = quality_key(quality)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rate and distortion as a picture."""
+"""Plots of rate-distortion curves."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path

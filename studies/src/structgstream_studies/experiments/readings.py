@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper leaves open, each reading as a value that can be run and scored.
+"""Alternative readings of what the paper leaves open, as values that can be run and scored.
 
-Readings are chosen by a camera that is held out for this purpose and for nothing else, so that no reported number was
-chosen for.
+Readings are chosen by a camera that is held out for this purpose only, so that reported results are not biased by the
+choice.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -21,10 +21,10 @@ BASE = "reading-default"
 
 @dataclass(frozen=True)
 class Reading:
-    """One answer to one of the paper's open questions.
+    """One reading of a point that the paper leaves open.
 
     Args:
-        question: what the paper leaves open.
+        question: the open point.
         answer: this reading.
         edit: from the default configuration to this one.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One experiment's outcome as a JSON file that says everything a figure in a document must carry.
+"""The result of an experiment as a JSON file, with everything that documents need.
 
-``identity`` (method, configuration, seed, capture with its fingerprint) decides whether a result is still the answer
-to a question; the commit and the machine are noted beside it, and numbers are what ``evaluate`` read from the file.
+``identity`` (method, configuration, seed, capture with its fingerprint) decides whether a result can be reused; the
+commit and the machine are stored beside it, and scores are those of ``evaluate``.
 """
 
 import json
@@ -21,10 +21,10 @@ FRAME_KEYS_OF_LOG = ("total_seconds", "cpu_seconds", "train_psnr", "spawned", "p
 
 @dataclass(frozen=True)
 class Result:
-    """What an experiment gave.
+    """The result of an experiment.
 
     Args:
-        identity: what was asked (see the module).
+        identity: of the experiment (see the module).
         mean: the mean of each score over frames and held-out cameras.
         cameras: camera name to its means.
         stream: facts of the file.
@@ -48,7 +48,7 @@ class Result:
 
     @property
     def seed(self) -> int:
-        """Seed of frame 0 and of everything random after it."""
+        """The random seed."""
         return self.identity["seed"]
 
     @property
@@ -58,7 +58,7 @@ class Result:
 
 
 def result_of(report: "Report", *, identity: Mapping[str, Any], trained_by: Mapping[str, Any]) -> Result:
-    """The result of an evaluation; what the report says camera by camera and stage by stage is averaged or left out."""
+    """The result of an evaluation; details by camera and stage are averaged or left out."""
     from structgstream.evaluation.report import as_json
 
     content = as_json(report)
@@ -82,7 +82,7 @@ def result_of(report: "Report", *, identity: Mapping[str, Any], trained_by: Mapp
 
 
 def _online_means(frames: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Means over the frames after the first, which cost something else."""
+    """Means over the frames after frame 0."""
     online = [frame for frame in frames if frame["index"] > 0]
 
     def mean(values: list[float | None]) -> float | None:
@@ -103,7 +103,7 @@ def _free_bytes(fields: Mapping[str, int]) -> int:
 
 
 def write_result(path: Path, result: Result) -> None:
-    """Writes a result so that it is there whole or not at all.
+    """Writes a result atomically.
 
     Raises:
         StorageError: the file cannot be written.
@@ -118,7 +118,7 @@ def write_result(path: Path, result: Result) -> None:
 
 
 def round_floats(value: Any) -> Any:
-    """Floats to six significant digits: what was measured has fewer, and files stay small."""
+    """Floats rounded to six significant digits, more than measurements have, to keep files small."""
     if isinstance(value, float):
         return float(f"{value:.6g}")
     if isinstance(value, Mapping):

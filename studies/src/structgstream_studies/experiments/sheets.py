@@ -11,13 +11,13 @@ from structgstream_studies.experiments.variants import FULL, AblationTable
 
 @dataclass(frozen=True)
 class Score:
-    """How a score is written.
+    """Format of a score.
 
     Args:
         title: head of its column, with its unit.
-        digits: behind the point.
-        factor: what it is multiplied by for the unit.
-        better: 1 when more is better, -1 when less is, 0 when it is a cost that no claim is about.
+        digits: number of decimals.
+        factor: conversion to the unit.
+        better: 1 if more is better, -1 if less is, 0 if neither is claimed.
     """
 
     title: str
@@ -53,7 +53,7 @@ SCORES: Mapping[str, Score] = {
     "decode_and_render_fps": Score("pictures a second", 1),
 }
 TEMPORAL = frozenset({"drift_db_per_frame", "e_warp", "t_lpips", "temporal_flip", "flicker"})
-"""Scores of one frame after another; of every tenth frame they would be of something else."""
+"""Scores of consecutive frames; invalid if only every tenth frame is evaluated."""
 PAPER_SCORES: Mapping[str, str] = {"online_free_bytes": "free_bytes"}
 """Where the paper's figure has another key than ours."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two questions that experiments answer: what each part of the method is worth, and how it stands beside others."""
+"""The two kinds of studies: ablations of the method, and comparisons with other methods."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -60,11 +60,11 @@ def ablation_runs(
 
     Args:
         tables: keys of ``variants.TABLES``, ``readings``, and of :data:`COMPACT_TABLES`.
-        full: what the variants are edits of.
-        capture: which pictures.
+        full: the configuration that the variants edit.
+        capture: the pictures.
         frames: number of frames of ``capture``.
-        seeds: of frame 0.
-        folder: where everything goes.
+        seeds: random seeds.
+        folder: the output folder.
         paper: paper mode, a row of the table of effects.
 
     Raises:

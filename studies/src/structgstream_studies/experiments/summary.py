@@ -3,8 +3,8 @@
 
 Note [Paired differences]
 ~~~~~~~~~~~~~~~~~~~~~~~~~
-What frame 0 becomes differs more from seed to seed than variants differ from each other, but variants of one seed begin
-with the same frame 0. So a variant is compared with the full method seed by seed, and the differences are averaged.
+Frame 0 varies more between seeds than variants differ, but variants of one seed share frame 0. So a variant is compared
+with the full method seed by seed, and the differences are averaged.
 """
 
 import math
@@ -15,7 +15,7 @@ from typing import Any
 from structgstream_studies.experiments.results import Result
 
 STANDARD_ERRORS = 2.0
-"""A difference is told when it has the same sign in all seeds and is this many standard errors from nothing."""
+"""A difference is established if it has the same sign in all seeds and is this many standard errors from zero."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Summary:
         return spread_of(found)
 
     def agrees_in_sign(self, other: "Summary", name: str) -> bool:
-        """Whether the differences to ``other`` have one sign in all seeds that both have, of which there are three."""
+        """Whether the differences to ``other`` have the same sign in all common seeds, of which three are needed."""
         signs = set()
         seeds = self.results.keys() & other.results.keys()
         for seed in seeds:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many tasks on the cores or GPUs that are there; what is done is skipped, so a sweep goes on after an interruption."""
+"""Runs many tasks on the available cores or GPUs; finished tasks are skipped, so a sweep can be resumed."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -67,13 +67,13 @@ def sweep(
     """Does every task that is not done, each in its own process, as soon as those that it needs are done.
 
     Args:
-        tasks: with distinct names; what one needs comes before it.
+        tasks: with distinct names, in an order in which each follows the tasks that it needs.
         seats: one task at a time runs on each.
         logs: folder for what the tasks print, ``NAME.txt`` each.
         listener: called twice a second.
 
     Raises:
-        KeyboardInterrupt: after the running tasks have ended; what they stored stays and is gone on from.
+        KeyboardInterrupt: after the running tasks have ended; their stored frames are kept for resuming.
     """
     skipped = {task.name for task in tasks if task.done()}
     waiting = {task.name: task for task in tasks if task.name not in skipped}

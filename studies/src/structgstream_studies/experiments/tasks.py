@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of an experiment as values that a process of its own can do, and do again without doing it twice."""
+"""The steps of an experiment as values that another process can run and resume."""
 
 import hashlib
 import json
@@ -35,7 +35,7 @@ class FirstFrameRun:
 
     @property
     def name(self) -> str:
-        """What it is called in logs; the same for tasks that give the same frame 0."""
+        """Its name in logs, equal for tasks with the same frame 0."""
         decides = {key: value for key, value in to_json(self._alone).items() if key != "online"}
         text = json.dumps(
             [decides, {**vars(self.capture), "folder": str(self.capture.folder), "frames": None, "scored": None}]
@@ -49,7 +49,7 @@ class FirstFrameRun:
 
     @property
     def frames(self) -> int:
-        """How many frames it fits."""
+        """Number of frames that it fits."""
         return 1
 
     @property
@@ -59,13 +59,13 @@ class FirstFrameRun:
 
     @property
     def _alone(self) -> StreamConfig:
-        """What decides it, and how it is kept: as it was fitted, since streams round it in ways of their own."""
+        """The configuration that determines it, stored unquantized, because streams quantize it differently."""
         # What is behind the scene is found when a stream begins.
         plain = replace(self.config, online=OnlineConfig(), codec="raw", rate=RateConfig())
         return replace(plain, environment=EnvironmentConfig())
 
     def done(self) -> bool:
-        """Whether the frame is there; a stream that was interrupted has none."""
+        """Whether the frame is stored; an interrupted stream has none."""
         from structgstream.codec.reader import open_stream
         from structgstream.errors import StreamError
 
@@ -94,7 +94,7 @@ class FirstFrameRun:
         )
 
     def log(self) -> dict[str, Any]:
-        """What the trainer noted about it."""
+        """The frame's entry in the log."""
         from structgstream.evaluation.run_log import read_log
 
         return read_log(self.stream)[0]
@@ -112,12 +112,12 @@ class VariantRun:
 
     @property
     def name(self) -> str:
-        """What it is called in logs and files."""
+        """Its name in logs and files."""
         return f"{self.key}.seed{self.config.seed}"
 
     @property
     def seed(self) -> int:
-        """Of frame 0 and everything random after it."""
+        """The random seed."""
         return self.config.seed
 
     @property
@@ -127,7 +127,7 @@ class VariantRun:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the tasks that come before it: frame 0, unless the stream has it already."""
+        """Names of the tasks that it needs: frame 0, unless the stream has it already."""
         return () if self._has_started() else (self.first.name,)
 
     @property
@@ -141,7 +141,7 @@ class VariantRun:
         return self.folder / "results" / f"{self.name}.json"
 
     def done(self) -> bool:
-        """Whether there is a result for this very question."""
+        """Whether there is a result with the same identity."""
         return is_result_of(self.result, self._identity(), self.capture, frames=self.frames)
 
     def _has_started(self) -> bool:
@@ -153,7 +153,7 @@ class VariantRun:
         return {"key": self.key, "method": "struct-gstream", "seed": self.config.seed, "config": to_json(self.config)}
 
     def run(self, backend: "Backend") -> None:
-        """Reconstructs what is missing of the stream, then scores the file."""
+        """Reconstructs the missing frames of the stream, then scores the file."""
         _reconstruct(self.capture, self.config, self.stream, backend, first=self.first)
         write_result(
             self.result,
@@ -207,7 +207,7 @@ def _reconstruct(
     machine = environment() | {"backend": backend.name}
 
     def remarks(report: "FrameReport") -> Mapping[str, Any]:
-        # What frame 0 cost is what it cost when it was fitted, also where it is shared.
+        # A shared frame 0 keeps the seconds and memory of its own fit.
         shared = first.log() if first is not None and report.index == 0 else {}
         return {**shared, "trained_by": machine} if report.index == 0 else {}
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's ablations as values: each variant is an edit of the full configuration, and says which fields it edits.
+"""The paper's ablations as values: each variant is an edit of the full configuration, with the names of its fields.
 
-The figures beside them are those that the paper prints (tables "Ablation study of structured 3DGs", "... of free 3DG
-generation and pruning", "... of the Global Patching Strategy"). It measured them on scenes of another capture, so what
-can be compared is the order of the variants, not the values.
+The paper's figures (tables "Ablation study of structured 3DGs", "... of free 3DG generation and pruning", "... of the
+Global Patching Strategy") were measured on scenes of another capture, so only the order of the variants can be
+compared, not the values.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ class Variant:
         key: its name in commands, files and results.
         title: its name in tables.
         config: the whole configuration.
-        changes: the paths of the fields in which it differs from the full one; those and no others (tested).
+        changes: the paths of exactly the fields in which it differs from the full one (tested).
     """
 
     key: str
@@ -40,7 +40,7 @@ class AblationTable:
 
     Args:
         key: its name in commands.
-        title: what it asks.
+        title: its subject.
         scene: the scene on which the paper measured it.
         rows: variants in the paper's order, each with the paper's figures by score (empty where it prints none).
         claim: what the paper concludes from it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One task in a process of its own, so that a crash takes nothing else along."""
+"""Runs one task in a separate process, to isolate crashes."""
 
 import os
 import sys
@@ -20,25 +20,25 @@ class Task(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the tasks that must be done before."""
+        """Names of the tasks that it needs."""
         ...
 
     @property
     def frames(self) -> int:
-        """How many frames it fits, for the progress display."""
+        """Number of frames that it fits, for the progress display."""
         ...
 
     @property
     def stream(self) -> Path:
-        """Where it writes; its log tells how far it is."""
+        """The stream's path; the log beside it shows the progress."""
         ...
 
     def done(self) -> bool:
-        """Whether there is nothing left to do."""
+        """Whether the task is finished."""
         ...
 
     def run(self, backend: Backend) -> None:
-        """Do what is left."""
+        """Run the missing steps."""
         ...
 
 

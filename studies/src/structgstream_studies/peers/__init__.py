@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other methods behind the same loop and the same evaluator (docs/peers.md)."""
+"""Other methods with the same frame loop and evaluator (docs/peers.md)."""

@@ -24,23 +24,23 @@ from structgstream_studies.peers.plain import PlainGaussians, rotated
 
 @dataclass(frozen=True)
 class AdditionsConfig:
-    """3DGStream's constants; rates are fifteen times those of 3DGS."""
+    """3DGStream's constants; learning rates are fifteen times those of 3DGS."""
 
     iterations: int = 100
     gradient: float = 1.5e-4
-    """Mean norm of the view-space gradient in normalised device coordinates from which a Gaussian has a child."""
+    """Mean norm of the view-space gradient (NDC) above which a Gaussian gets a child."""
     spread: float = 2.0
-    """A child's place has this many of the parent's standard deviations as its own."""
+    """Standard deviation of a child's position, in units of the parent's scales."""
     shrink: float = 0.8
     """A child's scales are the parent's divided by this."""
     opacity: float = 0.1
     interval: int = 20
-    """Additions are pruned this often."""
+    """Iterations between prunings of the additions."""
     min_opacity: float = 0.01
     max_extent: float = 0.1
-    """Share of the extent (1.1 rig radii) above which additions are dropped."""
+    """Largest size of an addition, as a share of the extent (1.1 rig radii)."""
     means: float = 2.4e-3
-    """Rate, times the extent."""
+    """Learning rate of the means, times the extent."""
     log_scales: float = 7.5e-2
     quats: float = 1.5e-2
     logit_opacities: float = 0.75
@@ -50,7 +50,7 @@ class AdditionsConfig:
 
 @dataclass(frozen=True)
 class Additions:
-    """What the second stage gave; no PSNR when there was nothing to add."""
+    """Result of the second stage; no PSNR if nothing was added."""
 
     added: PlainGaussians
     train_psnr: float | None
@@ -72,7 +72,7 @@ def spawned_at(parents: PlainGaussians, config: AdditionsConfig, generator: torc
 
 @dataclass
 class _AdditionsHooks(Hooks[View, ViewLoss]):
-    """What the second stage does in an iteration: draw the additions among the others, and drop the useless."""
+    """Iterations of the second stage: draws the additions with the other Gaussians, and prunes transparent ones."""
 
     config: AdditionsConfig
     adam: Adam[str]
@@ -85,7 +85,7 @@ class _AdditionsHooks(Hooks[View, ViewLoss]):
 
     @property
     def added(self) -> PlainGaussians:
-        """As they are now."""
+        """The present additions."""
         return PlainGaussians(**self.adam.values)
 
     def loss(self, iteration: int, sample: View) -> ViewLoss:
@@ -127,13 +127,13 @@ def fit_additions(
     before: int,
     on_step: StepListener | None,
 ) -> Additions:
-    """Fit ``start`` among ``base``, which stays as it is.
+    """Fit ``start`` together with ``base``, which is fixed.
 
     Args:
         start: the spawned Gaussians.
-        base: all others, as the receiver has them.
+        base: all others, as decoded by the receiver.
         color: of the training cameras.
-        order: views to look at.
+        order: endless iterator over the views.
         config: constants.
         extent: 1.1 rig radii, scene units.
         views: number of training views, over the last of which the PSNR is taken.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Peers behind the loop: their frames as packets of named arrays, and a method as a pipeline."""
+"""The codec of peers, with frames as packets of named arrays, and their pipeline."""
 
 import sys
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ class PeerCoder(Generic[State]):
     """Encodes and decodes the frames of one file, in order.
 
     Args:
-        method: gives arrays for states and states for arrays.
-        device: where states are decoded to.
+        method: converts states to arrays and back.
+        device: of decoded states.
     """
 
     def __init__(self, method: PeerMethod[State, Memory], device: torch.device) -> None:
@@ -33,12 +33,12 @@ class PeerCoder(Generic[State]):
         self._state: State | None = None
 
     def encode(self, state: State, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[State]:
-        """The packet of a frame, and what the decoder makes of it."""
+        """The packet of a frame, and its reconstruction."""
         packet = parse_packet(self._arrays(state), index=index, pts_seconds=pts_seconds, kind=kind)
         return Encoded(packet, self.replay(packet))
 
     def replay(self, packet: Packet) -> State:
-        """Decode a packet, and go on after it."""
+        """Decode a packet, and continue after it."""
         previous = None if packet.kind is PacketKind.KEY else self._state
         arrays = arrays_of(packet, where=f"Frame {packet.index}")
         self._state = self._restored(arrays, previous, device=self._device)
@@ -57,7 +57,7 @@ class PeerCodec(Generic[State, Memory]):
         return self.method.name
 
     def key_interval(self, fps: float) -> int:
-        """Every frame is a key frame, or the first alone."""
+        """1 if every frame is a key frame; otherwise only the first one is."""
         return 1 if self.method.stands_alone else sys.maxsize
 
     def file(self, path: Path, *, frames: int, resume: bool) -> tuple[PeerSink, PeerReader[State] | None]:
@@ -80,7 +80,7 @@ class PeerCodec(Generic[State, Memory]):
         return reader if len(reader) else None
 
     def prepare(self, fitted: State, task: FrameTask, facts: StreamFacts) -> tuple[State, StreamHeader]:
-        """Frame 0 as it is, and the header, which carries nothing of it."""
+        """Frame 0 unchanged, and the header, which has none of its data."""
         return fitted, StreamHeader(
             rig=facts.rig,
             similarity=facts.similarity,
@@ -94,12 +94,12 @@ class PeerCodec(Generic[State, Memory]):
         )
 
     def coder(self, header: StreamHeader, device: torch.device) -> PeerCoder[State]:
-        """What encodes and decodes, on ``device``."""
+        """The coder, on ``device``."""
         return PeerCoder(self.method, device)
 
 
 def peer_pipeline(method: PeerMethod[State, Memory], *, seed: int = 0) -> Pipeline[State, Memory]:
-    """A peer with the initial points, the normalisation and the seeds that the preset ``rig`` has."""
+    """A peer with the initial points, normalisation and seeds of the preset ``rig``."""
     return Pipeline(
         method,
         PeerCodec(method),

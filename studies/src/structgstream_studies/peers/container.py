@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a peer method: this project's records (CRC, cut anywhere) with named arrays in them.
+"""The file of a peer method: this project's records (with CRC, readable when truncated) with named arrays.
 
 ::
 
@@ -112,13 +112,13 @@ class PeerReader(Generic[State]):
     Args:
         data: its bytes.
         method: gives the method that decodes, from the header.
-        name: what messages call it.
+        name: of the file, for messages.
 
     Attributes:
         header: the init record; ``codec`` is the method's name, ``config`` its configuration.
         packets: every whole frame before the first cut or damage.
-        complete: whether the run that wrote the file came to its end.
-        cut_reason: what stopped reading otherwise.
+        complete: whether the run that wrote the file finished.
+        cut_reason: why the file is not complete.
         header_bytes: length of everything before the first frame.
         total_bytes: length of the file.
         end: offset of the byte after the last whole frame.
@@ -171,7 +171,7 @@ class PeerReader(Generic[State]):
         return len(self.packets)
 
     def packet(self, index: int) -> Packet:
-        """What frame ``index`` carries.
+        """The packet of frame ``index``.
 
         Raises:
             StreamError: it was damaged after the file was opened.
@@ -191,7 +191,7 @@ class PeerReader(Generic[State]):
         return arrays_of(self.packet(index), where=f"Frame {index} of {self._name}")
 
     def group(self, index: int) -> Iterator[Packet]:
-        """The packets that frame ``index`` needs, from a key packet to its own."""
+        """The packets needed to decode frame ``index``, from the key packet to its own."""
         keys = [info.index for info in self.packets[: index + 1] if info.kind is PacketKind.KEY]
         for number in range(keys[-1], index + 1):
             yield self.packet(number)
@@ -236,9 +236,9 @@ class PeerSink:
     """A peer's file. Every frame is on the disk when :meth:`write` returns.
 
     Args:
-        path: the file; what is there is replaced, unless it is resumed.
-        frames: how many it holds in the end: only then it is marked as complete.
-        resumed: the reader of the file to go on with, after its last whole frame.
+        path: the file; an existing one is replaced, unless it is resumed.
+        frames: number of frames of the finished file, which is then marked as complete.
+        resumed: a reader of the file to continue after its last whole frame.
     """
 
     def __init__(self, path: Path | str, *, frames: int, resumed: "PeerReader[Any] | None" = None) -> None:
@@ -303,10 +303,10 @@ class PeerSink:
 
 
 def check_prefix(data: ByteSource, name: str) -> None:
-    """Refuse what is not a peer's file of this major version.
+    """Check that ``data`` is a peer's file of this major version.
 
     Raises:
-        StreamError: with what was found.
+        StreamError: it is not.
     """
     if bytes(data[: len(MAGIC)]) != MAGIC or len(data) < PREFIX.size:
         raise StreamError(f"{name} is not a file of a peer method: its first bytes are not the format's signature.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3DGS's adaptive density control: clone what is small and pulled about, split what is large, drop what is not seen."""
+"""3DGS's adaptive density control: clones small Gaussians, splits large ones, prunes transparent ones."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,24 +16,24 @@ RESET_OPACITY = 0.01
 
 @dataclass(frozen=True)
 class DensifyConfig:
-    """When and what 3DGS adds and removes."""
+    """Schedule and thresholds of 3DGS's density control."""
 
     start: int = 500
     stop: int = 3000
-    """3DGS stops after half of its 30,000 iterations; as many rounds as possible fit in before this."""
+    """Last iteration of densification (3DGS: 15,000 of 30,000)."""
     interval: int = 100
     gradient: float = 2e-4
-    """Mean norm of the view-space gradient in normalised device coordinates from which a Gaussian is densified."""
+    """Mean norm of the view-space gradient (NDC) above which a Gaussian is densified (3DGS: 2e-4)."""
     percent_dense: float = 0.01
-    """Share of the extent (1.1 rig radii) that parts the small, which are cloned, from the large, which are split."""
+    """Size, as a share of the extent (1.1 rig radii), below which a Gaussian is cloned and above which it is split."""
     min_opacity: float = 0.005
     max_extent: float = 0.1
-    """Share of the extent above which Gaussians are dropped once opacities have been reset."""
+    """Size, as a share of the extent, above which Gaussians are pruned after opacities have been reset."""
     reset_at: int | None = None
     """The one iteration after which opacities are cut to 0.01; None: never. 3DGS does it every 3,000 of 30,000; on a
     schedule of 4,000 it costs held-out quality (docs/peers.md)."""
     max_gaussians: int = 120_000
-    """Of more candidates than there is room for, those with the largest gradients are densified; not in 3DGS."""
+    """Largest number of Gaussians; candidates with the largest gradients are densified first (3DGS: no bound)."""
 
     def is_due(self, iteration: int) -> bool:
         """Whether the set changes after this iteration."""

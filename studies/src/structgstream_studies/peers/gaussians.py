@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3D Gaussian splatting (Kerbl et al. 2023): one frame from scratch, every Gaussian on its own."""
+"""3D Gaussian splatting (Kerbl et al., 2023): fits one frame from scratch."""
 
 from dataclasses import dataclass, field
 
@@ -33,7 +33,7 @@ LOSSES = LossWeights(l1=0.8, ssim=0.2)
 
 @dataclass(frozen=True)
 class GaussiansRates:
-    """Adam's rates of 3DGS, scheduled over the iterations of the fit."""
+    """Learning rates of 3DGS, scheduled over the iterations of the fit."""
 
     means: LearningRate = LearningRate(1.6e-4, 1.6e-6)
     """Times 1.1 rig radii."""
@@ -48,20 +48,20 @@ class GaussiansRates:
 
 @dataclass(frozen=True)
 class GaussiansConfig:
-    """How a frame is fitted from scratch with plain Gaussians.
+    """Configuration of a frame fitted from scratch with plain Gaussians.
 
-    3DGS runs 30,000 iterations; the schedule here has the length of this project's frame 0, and begins on small
-    pictures as that does.
+    3DGS runs 30,000 iterations; the schedule here has the length of this project's frame 0, and also starts on reduced
+    pictures.
     """
 
     iterations: int = 4000
     coarse_iterations: int = 2500
-    """The first iterations look at pictures reduced by ``coarse_scale``."""
+    """Number of first iterations on pictures reduced by ``coarse_scale``."""
     coarse_scale: float = 0.5
     sh_degree: int = 1
-    """3DGStream's frame 0 (3DGS: 3)."""
+    """Degree of the spherical harmonics, as 3DGStream's frame 0 (3DGS: 3)."""
     sh_from: int = 1000
-    """Colours do not depend on direction before (3DGS raises the degree by one every 1,000 iterations)."""
+    """Iteration from which colours depend on direction (3DGS raises the degree by one every 1,000 iterations)."""
     voxel_size: float = 0.0067
     """Initial points are thinned to one in each voxel, as in this project's frame 0; 0 takes all."""
     initial_opacity: float = 0.1
@@ -73,17 +73,16 @@ class GaussiansConfig:
 
 @dataclass(frozen=True)
 class RecordedGaussians:
-    """Gaussians, and how the training cameras record them."""
+    """Gaussians, and the training cameras' colour correction."""
 
     gaussians: PlainGaussians
     camera_color: CameraColor
 
 
 def point_colors(points: Tensor, views: list[View]) -> Tensor:
-    """The median over the views of what each shows where a point ``[P, 3]`` projects: ``[P, 3]`` in [0, 1].
+    """Median over the views of the colours at the projections of points ``[P, 3]``: ``[P, 3]`` in [0, 1].
 
-    Nothing hides a point here, so a colour may be that of what stands before it; the fit starts there, no more. A point
-    that no view shows is grey.
+    Occlusion is ignored, as colours are only an initialisation. Points outside all views are grey.
     """
     seen = points.new_full((len(views), points.shape[0], 3), float("nan"))
     for row, view in enumerate(views):
@@ -99,7 +98,7 @@ def point_colors(points: Tensor, views: list[View]) -> Tensor:
 
 
 def initial_gaussians(points: Tensor, views: list[View], config: GaussiansConfig) -> PlainGaussians:
-    """Round Gaussians at ``points`` ``[P, 3]``, as wide as the neighbours are far (3DGS).
+    """Isotropic Gaussians at ``points`` ``[P, 3]`` with the distance to neighbours as scale (3DGS).
 
     Raises:
         CaptureError: fewer than four distinct points.

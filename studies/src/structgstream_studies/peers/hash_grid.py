@@ -11,9 +11,9 @@ modulo the rows. The network has no biases.
 
 Note [Rows asked for once]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~
-The positions do not change while a frame is fitted, so that which rows they need, and with which weights, is found
-once: the lookup is a sparse matrix times the table, its gradient the transposed matrix times the gradient above. Both
-are kept as bags of rows for ``embedding_bag``, whose own gradient takes twenty times as long on a CPU.
+Positions are constant while a frame is fitted, so the rows and weights of the interpolation are computed once: the
+lookup is a sparse matrix times the table, its gradient the transposed matrix times the incoming gradient. Both are
+stored as bags of rows for ``embedding_bag``, whose own gradient takes twenty times as long on a CPU.
 """
 
 import math

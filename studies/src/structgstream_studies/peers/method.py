@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a peer is: another method's way from pictures to a frame, and from a frame to arrays and back."""
+"""The protocol of peers: fitting of frames, and conversion of frames to arrays and back."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -27,21 +27,21 @@ class PeerMethod(Method[State, Memory], Protocol[State, Memory]):
 
     @property
     def name(self) -> str:
-        """What the header's ``codec`` says."""
+        """The value of the header's ``codec``."""
         ...
 
     @property
     def stands_alone(self) -> bool:
-        """Whether every frame can be shown without those before it."""
+        """Whether every frame can be decoded without those before it."""
         ...
 
     @property
     def config(self) -> Any:
-        """Everything that decides the result, as a dataclass: the header's ``config``."""
+        """The configuration as a dataclass: the header's ``config``."""
         ...
 
     def arrays(self, state: State) -> Arrays:
-        """What a receiver who holds the frame before needs to show this one."""
+        """The arrays that a receiver with the previous frame needs for this one."""
         ...
 
     def restored(self, arrays: Mapping[str, NDArray[Any]], previous: State | None, *, device: torch.device) -> State:
@@ -54,7 +54,7 @@ class PeerMethod(Method[State, Memory], Protocol[State, Memory]):
 
 
 class PicturesOnly:
-    """What peers share: of the pictures they want no more than the training views, and of the past one frame."""
+    """Base of peers: they need only the training views, and only one previous frame."""
 
     needs_before = False
     needs_older = False
@@ -67,7 +67,7 @@ class PicturesOnly:
 
 
 class IndependentFrames(PicturesOnly, ABC, Generic[State]):
-    """A method that fits every frame as the first and remembers nothing."""
+    """A method that fits every frame from scratch."""
 
     stands_alone = True
 

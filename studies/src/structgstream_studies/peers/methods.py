@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The peers by name, and the way from a file back to the method that reads it."""
+"""The peers by name, and the method that decodes a file."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -58,7 +58,7 @@ TINY_METHODS: Mapping[str, AnyMethod] = {
         ),
     )
 }
-"""Seconds, for tests: the same code, results of no quality."""
+"""Small configurations for tests; low quality."""
 
 
 def decoder_of(header: StreamHeader) -> AnyMethod:
