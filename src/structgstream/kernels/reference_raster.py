@@ -13,6 +13,7 @@ from torch import Tensor
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
+from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.operations import Rasterize
 from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection
 
@@ -32,24 +33,6 @@ class _Projected:
     rows: Tensor  # [n] index into the input
 
 
-def _rotations(quats: Tensor) -> Tensor:
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ],
-        dim=1,
-    ).reshape(-1, 3, 3)
-
-
 def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | None) -> _Projected:
     means, quats, scales, opacities = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     viewmat, K, width, height = viewport.viewmat, viewport.K, viewport.width, viewport.height
@@ -66,7 +49,7 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
     jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z**2, zero, fy / z, -fy * clamped_y / z**2], dim=1).reshape(
         -1, 2, 3
     )
-    axes = jacobian @ viewmat[:3, :3] @ (_rotations(quats[rows]) * scales[rows][:, None])  # [n, 2, 3]
+    axes = jacobian @ viewmat[:3, :3] @ (quaternion_matrices(quats[rows]) * scales[rows][:, None])  # [n, 2, 3]
     covariances = axes @ axes.transpose(1, 2)
     xx, xy, yy = (
         covariances[:, 0, 0] + LOW_PASS_PIXELS,

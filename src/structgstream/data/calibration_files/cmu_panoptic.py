@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration_files.multical import LARGEST_BYTES
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import each_camera, first_json_with, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
 
@@ -23,10 +22,7 @@ METRES = 0.01
 
 def find(folder: Path) -> tuple[Path, ...]:
     """The first JSON file with such cameras."""
-    for file in sorted(folder.glob("*.json")):
-        if file.stat().st_size < LARGEST_BYTES and b'"distCoef"' in file.read_bytes():
-            return (file,)
-    return ()
+    return first_json_with(folder, "distCoef")
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

@@ -14,20 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import each_camera, first_json_with, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
 
 EXPECTED = "cameras with image_size, K and dist, and camera_poses with R and T, as multical writes it"
-LARGEST_BYTES = 50_000_000  # of a JSON that is looked into, to tell what it is
 
 
 def find(folder: Path) -> tuple[Path, ...]:
     """The first JSON file that has both keys."""
-    for file in sorted(folder.glob("*.json")):
-        if file.stat().st_size < LARGEST_BYTES and b'"camera_poses"' in file.read_bytes():
-            return (file,)
-    return ()
+    return first_json_with(folder, "camera_poses")
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

@@ -10,7 +10,16 @@ from structgstream.data.posed import PosedCamera
 from structgstream.errors import CalibrationError
 
 Entry = TypeVar("Entry")
+LARGEST_BYTES = 50_000_000  # of a file that is searched to recognise it
 BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError)
+
+
+def first_json_with(folder: Path, key: str) -> tuple[Path, ...]:
+    """The first JSON file of ``folder`` that contains the quoted ``key``, as a tuple of one; empty if there is none."""
+    for file in sorted(folder.glob("*.json")):
+        if file.stat().st_size < LARGEST_BYTES and f'"{key}"'.encode() in file.read_bytes():
+            return (file,)
+    return ()
 
 
 @contextmanager
