@@ -22,7 +22,7 @@ EXPECTED = "cameras with image_size, K and dist, and camera_poses with R and T, 
 
 
 def find(folder: Path) -> tuple[Path, ...]:
-    """The first JSON file that has both keys."""
+    """The first JSON file with camera poses."""
     return first_json_with(folder, "camera_poses")
 
 
