@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import hashlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -55,9 +56,10 @@ def test_the_version_rises_with_the_interface() -> None:
     """When this fails the interface has changed: raise SGS_ABI_VERSION and ABI_VERSION, and note the new hash here."""
     sources = Path(__file__).parents[2] / "csrc"
     text = b"".join((sources / name).read_bytes() for name in ("include/structgstream.h", "cpu/anchors.h"))
-    noted = {1: "644f6ba04425e5e46168a4cfe4fead227c11076fef77a14a6a0edaa0add54c17"}
+    code = re.sub(rb"\s+", b" ", re.sub(rb"//[^\n]*|/\*.*?\*/", b"", text, flags=re.DOTALL))  # Comments may change.
+    noted = {1: "1dd6e1a8252b600b2cdde884b17edae1be7a80b17e21ae8112bed0f483b39901"}
     assert f"#define SGS_ABI_VERSION {_load.ABI_VERSION}\n".encode() in text
-    assert hashlib.sha256(text).hexdigest() == noted[_load.ABI_VERSION]
+    assert hashlib.sha256(code).hexdigest() == noted[_load.ABI_VERSION]
 
 
 def test_the_instruction_set_has_a_name() -> None:

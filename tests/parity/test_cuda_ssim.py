@@ -162,5 +162,5 @@ def test_what_it_cannot_compare(loss: Loss, emulation: Callable[[int], cuda_ssim
         loss(image.double(), target)
     with pytest.raises(BackendError, match=r"\(8, 7, 3\)"):
         loss(image, target[:, :7])
-    with pytest.raises(BackendError, match="not of meta"):
+    with pytest.raises(BackendError, match="not on meta"):
         cuda_ssim.l1_ssim(emulation(0), image, target.to("meta"))
