@@ -12,7 +12,7 @@ from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
 from structgstream.training.motion import MotionConfig
-from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame, without_patching
+from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.result import Step
 from worlds import moving_world, psnr, rendered
@@ -22,6 +22,11 @@ QUICK = OnlineConfig(
     rates=OnlineRates(anchor_positions=2e-3),
     patching=PatchingConfig(iteration=12, grad_threshold=1e-3),
 )
+
+
+def without_patching(config: OnlineConfig) -> OnlineConfig:
+    """The paper's baseline of its free-3DG ablation."""
+    return replace(config, patching=replace(config.patching, spawn="off"))
 
 
 def fit(scene, world, index, *, config=QUICK, seed=0, on_step=None, backend: Backend | None = None):

@@ -135,7 +135,6 @@ def grow(
     with an anchor, present or proposed, get none. If ``most`` is exceeded, the proposals with the largest ratio of
     gradient to threshold are taken.
     """
-    k = anchors.offsets_per_anchor
     eligible = count > config.eligible_count
     means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(-1, 3)
     added: list[NewAnchors] = []
@@ -143,44 +142,50 @@ def grow(
     for level in range(config.levels):
         if level > 0 and not added:
             break
-        every_nth_frame = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
+        sampled = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
         threshold = config.grad_threshold * 2**level
-        chosen = (eligible & (mean_gradient >= threshold) & every_nth_frame).nonzero()[:, 0]
+        chosen = (eligible & (mean_gradient >= threshold) & sampled).nonzero()[:, 0]
         if chosen.numel() == 0:
             continue
-        cell = voxel_size * 16 / 4**level
-        everything = (torch.cat([means[chosen], occupied]) / cell).round().to(torch.int64)
-        origin = everything.amin(0)
-        extent = everything.amax(0) - origin + 1
-        keys = cell_keys(means[chosen], cell, origin, extent)
-        fresh = ~torch.isin(keys, cell_keys(occupied, cell, origin, extent))
-        unique, parent_cell = keys[fresh].unique(return_inverse=True)
-        if unique.numel() == 0:
-            continue
-        parents = anchors.features[chosen[fresh] // k]
-        features = parents.new_full((unique.numel(), parents.shape[1]), -torch.inf)
-        features.scatter_reduce_(0, parent_cell[:, None].expand_as(parents), parents, reduce="amax")
-        strengths = mean_gradient.new_zeros(unique.numel())
-        strengths.scatter_reduce_(0, parent_cell, mean_gradient[chosen[fresh]] / threshold, reduce="amax")
-        cells = torch.stack(
-            [unique // (extent[1] * extent[2]), unique // extent[2] % extent[1], unique % extent[2]], dim=1
+        new = _new_cells(
+            means[chosen],
+            anchors.features[chosen // anchors.offsets_per_anchor],
+            mean_gradient[chosen] / threshold,
+            occupied=occupied,
+            cell=voxel_size * 16 / 4**level,
         )
-        positions = (cells + origin).to(means) * cell
-        added.append(NewAnchors(positions, positions.new_full((positions.shape[0],), cell), features, strengths))
-        occupied = torch.cat([occupied, positions])
+        if len(new):
+            added.append(new)
+            occupied = torch.cat([occupied, new.positions])
     if not added:
-        return NewAnchors(
-            means.new_zeros(0, 3),
-            means.new_zeros(0),
-            anchors.features.new_zeros(0, anchors.features.shape[1]),
-            means.new_zeros(0),
-        )
+        none = means.new_zeros(0)
+        return NewAnchors(means[:0], none, anchors.features[:0], none)
     return NewAnchors(
         torch.cat([new.positions for new in added]),
         torch.cat([new.cell_sizes for new in added]),
         torch.cat([new.features for new in added]),
         torch.cat([new.strengths for new in added]),
     ).strongest(most - len(anchors))
+
+
+def _new_cells(means: Tensor, features: Tensor, strengths: Tensor, *, occupied: Tensor, cell: float) -> NewAnchors:
+    """One anchor for each cell of side ``cell`` that holds some of ``means`` ``[n, 3]`` and none of ``occupied``.
+
+    It gets the largest of their ``features`` ``[n, D]``, column by column, and of their ``strengths`` ``[n]``.
+    """
+    coordinates = (torch.cat([means, occupied]) / cell).round().to(torch.int64)
+    origin = coordinates.amin(0)
+    extent = coordinates.amax(0) - origin + 1
+    keys = cell_keys(means, cell, origin, extent)
+    fresh = ~torch.isin(keys, cell_keys(occupied, cell, origin, extent))
+    unique, index = keys[fresh].unique(return_inverse=True)
+    parents = features[fresh]
+    largest = parents.new_full((len(unique), parents.shape[1]), -torch.inf)
+    largest.scatter_reduce_(0, index[:, None].expand_as(parents), parents, reduce="amax")
+    strongest = strengths.new_zeros(len(unique)).scatter_reduce_(0, index, strengths[fresh], reduce="amax")
+    cells = torch.stack([unique // (extent[1] * extent[2]), unique // extent[2] % extent[1], unique % extent[2]], dim=1)
+    positions = (cells + origin).to(means) * cell
+    return NewAnchors(positions, positions.new_full((len(unique),), cell), largest, strongest)
 
 
 def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:

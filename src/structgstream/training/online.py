@@ -324,8 +324,3 @@ def _fit_moving_part(
             "jumps": int(segmentation.scene_cut),
         },
     )
-
-
-def without_patching(config: OnlineConfig) -> OnlineConfig:
-    """The same configuration with no free Gaussians: the paper's baseline of its free-3DG ablation."""
-    return replace(config, patching=replace(config.patching, spawn="off"))

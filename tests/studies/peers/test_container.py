@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rigs import arc_rig
-from structgstream.codec.container.records import PREFIX, scan_records
+from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
 from structgstream.scene.state import STATE_TABLE
@@ -18,7 +18,6 @@ from structgstream.similarity import Similarity
 from structgstream_studies.peers.container import (
     PeerReader,
     PeerSink,
-    is_peer_file,
     packed_array,
     parse_packet,
     unpacked_arrays,
@@ -142,10 +141,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     newer[8] = 2
     with pytest.raises(StreamError, match="version 2"):
         read(bytes(newer))
-    assert is_peer_file(tmp_path / "a.sgp")
-    assert not is_peer_file(tmp_path / "none")
-    (tmp_path / "other").write_bytes(data[: PREFIX.size - 6])
-    assert not is_peer_file(tmp_path / "other")
 
 
 def test_frames_out_of_order_are_refused(tmp_path: Path) -> None:

@@ -110,8 +110,8 @@ def comparison_sheet(results: Iterable[Result], *, titles: Mapping[str, str], sc
     keys = [key for key in titles if key in found]
     rows = []
     for key in keys:
-        every_nth_frame = any(result.identity["capture"]["every"] > 1 for result in found[key].results.values())
-        cells = ["-" if every_nth_frame and name in TEMPORAL else _cell(found[key], name) for name in shown]
+        subsampled = any(result.identity["capture"]["every"] > 1 for result in found[key].results.values())
+        cells = ["-" if subsampled and name in TEMPORAL else _cell(found[key], name) for name in shown]
         rows.append([titles[key], str(len(found[key].results)), *cells])
     return Sheet("Methods", ["method", "seeds", *(SCORES[name].title for name in shown)], rows)
 

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.codec.container.byte_source import ByteSource, FileBytes
+from structgstream.codec.container.byte_source import ByteSource
 from structgstream.codec.container.records import (
     PREFIX,
     RecordType,
@@ -49,10 +49,6 @@ _DTYPES = {0: np.dtype("<f4"), 1: np.dtype("<f2"), 2: np.dtype("<u1"), 3: np.dty
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
 _TYPES = {kind: record for record, kind in _KINDS.items()}
-
-
-MethodOf = Callable[[StreamHeader], PeerMethod[State, Any]]
-"""Gives the method that decodes a file with this header."""
 
 
 def packed_array(name: str, value: NDArray[Any]) -> bytes:
@@ -97,13 +93,6 @@ def unpacked_arrays(payload: bytes, start: int, *, where: str) -> tuple[Arrays, 
         sizes[name] = end - start
         start = end
     return arrays, sizes
-
-
-def is_peer_file(path: Path | str) -> bool:
-    """Whether the file begins as a peer's does."""
-    with suppress(StreamError):
-        return FileBytes(path)[: len(MAGIC)] == MAGIC
-    return False
 
 
 class PeerReader(Generic[State]):

@@ -15,8 +15,6 @@ from structgstream.training.step import Loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream_studies.peers.hash_grid import Cache, GridConfig, GridQuery, transformation
 
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
 
 @dataclass(frozen=True)
 class WarmUpConfig:
