@@ -2,9 +2,10 @@
 """``structgstream demo``."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -12,6 +13,9 @@ from rich.console import Console
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, parse_known_options, resolve_config
 from structgstream.cli.tables import quality_text, report_tables
+
+if TYPE_CHECKING:
+    from structgstream.evaluation.report import Report
 
 SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
 
@@ -88,22 +92,18 @@ def main(arguments: list[str]) -> None:
     write_pictures(orbit, path_pictures(reader, backend, path="orbit", camera=camera), fps=source.fps)
     player = options.output / "player.html"
     write_page(player, StreamFile(stream))
-    console.print(report_tables(report, title="bundled clip, held-out camera"))
-    console.print()
-    places = {
-        "stream": stream,
-        "pictures": report_folder / "contact_sheet.png",
-        "plots": report_folder / "over_time.png",
-        "numbers": report_folder / "report.json",
-        "held-out view": f"{held_out} (truth, rendering, difference x4; a fifth of the speed)",
-        "moving camera": orbit,
-    }
-    for name, path in places.items():
-        console.print(f"{name:<14}  {path}", highlight=False, markup=False, soft_wrap=True)
-    console.print(
-        f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, "
-        f"everything in {time.perf_counter() - began:.0f} s.",
-        highlight=False,
+    _print_results(
+        console,
+        report,
+        {
+            "stream": stream,
+            "pictures": report_folder / "contact_sheet.png",
+            "plots": report_folder / "over_time.png",
+            "numbers": report_folder / "report.json",
+            "held-out view": f"{held_out} (truth, rendering, difference x4; a fifth of the speed)",
+            "moving camera": orbit,
+        },
+        seconds=time.perf_counter() - began,
     )
     console.print(
         f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
@@ -111,4 +111,16 @@ def main(arguments: list[str]) -> None:
         highlight=False,
         markup=False,
         soft_wrap=True,
+    )
+
+
+def _print_results(console: Console, report: "Report", files: Mapping[str, Path | str], *, seconds: float) -> None:
+    """The scores, and where everything was written."""
+    console.print(report_tables(report, title="bundled clip, held-out camera"))
+    console.print()
+    for name, path in files.items():
+        console.print(f"{name:<14}  {path}", highlight=False, markup=False, soft_wrap=True)
+    console.print(
+        f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, everything in {seconds:.0f} s.",
+        highlight=False,
     )

@@ -3,7 +3,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_
 from structgstream.evaluation.optional_metrics import (
     ComparedFrame,
     MetricSelection,
+    OptionalMetrics,
     load_optional_metrics,
     optional_scores,
 )
@@ -102,9 +103,7 @@ def evaluate(
         optional_metrics = load_optional_metrics(
             views.items(), frames=size, device=backend.device, flow=flow, lpips_weights=lpips_weights
         )
-    first: dict[str, Picture] = {}
-    colors: dict[str, ChannelFit] = {}
-    before: dict[str, ComparedFrame] = {}
+    comparison = _Comparison(views, backend, optional_metrics)
     frames = []
     peaks = PeakMeter(backend.device)
     for frame, (info, scene, decode_seconds) in zip(
@@ -112,23 +111,7 @@ def evaluate(
     ):
         compared = []
         for name in names:
-            truth = frame.images[name]
-            first.setdefault(name, truth)
-            picture, seconds = rendered(scene, views[name], backend)
-            if name not in colors:
-                colors[name] = channel_fit(picture, truth)
-            scores = score(picture, truth, first[name], backend=backend, seconds=seconds, color=colors[name])
-            if optional_metrics is not None:
-                further, before[name] = optional_scores(
-                    optional_metrics,
-                    truth=truth,
-                    picture=picture,
-                    before=before.get(name),
-                    camera=name,
-                    index=info.index,
-                )
-                scores = replace(scores, **further)
-            compared.append(Compared(name, truth, picture, scores))
+            compared.append(comparison.compare(name, scene, frame.images[name], index=info.index))
             if observer is not None:
                 observer(info.index, compared[-1])
         frames.append(_frame_scores(info, scene, compared, decode_seconds, dict((log or {}).get(info.index, {}))))
@@ -136,12 +119,52 @@ def evaluate(
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
     facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames])
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
-    facts |= {"camera_colors": {name: vars(fit) for name, fit in colors.items()}}
+    facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
     facts |= {"metrics": metrics, "not_available": dict(optional_metrics.not_available) if optional_metrics else {}}
     facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
     peaks.end(EVALUATION)
     machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
     return Report(frames, by_camera, mean, facts, machine)
+
+
+@dataclass
+class _Comparison:
+    """Renderings against pictures, frame by frame, with what scores need of each camera's earlier frames.
+
+    Args:
+        views: cameras by name, scene units.
+        backend: the compute back-end.
+        optional_metrics: the metrics that take longer; None for none.
+        first: each camera's picture of frame 0.
+        colors: each camera's colour response, fitted to frame 0.
+        before: each camera's last frame, for temporal metrics.
+    """
+
+    views: Mapping[str, Camera]
+    backend: Backend
+    optional_metrics: OptionalMetrics | None
+    first: dict[str, Picture] = field(default_factory=dict)
+    colors: dict[str, ChannelFit] = field(default_factory=dict)
+    before: dict[str, ComparedFrame] = field(default_factory=dict)
+
+    def compare(self, camera: str, scene: Drawable, truth: Picture, *, index: int) -> Compared:
+        """The rendering of frame ``index`` by ``camera``, and its scores."""
+        first = self.first.setdefault(camera, truth)
+        picture, seconds = rendered(scene, self.views[camera], self.backend)
+        if camera not in self.colors:
+            self.colors[camera] = channel_fit(picture, truth)
+        scores = score(picture, truth, first, backend=self.backend, seconds=seconds, color=self.colors[camera])
+        if self.optional_metrics is not None:
+            further, self.before[camera] = optional_scores(
+                self.optional_metrics,
+                truth=truth,
+                picture=picture,
+                before=self.before.get(camera),
+                camera=camera,
+                index=index,
+            )
+            scores = replace(scores, **further)
+        return Compared(camera, truth, picture, scores)
 
 
 def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[PacketInfo, Drawable, float]]:
