@@ -49,7 +49,7 @@ function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[
 }
 
 /** The same without a last change. */
-export function unmoved(bins: SceneBins): SceneBins {
+export function withoutChange(bins: SceneBins): SceneBins {
   return {
     ...bins,
     change: noChange(bins.change.history.length, bins.change.columns),
@@ -63,7 +63,7 @@ export function unmoved(bins: SceneBins): SceneBins {
  *
  * @throws StreamError a value is too many steps from zero
  */
-export function binned(state: Fields, dynamic: ReadonlySet<FieldName>, steps: Steps): SceneBins {
+export function quantizeState(state: Fields, dynamic: ReadonlySet<FieldName>, steps: Steps): SceneBins {
   const rows = state.get("anchor_positions")!.shape[0]!;
   const widths = ANCHOR_ROWS.map((name) => (dynamic.has(name) ? state.get(name)!.shape[1]! : 0));
   const columns = widths.reduce((sum, width) => sum + width, 0);
@@ -77,7 +77,7 @@ export function binned(state: Fields, dynamic: ReadonlySet<FieldName>, steps: St
   }
   const weights = new Map<FieldName, Int32Array>();
   for (const name of WEIGHTS) if (dynamic.has(name)) weights.set(name, nearest(state.get(name)!, steps.get(name)!));
-  return unmoved({ anchors, change: noChange(rows, columns), weights, weightChanges: new Map(), free: noFree() });
+  return withoutChange({ anchors, change: noChange(rows, columns), weights, weightChanges: new Map(), free: noFree() });
 }
 
 function nearest(value: Tensor, step: number): Int32Array {
@@ -97,7 +97,11 @@ function nearest(value: Tensor, step: number): Int32Array {
 }
 
 /** The dynamic fields that bins stand for. */
-export function valued(bins: SceneBins, dynamic: ReadonlySet<FieldName>, steps: Steps): Map<FieldName, Tensor> {
+export function dequantizeState(
+  bins: SceneBins,
+  dynamic: ReadonlySet<FieldName>,
+  steps: Steps,
+): Map<FieldName, Tensor> {
   const state = new Map<FieldName, Tensor>();
   const rows = bins.change.history.length;
   const { columns } = bins.change;

@@ -2,7 +2,15 @@
 /** The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact). */
 
 import { AdaptiveDecoder } from "./adaptive.js";
-import { binned, CODABLE, decodedScene, FREE_STEPS, type SceneBins, unmoved, valued } from "./bins.js";
+import {
+  CODABLE,
+  decodedScene,
+  dequantizeState,
+  FREE_STEPS,
+  quantizeState,
+  type SceneBins,
+  withoutChange,
+} from "./bins.js";
 import { Models } from "./decisions.js";
 import { StreamError } from "./errors.js";
 import { type FieldName, mergedFields, type Tensor } from "./fields.js";
@@ -58,7 +66,7 @@ export class CompactDecoder {
   /** @throws StreamError the reference has a value that no bin stands for */
   constructor(private readonly header: StreamHeader) {
     const known = mergedFields(header.static, header.reference);
-    this.reference = binned(known, new Set(referenceNames(header.dynamic)), header.steps);
+    this.reference = quantizeState(known, new Set(referenceNames(header.dynamic)), header.steps);
   }
 
   /**
@@ -78,11 +86,11 @@ export class CompactDecoder {
     const bins = decodedScene(decoder, start.bins, dynamic, where);
     decoder.end();
     // What a key packet changes is everything since the reference, and tells nothing of what comes next.
-    this.state = { index, bins: isKey ? unmoved(bins) : bins, models };
+    this.state = { index, bins: isKey ? withoutChange(bins) : bins, models };
   }
 
   /** The dynamic fields of the frame that the last packet made; {@link advance} must have been called. */
   values(): Map<FieldName, Tensor> {
-    return valued(this.state!.bins, this.header.dynamic, this.header.steps);
+    return dequantizeState(this.state!.bins, this.header.dynamic, this.header.steps);
   }
 }

@@ -39,7 +39,7 @@ Gaussian structured(int slot) {
   int k = slot - v * ${splats};
   int m = int(texelFetch(anchors, place(v), 0).x);
   vec4 a, b, c;
-  dressed(v, k, a, b, c);
+  readGaussian(v, k, a, b, c);
   vec3 offset = texelFetch(offsets, place(m * ${splats} + k), 0).xyz;
   vec3 mean = texelFetch(positions, place(m), 0).xyz + offset * exp(texelFetch(offsetScales, place(m), 0).xyz);
   return Gaussian(mean, exp(texelFetch(baseScales, place(m), 0).xyz) * b.xyz, vec4(b.w, c.xyz), a.x, a.yzw);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** GLSL that reads what the MLP passes wrote: `dressed(v, k, a, b, c)`, whichever path wrote it. */
+/** GLSL that reads what the MLP passes wrote: `readGaussian(v, k, a, b, c)`, whichever path wrote it. */
 
 import { PAIR_TARGETS, SPLAT_VECTORS } from "../gpu/device.js";
 import type { MlpPath } from "../types.js";
@@ -14,7 +14,7 @@ function feedbackReading(splats: number, most: number): string {
   return `
 uniform sampler2D outputs;
 uniform int passTexels;
-void dressed(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
+void readGaussian(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
   int pass = k / ${most};
   int i = pass * passTexels + (v * min(${most}, ${splats} - pass * ${most}) + k - pass * ${most}) * ${SPLAT_VECTORS};
   a = texelFetch(outputs, place(i), 0);
@@ -29,7 +29,7 @@ function targetsReading(most: number): string {
   if (most % 2) throw new RangeError(`passes of ${most} Gaussians would part a pair`);
   return `
 uniform usampler2DArray outputs;
-void dressed(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
+void readGaussian(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
   ivec2 at = ivec2(v & ${(1 << LAYER_WIDTH_BITS) - 1}, v >> ${LAYER_WIDTH_BITS});
   int layer = (k >> 1) * ${PAIR_TARGETS};
   uvec4 middle = texelFetch(outputs, ivec3(at, layer + 1), 0);
