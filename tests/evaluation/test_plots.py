@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands in the panels over time: the numbers themselves, read from the figure before it becomes a picture."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,3 +79,22 @@ def test_seconds_add_up_to_the_total_and_a_long_first_frame_is_written_out(monke
     assert heights(axis) == {"render": [60, 2], "other": [30, 0.5], "loss": [0, 1]}
     assert axis.get_ylim()[1] == pytest.approx(1.3 * 3.5)
     assert [note.get_text() for note in axis.texts] == ["first frame: 90 s"]
+
+
+def test_no_two_stages_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run on a CPU has ten stages, which is more than there are colours."""
+    seconds = {f"stage {number}": float(number) for number in range(1, 13)}
+    axis = panels([frame(0, {"left": 30.0}, log={"seconds": seconds | {"total": 78.0}})], monkeypatch)["seconds"]
+    looks = {(bars[0].get_facecolor(), bars[0].get_hatch()) for bars in axis.containers}  # type: ignore[index]
+    assert len(looks) == len(axis.containers) == 12
+
+
+def test_a_score_that_hardly_changes_lies_within_its_panel(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [frame(index, {"left": 30.0}) for index in range(3)]
+    frames = [
+        replace(one, mean=replace(one.mean, flip=value))
+        for one, value in zip(frames, (0.1389, 0.1391, 0.1391), strict=True)
+    ]
+    bottom, top = panels(frames, monkeypatch)["distance"].get_ylim()
+    assert bottom == 0.0
+    assert top > 1.05 * 0.1391

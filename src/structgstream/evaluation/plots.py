@@ -2,7 +2,7 @@
 """Plots of a report over time in one picture: quality, bytes, counts, seconds."""
 
 from collections.abc import Callable, Sequence
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,10 +78,12 @@ def _flicker(axis: "Axes", report: Report) -> None:
 
 def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> None:
     """Plots the mean over cameras of metrics whose best value is 0, each always in the same colour."""
+    largest = 0.0
     for colour, (key, label) in zip(COLORS, keys):
         if points := _known(report, key):
             axis.plot(*zip(*points), color=colour, linewidth=1.5, label=label)
-    axis.set_ylim(bottom=0)
+            largest = max(largest, *(value for _, value in points))
+    axis.set_ylim(0, 1.1 * largest or None)  # Margins of nearly constant values would cut the line.
 
 
 def _known(report: Report, key: str) -> list[tuple[int, float]]:
@@ -131,10 +133,22 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
     whole = sum(array.sum() for array in values.values())
     shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
-    colours = cycle(COLORS)
+    # A second round through the colours is hatched, so that no two fields look alike.
+    looks = cycle(product((None, "////", "...."), COLORS))
     for name in shown:
-        colour = OTHER if name == "other" else next(colours)
-        axis.bar(index, values[name], bottom=base, width=0.85, color=colour, label=name.replace("_", " "))
+        hatch, colour = (None, OTHER) if name == "other" else next(looks)
+        label = name.replace("_", " ")
+        axis.bar(
+            index,
+            values[name],
+            bottom=base,
+            width=0.85,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            lw=0,
+            label=label,
+        )
         base = base + values[name]
 
 
