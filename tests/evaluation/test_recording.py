@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has no anchors is counted as free Gaussians, and drawn where it can be."""
+"""What is recorded is drawn on the device where it can be."""
 
 import pytest
 import torch
@@ -8,7 +8,6 @@ from streams import small_scene
 from structgstream.cameras import Camera
 from structgstream.errors import BackendError
 from structgstream.evaluation.recording import to_device
-from structgstream.frame_report import counts
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 
@@ -21,9 +20,6 @@ class Fixed:
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
         raise NotImplementedError
 
-    def __len__(self) -> int:
-        return 17
-
 
 class Roaming(Fixed):
     """As well on another device."""
@@ -31,11 +27,6 @@ class Roaming(Fixed):
     def on_device(self, device: torch.device) -> Fixed:
         self.device = device
         return self
-
-
-def test_a_scene_has_anchors_and_free_gaussians_and_others_are_free_altogether() -> None:
-    assert counts(small_scene(4, free=2)) == {"anchors": 4, "free": 2}
-    assert counts(Fixed()) == {"anchors": 0, "free": 17}
 
 
 def test_a_drawable_goes_to_a_device_if_it_can() -> None:

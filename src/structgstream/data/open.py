@@ -19,7 +19,7 @@ LAYOUTS = """Supported layouts:
   PanopticSports   train_meta.json, test_meta.json, ims/CAMERA/FRAME.jpg
   videos + JSON    cameras.json, CAMERA.mp4
   Neural 3D Video  poses_bounds.npy, camXX.mp4 (Meet Room: cam_X.mp4), with or without a COLMAP model
-  Immersive        models.json, camera_XXXX.mp4, of fisheye lenses
+  Immersive        models.json, camera_NNNN.mp4, of fisheye lenses
   COLMAP           sparse/0/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
                    frames/FRAME/CAMERA.ext, CAMERA.mp4, or images/CAMERA.ext for one frame
   transforms.json  of Blender, instant-ngp, nerfstudio, with pictures as COLMAP or with a time each
