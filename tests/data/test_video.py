@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
-from structgstream.data.video import VideoSource, VideoTrack, measured_fps, scan_videos, synchronised
+from structgstream.data.video import VideoSource, measured_fps, synchronised
+from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 
 RIG = small_rig(3)

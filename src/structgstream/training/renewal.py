@@ -19,7 +19,7 @@ from structgstream.training.observation import gather_maps
 from structgstream.training.partition import Partition
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.residuals import ResidualFloor, apply_camera_color
-from structgstream.training.views import View
+from structgstream.training.views import View, mean_of_counting
 
 LEAST_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
@@ -82,7 +82,8 @@ def renew_free_gaussians(
             _view_residual(moving, view, focuses, backend, floor=floor, config=config) if drawn else entry
             for entry, view, drawn in zip(missing, views, again, strict=True)
         ]
-        share = float(torch.stack([(entry.missing_share > 0.5).float().mean() for entry in missing]).mean())
+        shares = [mean_of_counting((entry.missing_share > 0.5).float(), entry.view.mask) for entry in missing]
+        share = float(torch.stack(shares).mean())
         if share > config.most_missing_share:
             return replace(none, missing_share=share, refused=True)
         kept = everything
