@@ -29,7 +29,9 @@ class MultiViewFrame:
 
     def present(self, names: Iterable[str]) -> tuple[str, ...]:
         """Those of the cameras ``names`` whose picture counts somewhere, in their order."""
-        return tuple(name for name in names if name in self.images and (name not in self.masks or self.masks[name].any()))
+        return tuple(
+            name for name in names if name in self.images and (name not in self.masks or self.masks[name].any())
+        )
 
     def __repr__(self) -> str:
         shapes = sorted({image.shape for image in self.images.values()})

@@ -27,8 +27,8 @@ def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -
     if len(present) < LEAST_CAMERAS:
         raise CaptureError(
             f"Frame {frame.index} of {capture} has pictures of {', '.join(present) or 'none'} of its "
-            f"{len(rig.training)} training cameras; at least {LEAST_CAMERAS} are needed. Restore them, or choose frames "
-            "before or after it (--start, --frames)."
+            f"{len(rig.training)} training cameras; at least {LEAST_CAMERAS} are needed. Restore them, or choose "
+            "frames before or after it (--start, --frames)."
         )
 
 

@@ -95,9 +95,7 @@ def common_pictures(
     instants = sorted({instant for pictures in files.values() for instant in pictures}, key=natural)
     slot_of = {instant: slot for slot, instant in enumerate(instants)}
     slots = {camera: sorted(slot_of[instant] for instant in pictures) for camera, pictures in files.items()}
-    common = common_slots(
-        slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}", training=training
-    )
+    common = common_slots(slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}", training=training)
     return CommonPictures(
         {camera: tuple(pictures.get(instants[slot]) for slot in common) for camera, pictures in files.items()},
         tuple(instants[slot] for slot in common),
@@ -120,8 +118,8 @@ def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:
         raise CaptureError(
-            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it, or delete it: its "
-            "camera then is absent from that frame."
+            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it, or delete "
+            "it: its camera then is absent from that frame."
         )
     height, width = picture.shape[:2]
     if (width, height) != (camera.width, camera.height):

@@ -81,7 +81,8 @@ def measured_rate(seconds: Sequence[Floats]) -> float | None:
         if len(own) < 2:
             continue
         steps = np.diff(own)
-        frames = np.rint(steps / max(float(np.median(steps)), 1e-9)).sum()
+        # A long step stands for missing frames, a short one is jitter.
+        frames = np.maximum(np.rint(steps / max(float(np.median(steps)), 1e-9)), 1).sum()
         rates.append(float(frames / (own[-1] - own[0])))
     if not rates:
         return None

@@ -157,9 +157,7 @@ def _sift_points(
     """Triangulated keypoints that a third view confirms."""
     pairs = unique_pairs(neighbours)
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(
-            lambda name: sift_features(images[name], count=config.features, mask=masks.get(name)), cameras
-        )
+        found = pool.map(lambda name: sift_features(images[name], count=config.features, mask=masks.get(name)), cameras)
         features = dict(zip(cameras, found, strict=True))
 
         def match(pair: tuple[str, str]) -> NDArray[np.intp]:

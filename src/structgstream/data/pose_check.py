@@ -170,9 +170,7 @@ class _Matcher:
         return {pair: self._matches[pair] for pair in pairs}
 
     def _extract(self, name: str) -> Features:
-        return sift_features(
-            self._frame.images[name], count=self._config.features, mask=self._frame.masks.get(name)
-        )
+        return sift_features(self._frame.images[name], count=self._config.features, mask=self._frame.masks.get(name))
 
     def _match(self, pair: tuple[str, str]) -> tuple[Floats, Floats]:
         config, empty = self._config, (np.empty((0, 2)), np.empty((0, 2)))

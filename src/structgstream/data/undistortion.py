@@ -259,7 +259,6 @@ class UndistortedSource(WithRig):
         def pinhole(plan: Undistortion | None, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
             return picture if plan is None else plan(picture)
 
-
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "lenses") as pool:
             for frame in self.source.frames(start):
                 names = [name for name in self.rig if name in frame.images]

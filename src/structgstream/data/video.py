@@ -64,7 +64,7 @@ class VideoSource:
             # Entered last, so that no thread is inside a decoder when the decoders close.
             pool = stack.enter_context(ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "videos"))
             for index in range(start, len(self)):
-                pictures = zip(self.rig, pool.map(next, decoders), strict=True)
+                pictures = zip(self.rig, pool.map(_next, decoders), strict=True)
                 present = {name: picture for name, picture in pictures if picture is not None}
                 yield MultiViewFrame(index, index / self.fps, present)
 
@@ -87,6 +87,10 @@ class VideoSource:
             )  # fmt: skip
 
         return pictures_at(track, self.stamps[name][start:], size=(camera.width, camera.height), on_damage=tell)
+
+
+def _next(pictures: Iterator[NDArray[np.uint8] | None]) -> NDArray[np.uint8] | None:
+    return next(pictures)
 
 
 def synchronised(

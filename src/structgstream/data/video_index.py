@@ -137,9 +137,8 @@ def _scan(path: Path) -> VideoTrack:
         keys = [packet.pts for packet in packets if packet.is_keyframe and packet.pts is not None]
         turns = _quarter_turns(path, stream, first)
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
-        return VideoTrack(
-            path, tuple(sorted(stamps)), float(stream.time_base), *size, quarter_turns=turns, keyframes=tuple(sorted(keys))
-        )
+        seconds = float(stream.time_base)
+        return VideoTrack(path, tuple(sorted(stamps)), seconds, *size, turns, tuple(sorted(keys)))
 
 
 def _first_frame(packet: "Packet") -> "VideoFrame | None":
@@ -161,7 +160,7 @@ def _quarter_turns(path: Path, stream: "VideoStream", frame: "VideoFrame | None"
             f"The video {path} is interlaced: its lines are of two instants; set the camera to a progressive mode "
             "(25p, 30p, 50p, 60p), or deinterlace the video to frames first."
         )
-    matrix = None if frame is None else next((side for side in frame.side_data if side.type.name == "DISPLAYMATRIX"), None)
+    matrix = None if frame is None else frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return 0
     a, b, _, c, d, *_ = np.frombuffer(bytes(matrix), "<i4") / 65536

@@ -139,9 +139,7 @@ def _key_before(track: VideoTrack, stamp: int) -> int | None:
     return track.keyframes[found - 1] if found > 1 else None
 
 
-def _shown(
-    frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]
-) -> Picture:
+def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
     """The picture as it is shown, at ``size``."""
     if not track.quarter_turns:
         return _srgb(frame, reformatter, width=size[0], height=size[1])

@@ -29,8 +29,8 @@ class ResidualFloor:
 
     Args:
         scale: size of the maps relative to the pictures.
-        maps: by view index ``[h, w]``, maximum residual over the 5 x 5 pixels around each, in 0 ... 1, and 1 where a mask
-            left a pixel out. Cameras that were absent from frame 0 have none, and their residuals indicate nothing.
+        maps: by view index ``[h, w]``, maximum residual over the 5 x 5 pixels around each, in 0 ... 1, and 1 where a
+            mask left a pixel out. Cameras that were absent from frame 0 have none: their residuals indicate nothing.
     """
 
     scale: float
