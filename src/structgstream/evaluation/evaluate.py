@@ -28,7 +28,7 @@ from structgstream.evaluation.facts import (
     training_facts,
 )
 from structgstream.evaluation.flow import Flow
-from structgstream.evaluation.masks import changed_pixels
+from structgstream.evaluation.masks import blackened, both, changed_pixels
 from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
 from structgstream.evaluation.optional_metrics import (
     ComparedFrame,
@@ -145,7 +145,7 @@ class _Comparison:
         views: cameras by name, scene units.
         backend: the compute back-end.
         optional_metrics: the metrics that take longer; None for none.
-        first: each camera's picture of frame 0.
+        first: each camera's first picture, and its mask.
         colors: each camera's colour response, fitted to frame 0.
         before: each camera's last frame and its number, for temporal metrics.
         left_out: each camera's share of masked pixels, by frame.
@@ -154,7 +154,7 @@ class _Comparison:
     views: Mapping[str, Camera]
     backend: Backend
     optional_metrics: OptionalMetrics | None
-    first: dict[str, Picture] = field(default_factory=dict)
+    first: dict[str, tuple[Picture, Mask | None]] = field(default_factory=dict)
     colors: dict[str, ChannelFit] = field(default_factory=dict)
     before: dict[str, tuple[int, ComparedFrame]] = field(default_factory=dict)
     left_out: dict[str, list[float]] = field(default_factory=dict)
@@ -162,13 +162,25 @@ class _Comparison:
     def compare(
         self, camera: str, scene: Drawable, truth: Picture, *, index: int, mask: Mask | None = None
     ) -> Compared:
-        """The rendering of frame ``index`` by ``camera``, and its scores over the pixels of ``mask``."""
-        first = self.first.setdefault(camera, truth)
+        """The rendering of frame ``index`` by ``camera``, and its scores over the pixels of ``mask``.
+
+        Both pictures are black in the other pixels, so that these do not reach into the scores of their neighbours.
+        """
+        truth = blackened(truth, mask)
+        first, first_mask = self.first.setdefault(camera, (truth, mask))
         picture, seconds = rendered(scene, self.views[camera], self.backend)
+        picture = blackened(picture, mask)
         if camera not in self.colors:
             self.colors[camera] = channel_fit(*counting(mask, picture, truth))
         scores = score(
-            picture, truth, first, backend=self.backend, seconds=seconds, color=self.colors[camera], mask=mask
+            picture,
+            truth,
+            first,
+            backend=self.backend,
+            seconds=seconds,
+            color=self.colors[camera],
+            mask=mask,
+            first_mask=first_mask,
         )
         self.left_out.setdefault(camera, []).append(0.0 if mask is None else 1.0 - float(mask.mean()))
         if self.optional_metrics is not None:
@@ -207,6 +219,7 @@ def score(
     seconds: float = 0.0,
     color: ChannelFit | None = None,
     mask: Mask | None = None,
+    first_mask: Mask | None = None,
 ) -> Scores:
     """The scores of a rendering against ``truth``.
 
@@ -217,7 +230,8 @@ def score(
         backend: computes SSIM.
         seconds: duration of the rendering.
         color: the camera's colour response, fitted to frame 0; None to leave out that score.
-        mask: ``[H, W]`` bool, the pixels that count; None for all.
+        mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
+        first_mask: that of ``first``.
 
     Raises:
         CaptureError: the pictures have different sizes.
@@ -228,7 +242,7 @@ def score(
                 f"A rendering of {picture.shape[1]}x{picture.shape[0]} pixels cannot be scored against a {what} of "
                 f"{other.shape[1]}x{other.shape[0]}; open the capture at the scale of the reconstruction."
             )
-    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first)
+    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first, both(mask, first_mask))
     ssim_score = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
     if mask is not None:
         errors, changed = errors[mask], changed[mask]

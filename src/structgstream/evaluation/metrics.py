@@ -95,12 +95,11 @@ def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | Non
 
 
 def masked_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float:
-    """Mean of :func:`ssim_map` over the pixels of ``mask`` ``[H, W]``, both pictures being black in the others.
+    """Mean of :func:`ssim_map` over the pixels of ``mask`` ``[H, W]``, of pictures that are black in the others.
 
-    So a masked pixel is treated as one beyond the border, and its content has no influence.
+    So a masked pixel is treated as one beyond the border.
     """
-    shown = (np.where(mask[..., None], image, 0).astype(np.uint8) for image in (picture, truth))
-    return float(ssim_map(*shown)[:, torch.from_numpy(mask)].mean())
+    return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
 
 
 def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:

@@ -18,7 +18,7 @@ from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of, opencv
 from structgstream.evaluation.flow import Flow, FlowField, dis_flow
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
-from structgstream.evaluation.masks import changed_pixels
+from structgstream.evaluation.masks import both, changed_pixels
 from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim
 from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
 from structgstream.flow import sampled
@@ -137,40 +137,32 @@ def optional_scores(
         before: the same camera's previous frame; None for the first.
         camera: its name.
         index: number of the frame.
-        mask: ``[H, W]``, the pixels that count; None for all.
+        mask: ``[H, W]``, the pixels that count; None for all. Both pictures are black in the others.
     """
     alex, vgg = (None if mask is not None else _usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))
     scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth) if mask is None else None}
-    if mask is not None:  # Equal in masked pixels, so that these do not reach into the others' neighbourhoods.
-        picture = np.where(mask[..., None], picture, truth)
     seen = None if optional_metrics.flip is None else (optional_metrics.flip(truth), optional_metrics.flip(picture))
     scores["flip"] = None if seen is None else flip_of(*seen, mask=mask)
     features = None if alex is None else (alex.features(truth), alex.features(picture))
     scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
     scores["lpips_vgg"] = None if vgg is None else vgg.distance(vgg.features(truth), vgg.features(picture))
     if before is not None:
-        both = _both(mask, before.mask)
-        still = ~changed_pixels(truth, before.truth)
-        still = still if both is None else still & both
+        counting = both(mask, before.mask)
+        still = ~changed_pixels(truth, before.truth, counting)
+        still = still if counting is None else still & counting
         scores["flicker"] = flicker(picture, before.picture, still)
         scores["truth_flicker"] = flicker(truth, before.truth, still)
         if optional_metrics.flow is not None:
             field = optional_metrics.flow(before.truth, truth, camera, index)
             field = _counting(field, mask, before.mask)
             scores["e_warp"] = warping_error(picture, before.picture, field)
-        if seen is not None and before.flip is not None and both is None:
+        if seen is not None and before.flip is not None and counting is None:
             true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))
             scores["temporal_flip"] = difference_of_change(rendered, true)
         if alex is not None and features is not None and before.lpips is not None:
             true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
             scores["t_lpips"] = difference_of_change(rendered, true)
     return scores, ComparedFrame(truth, picture, seen, features, mask)
-
-
-def _both(mask: Mask | None, other: Mask | None) -> Mask | None:
-    if mask is None or other is None:
-        return other if mask is None else mask
-    return mask & other
 
 
 def _counting(field: FlowField, mask: Mask | None, before: Mask | None) -> FlowField:
