@@ -82,8 +82,9 @@ def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, c
     seen = area_mean(picture.permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
     off = residual(seen, small.image, small.mask)
     limit = off.new_full((), config.residual_threshold)
-    if floor is not None and view.index not in floor.maps:  # Absent from frame 0: nothing is known to be new here.
-        return ViewResidual(small, torch.zeros_like(off, dtype=torch.bool), torch.zeros_like(off))
+    if floor is not None and view.index not in floor.maps:  # Absent from frame 0: nothing here is known to be new.
+        nothing = torch.zeros_like(off, dtype=torch.bool)
+        return ViewResidual(View(small.index, small.camera, small.image, nothing), nothing, torch.zeros_like(off))
     if floor is not None:
         limit = limit + interpolate(floor.maps[view.index][None, None], size=size, mode="bilinear")[0, 0]
     missing = box_mean((off > limit).float(), MASK_PIXELS)

@@ -155,7 +155,9 @@ def _blamed_mask(
         focus, camera = focuses.get(entry.view.index), entry.view.camera
         if focus is None:
             continue
-        maps = torch.stack([torch.ones_like(entry.missing_share), entry.wrong.to(entry.missing_share)], dim=-1)
+        wrong_pixels = entry.wrong.to(entry.missing_share)
+        counting = torch.ones_like(wrong_pixels) if entry.view.mask is None else entry.view.mask.to(wrong_pixels)
+        maps = torch.stack([counting, wrong_pixels], dim=-1)
         sums = gather_maps(moving.gaussians(camera, backend), moving, camera, maps, backend, still=focus.still)
         of_free = sums[len(sums) - len(moving.free) :]
         coverage.append(of_free[:, 0])
