@@ -20,6 +20,7 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CaptureError
 from structgstream.evaluation.evaluate import evaluate
+from structgstream.evaluation.optional_metrics import OF_WHOLE_PICTURES
 from structgstream.evaluation.plots import write_plots
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import log_entry
@@ -232,4 +233,7 @@ def test_scores_are_of_the_pixels_that_count(world: World, tmp_path: Path) -> No
     assert noisy["psnr"] > whole["psnr"] + 3
     assert noisy["ssim"] > whole["ssim"] + 0.05
     assert noisy["ms_ssim"] is None
+    reasons = found[0].stream["not_available"]
+    assert "masks leave out pixels of cam00" in reasons["temporal_flip"]
+    assert all(name in reasons for name in OF_WHOLE_PICTURES)
     assert found[0].stream["masked_share"] == {"cam00": pytest.approx(30 / 96)}

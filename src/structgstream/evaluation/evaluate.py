@@ -31,6 +31,7 @@ from structgstream.evaluation.flow import Flow
 from structgstream.evaluation.masks import blackened, both, changed_pixels
 from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
 from structgstream.evaluation.optional_metrics import (
+    OF_WHOLE_PICTURES,
     ComparedFrame,
     MetricSelection,
     OptionalMetrics,
@@ -130,7 +131,7 @@ def evaluate(
     facts |= comparison_facts(frames, names, comparison.left_out)
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
     facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
-    facts |= {"metrics": metrics, "not_available": dict(optional_metrics.not_available) if optional_metrics else {}}
+    facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, facts["masked_share"])}
     facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
     peaks.end(EVALUATION)
     machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
@@ -197,6 +198,14 @@ class _Comparison:
             self.before[camera] = index, now
             scores = replace(scores, **further)
         return Compared(camera, truth, picture, scores)
+
+
+def _not_available(metrics: OptionalMetrics | None, masked_share: Mapping[str, float]) -> dict[str, str]:
+    """Reasons for missing scores; those of what is missing altogether come before those of masks."""
+    if metrics is None:
+        return {}
+    reason = f"masks leave out pixels of {', '.join(masked_share)}, and this score compares whole pictures"
+    return (dict.fromkeys(OF_WHOLE_PICTURES, reason) if masked_share else {}) | dict(metrics.not_available)
 
 
 def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[PacketInfo, Drawable, float]]:

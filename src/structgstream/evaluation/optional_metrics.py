@@ -28,6 +28,7 @@ Mask = NDArray[np.bool_]
 MetricSelection = Literal["all", "basic"]
 """All metrics, or only the cheap ones of two pictures: PSNR and its variants, and SSIM."""
 
+OF_WHOLE_PICTURES = ("ms_ssim", "lpips_alex", "lpips_vgg", "temporal_flip", "t_lpips")
 TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 
 
