@@ -4,6 +4,7 @@
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -40,7 +41,7 @@ def write(
 ) -> None:
     """Five frames of one picture."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=30, options=dict(options or {}))
+        stream: Any = container.add_stream(codec, rate=30, options=dict(options or {}))
         stream.height, stream.width = image.shape[:2]
         stream.pix_fmt = pixels
         if interlaced:

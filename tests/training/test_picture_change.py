@@ -2,6 +2,7 @@
 """What two pictures of one camera tell, with no scene at hand."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,9 @@ def views(*, square_at: int | None = None) -> list[View]:
     return training_views(MultiViewFrame(0, 0.0, images), RIG, torch.device("cpu"))
 
 
-def changes(now: list[View], before: list[View], *, reach_pixels: int = 0, flow_from: tuple[int, ...] = ()):
+def changes(
+    now: list[View], before: list[View], *, reach_pixels: int = 0, flow_from: tuple[int, ...] = ()
+) -> list[Any]:
     return detect_picture_changes(
         now,
         before,

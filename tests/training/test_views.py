@@ -78,6 +78,7 @@ def test_masked_pixels_are_black_and_reduce_to_pixels_that_do_not_count() -> Non
         assert (small.image[small.mask] == 200).all()
         assert small.mask.any()
     half = view.reduced(0.5).mask
+    assert half is not None
     assert torch.equal(half, view.mask.reshape(16, 2, 24, 2).all(3).all(1))
     frame = MultiViewFrame(0, 0.0, frame.images, {"cam02": np.ones((32, 48), bool)})
     assert training_views(frame, RIG, torch.device("cpu"))[0].mask is None
