@@ -30,6 +30,7 @@ class FrameReport:
     Peaks of memory are by stage: ``read``, ``fit``, ``store`` (encoding and writing), and ``prepare`` (computing frame
     0's data for later frames). ``peak_memory_kind`` states whether they are per stage (Note [Peaks]);
     ``peak_device_bytes`` are the GPU's, if any. ``cpu_seconds`` is the CPU time of all threads of the process.
+    ``absent`` are the cameras without a picture of this frame, held-out ones among them.
     """
 
     index: int
@@ -51,6 +52,7 @@ class FrameReport:
     peak_memory_kind: PeakKind = PeakKind.NONE
     cpu_seconds: float = 0.0
     counts: Mapping[str, int] = field(default_factory=dict)
+    absent: tuple[str, ...] = ()
 
 
 class FrameMeter:
@@ -69,8 +71,10 @@ class FrameMeter:
         now = time.perf_counter()
         self._seconds[stage], self._last = now - self._last, now
 
-    def report(self, fit: FitResult[StateT], encoded: Encoded[StateT], size: int) -> FrameReport:
-        """The report of the frame whose packet takes ``size`` bytes."""
+    def report(
+        self, fit: FitResult[StateT], encoded: Encoded[StateT], size: int, *, absent: tuple[str, ...] = ()
+    ) -> FrameReport:
+        """The report of the frame whose packet takes ``size`` bytes, and from which the cameras ``absent`` are."""
         packet, state = encoded.packet, encoded.reconstruction
         read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
         return FrameReport(
@@ -92,6 +96,7 @@ class FrameMeter:
             peak_device_bytes=self._peaks.device_bytes,
             peak_memory_kind=self._peaks.kind,
             cpu_seconds=time.process_time() - self._cpu_started,
+            absent=absent,
         )
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pictures of one time step of a capture."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,18 +10,28 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class MultiViewFrame:
-    """The pictures of all cameras at one time step.
+    """The pictures of one time step; a camera without a picture is absent from it.
 
     Args:
         index: position in the stream, 0 for the first reconstructed frame.
         pts_seconds: presentation time, 0 for the first reconstructed frame.
-        images: camera name to ``[H, W, 3]`` uint8 sRGB; sizes may differ between cameras. Held-out cameras are
-            included when the source delivers them; training never reads them.
+        images: camera name to ``[H, W, 3]`` uint8 sRGB, in the rig's order; sizes may differ between cameras. Cameras
+            that have no picture of this instant are missing here. Held-out cameras are included when the source
+            delivers them; training never reads them.
+        masks: camera name to ``[H, W]`` bool, True where the picture counts. A camera that is missing here counts
+            everywhere.
     """
 
     index: int
     pts_seconds: float
     images: Mapping[str, NDArray[np.uint8]]
+    masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    def present(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of the cameras ``names`` whose picture counts somewhere, in their order."""
+        return tuple(
+            name for name in names if name in self.images and (name not in self.masks or self.masks[name].any())
+        )
 
     def __repr__(self) -> str:
         shapes = sorted({image.shape for image in self.images.values()})

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeds of frames, and initial points of frame 0."""
+"""Seeds of frames, the pictures that a frame needs, and initial points of frame 0."""
 
 import torch
 
+from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameSource
+from structgstream.data.timeline import LEAST_CAMERAS
+from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.similarity import Similarity
 
@@ -12,6 +15,21 @@ from structgstream.similarity import Similarity
 def frame_seed(seed: int, index: int) -> int:
     """The seed of a frame, so that it can be repeated alone."""
     return (seed * 1_000_003 + index) % 2**63
+
+
+def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
+    """Check that a frame can be fitted: at least two training cameras have pictures.
+
+    Raises:
+        CaptureError: naming them.
+    """
+    present = frame.present(rig.training)
+    if len(present) < LEAST_CAMERAS:
+        raise CaptureError(
+            f"Frame {frame.index} of {capture} has pictures of {', '.join(present) or 'none'} of its "
+            f"{len(rig.training)} training cameras; at least {LEAST_CAMERAS} are needed. Restore them, or choose "
+            "frames before or after it (--start, --frames)."
+        )
 
 
 def initial_points_of(

@@ -59,6 +59,11 @@ class FrameTask:
     pressure: float = 1.0
     on_step: StepListener | None = None
 
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """The cameras of the rig without a picture that counts, in its order."""
+        return tuple(name for name in self.rig if name not in self.frame.present(self.rig))
+
 
 @dataclass(frozen=True)
 class Past(Generic[State, Memory]):

@@ -16,7 +16,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
-from structgstream.initialization import frame_seed, initial_points_of
+from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
 from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
@@ -112,7 +112,7 @@ class Session(Generic[State, Memory]):
                 meter.end("write", peak="store")
                 past = self._advance(past, encoded.reconstruction, task)
                 meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
-                yield meter.report(fit, encoded, size)
+                yield meter.report(fit, encoded, size, absent=task.absent)
 
     def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
         """Each frame from ``start`` on with its preprocessed pictures."""
@@ -122,6 +122,7 @@ class Session(Generic[State, Memory]):
         frames = self._source.frames(start - again)
         before = next(frames) if again else None
         for frame in frames:
+            check_enough_pictures(frame, self._rig, self._source.name)
             yield frame, method.observe(frame, before, rig=self._rig, backend=self._backend)
             before = frame if method.needs_before else None
 
@@ -196,4 +197,5 @@ class Session(Generic[State, Memory]):
     def _first_task(self) -> FrameTask:
         """The task of frame 0, whose pictures are read again."""
         frame = next(self._source.frames(0))
+        check_enough_pictures(frame, self._rig, self._source.name)
         return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))

@@ -84,12 +84,18 @@ def test_a_camera_that_moves(tmp_path: Path) -> None:
         open_colmap(tmp_path)
 
 
-def test_a_missing_picture_in_the_middle(tmp_path: Path) -> None:
+def test_a_missing_picture_is_an_absent_camera(tmp_path: Path) -> None:
     write_pictures(tmp_path, "frames/FRAME/CAM.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
     (tmp_path / "frames/000002/cam01.png").unlink()
-    with pytest.raises(CaptureError, match=r"'cam01' of .* no frame for frame '000002'"):
-        open_colmap(tmp_path)
+    absent = [set(RIG).difference(frame.images) for frame in open_colmap(tmp_path).frames()]
+    assert [index for index, names in enumerate(absent) if names] == [2]
+    assert absent[2] == {"cam01"}
+    (
+        tmp_path / "frames/000000/cam02.png"
+    ).unlink()  # the range begins with it, and cam01's first picture is a later one
+    (tmp_path / "frames/000001/cam01.png").unlink()
+    assert set(RIG).difference(next(open_colmap(tmp_path).frames()).images) == {"cam01"}
 
 
 @pytest.mark.parametrize("folder", ["images", "images_2", "images_4", "images_8", ""])

@@ -9,6 +9,7 @@ import pytest
 
 from planes import distance_to_surface, room_frame, room_rig
 from structgstream.data.clip import bundled_clip
+from structgstream.data.matching import inside, project
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
 from structgstream.data.points import InitialPoints, PointsConfig, _has_neighbors, initial_points
 from structgstream.data.wrappers import resized
@@ -134,3 +135,44 @@ def test_points_are_the_same_again_and_thinned_to_the_bound() -> None:
     assert 750 < len(few.positions) <= 1_000
     # Thinned by cells: the few still reach as far as the many.
     assert np.ptp(few.positions, axis=0) == pytest.approx(np.ptp(points.positions, axis=0), rel=0.1)
+
+
+def test_absent_cameras_and_masked_pixels_give_no_points() -> None:
+    """Half of every picture is masked, and one camera is absent: points lie where the others' halves look."""
+    frame = next(iter(CLIP.frames()))
+    masks = {name: np.ones(image.shape[:2], bool) for name, image in frame.images.items()}
+    for mask in masks.values():
+        mask[:, mask.shape[1] // 2 :] = False
+    absent = CLIP.rig.training[2]
+    images = {name: image for name, image in frame.images.items() if name != absent}
+    config = PointsConfig(max_points=20_000, sweep_levels=COARSE)
+    found = initial_points(MultiViewFrame(0, 0.0, images, masks), CLIP.rig, config=config)
+    assert not found.random
+    assert len(found.positions) > 300
+    whole = initial_points(frame, CLIP.rig, config=config)
+
+    def shown(points: np.ndarray) -> float:
+        """Share of the points that some camera shows at a pixel that counts."""
+        seen = np.zeros(len(points), bool)
+        for name in CLIP.rig.training:
+            if name == absent:
+                continue
+            camera = CLIP.rig[name]
+            pixels, depths = project(camera, points)
+            within = inside(camera, pixels, depths, near=0.0)
+            column, row = pixels[within].astype(np.intp).T
+            seen[within] |= masks[name][row, column]
+        return float(seen.mean())
+
+    assert shown(found.positions) > 0.99
+    assert shown(whole.positions) < shown(found.positions)
+
+
+def test_random_points_lie_behind_pixels_that_count() -> None:
+    frame = next(iter(CLIP.frames()))
+    masks = {name: np.ones(image.shape[:2], bool) for name, image in frame.images.items()}
+    masks[CLIP.rig.training[0]][:, 3:] = False
+    config = PointsConfig(min_points=10**6, random_points=900, sweep_levels=())
+    found = initial_points(MultiViewFrame(0, 0.0, frame.images, masks), CLIP.rig, config=config)
+    assert found.random
+    assert 750 < len(found.positions) < 850  # one of nine cameras gives nearly none

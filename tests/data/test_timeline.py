@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 import logging
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from structgstream.data.timeline import common_slots, natural
+from properties import examples
+from structgstream.data.timeline import Clock, common_slots, natural
 from structgstream.errors import CaptureError
 
 
@@ -31,7 +35,6 @@ def test_equal_cameras_warn_of_nothing(caplog: pytest.LogCaptureFixture) -> None
 @pytest.mark.parametrize(
     ("b", "words"),
     [
-        ([0, 1, 3], "'b' of take has no frame for frame 2"),
         ([0, 1, 1, 2, 3], "'b' of take has two frames for frame 1"),
         ([7, 8], "no frames in common: 'a' ends with frame 3 and 'b' starts with frame 7"),
         ([], "'b' of take has no frames"),
@@ -40,3 +43,60 @@ def test_equal_cameras_warn_of_nothing(caplog: pytest.LogCaptureFixture) -> None
 def test_a_broken_timeline_names_camera_and_instant(b: list[int], words: str) -> None:
     with pytest.raises(CaptureError, match=words):
         common(a=[0, 1, 2, 3], b=b)
+
+
+def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records]
+
+
+def test_a_hole_is_told_once_and_the_range_stays(caplog: pytest.LogCaptureFixture) -> None:
+    assert common(a=[0, 1, 2, 3, 4], b=[0, 1, 4], c=[0, 1, 2, 3, 4]) == range(5)
+    assert messages(caplog) == ["take: camera 'b' lacks 2 of 5 frames, the first of them frame 2; it is absent there"]
+
+
+def test_the_range_ends_where_most_cameras_have_ended(caplog: pytest.LogCaptureFixture) -> None:
+    whole = list(range(10))
+    assert common(a=whole, b=whole, c=whole[:4], d=whole[:4]) == range(10)  # half of them still run
+    assert messages(caplog) == [
+        f"take: camera '{name}' ends with frame 3; it is absent from the 6 frames after that" for name in "cd"
+    ]
+    caplog.clear()
+    assert common(a=whole, b=whole, c=whole[:4], d=whole[:5], e=whole[:6]) == range(6)
+    assert "'e' ends with frame 5; 4 later" in caplog.text
+
+
+def test_two_training_cameras_reach_the_end() -> None:
+    slots = {"held": [*range(10)], "a": [*range(10)], "b": [*range(4)], "c": [*range(3)]}
+    label = "frame {}".format
+    assert common_slots(slots, where="take", label=label, training=("a", "b", "c")) == range(4)
+    assert common_slots(slots, where="take", label=label) == range(10)
+
+
+def test_frames_that_nobody_has_are_told(caplog: pytest.LogCaptureFixture) -> None:
+    assert common(a=[0, 1, 3], b=[0, 1, 3], c=[0, 1, 2, 3]) == range(4)
+    assert "1 frames, the first of them frame 2, have pictures of fewer than 2 training cameras" in caplog.text
+
+
+def test_a_camera_that_ended_before_the_others_began_belongs_to_another_take() -> None:
+    with pytest.raises(CaptureError, match="no frames in common: 'a' ends with frame 3 and 'b' starts with frame 7"):
+        common(a=[0, 1, 2, 3], b=[7, 8, 9], c=[7, 8, 9], d=[7, 8, 9])
+
+
+@examples(200)
+@given(st.lists(st.sets(st.integers(0, 30), min_size=1), min_size=1, max_size=6))
+def test_the_range_is_the_longest_that_all_have_begun_and_half_reach(found: list[set[int]]) -> None:
+    slots = {f"cam{number}": sorted(own) for number, own in enumerate(found)}
+    begun = max(own[0] for own in slots.values())
+    reaching = {slot: sum(own[-1] >= slot for own in slots.values()) for slot in range(31)}
+    least = max(len(slots) / 2, min(2, len(slots)))
+    expected = [slot for slot in range(begun, 31) if reaching[slot] >= least]
+    if all(any(slot in expected for slot in own) for own in slots.values()):
+        assert list(common(**slots)) == expected
+    else:
+        with pytest.raises(CaptureError, match="no frames in common"):
+            common(**slots)
+
+
+def test_a_clock_gives_common_time() -> None:
+    times = Clock(offset_seconds=-2.0, rate=1.001).common_seconds(np.array([0.0, 10.0]))
+    np.testing.assert_allclose(times, [-2.0, 8.01])

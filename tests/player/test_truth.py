@@ -2,12 +2,14 @@
 """Pictures of a capture on demand: which, how many are kept, and what a broken video does."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from memory_captures import MemoryCapture
 from pictures import decoded_picture
 from structgstream.data.clip import bundled_clip_path
 from structgstream.data.open import open_capture
@@ -72,3 +74,17 @@ def test_a_video_that_breaks_is_told_and_asked_again(tmp_path: Path) -> None:
         truth.jpeg("cam00", 10)
     video.write_bytes(whole)
     assert truth.jpeg("cam00", 10)
+
+
+def test_a_camera_that_is_absent_from_a_frame_has_no_picture_there(
+    tmp_path: Path, source: FrameSource, taken: dict[tuple[str, int], NDArray[np.uint8]]
+) -> None:
+    frames = [
+        replace(
+            frame, images={name: image for name, image in frame.images.items() if (name, frame.index) != ("cam00", 1)}
+        )
+        for frame in source.frames()
+    ]
+    truth = Truth(MemoryCapture(source.rig, frames), ("cam00", "cam04"))
+    assert [truth.jpeg("cam00", frame) is None for frame in range(3)] == [False, True, False]
+    assert truth.jpeg("cam04", 1) is not None

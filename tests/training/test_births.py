@@ -7,6 +7,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
+from structgstream.scene.render import draw
 from structgstream.training.births import BirthConfig, ViewResidual, blamed_mask, sweep_births, view_residual
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
@@ -59,3 +60,29 @@ def test_without_anything_missing_nothing_is_born() -> None:
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
     assert not len(sweep_births(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend()))
+
+
+def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> None:
+    """Four views miss a ball that frame 0 lacked; a fifth that is masked, or was absent from frame 0, misses nothing,
+    and as an equal voice would prevent its birth."""
+    world = moving_world(1, width=96, height=64, cameras=6, emerges_at=0)
+    views = training_views(world.frames[0], world.rig, torch.device("cpu"))
+    backend, color = reference_backend(), CameraColor.identity(len(views))
+    without = {v.index: draw(world.scene.gaussians(v.camera, backend), v.camera, backend).image for v in views}
+    depths = {v.index: torch.full((64, 96), torch.inf) for v in views}
+    config = replace(CONFIG, residual_threshold=0.05, most_contradictions=0.2, least_hits=1)
+    floor = ResidualFloor(1.0, {v.index: torch.zeros(64, 96) for v in views})
+
+    def born(last: ViewResidual) -> int:
+        found = [view_residual(without[v.index].clamp(0, 1), v, floor=floor, config=config) for v in views[:-1]]
+        return len(sweep_births([*found, last], depths, color, first_birth=0, config=config, backend=backend))
+
+    last = views[-1]
+    silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))
+    masked = replace(last, mask=torch.zeros(64, 96, dtype=torch.bool), image=torch.zeros_like(last.image))
+    unknown = replace(floor, maps={index: m for index, m in floor.maps.items() if index != last.index})
+    absent = view_residual(without[last.index].clamp(0, 1), last, floor=unknown, config=config)
+    seen = view_residual(without[last.index].clamp(0, 1), masked, floor=floor, config=config)
+    assert not absent.missing_share.any()
+    assert not seen.missing_share.any()
+    assert born(absent) == born(seen) > born(silent)

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from rigs import random_scene
@@ -11,6 +12,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.motion import MotionConfig, changed_movers
 from structgstream.training.partition import Partition
+from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
@@ -124,3 +126,46 @@ def test_free_gaussians_that_no_view_shows_are_gone() -> None:
     assert part.merge(part.moving).free.births.tolist() == [1]
     kept = moved_since(scene, views, views, config=CONFIG, backend=reference_backend())
     assert not kept.unseen.any()
+
+
+def test_a_camera_that_was_absent_before_does_not_vote_and_is_seen() -> None:
+    """The result is that of the others; but what it shows counts as visible, so that it is trained on."""
+    views, before = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
+    back, others = views[1], [view for n, view in enumerate(views) if n != 1]
+    config = replace(CONFIG, least_views_share=0.4)
+    floor = ResidualFloor(1.0, {view.index: torch.zeros(32, 48) for view in views})
+    for given in (None, floor):
+        options = {"config": replace(config, residual_threshold=0.1), "backend": reference_backend(), "floor": given}
+        found = moved_since(WORLD.scene, views, [view for view in before if view.index != back.index], **options)
+        alone = moved_since(WORLD.scene, others, [view for view in before if view.index != back.index], **options)
+        assert torch.equal(found.anchors, alone.anchors)
+        assert found.anchors.any()
+        assert found.trusted == (0, 1, 2, 3)
+        assert found.visible[back.index].any()
+
+
+def test_a_camera_without_a_floor_votes_by_its_pictures_alone() -> None:
+    """It was absent from frame 0, and its residuals, being of unknown origin, would make everything move."""
+    views, before = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
+    dark = [replace(view, image=view.image // 2) if view.index == 2 else view for view in views]
+    dark_before = [replace(view, image=view.image // 2) if view.index == 2 else view for view in before]
+    known = {view.index: torch.ones(32, 48) for view in views if view.index != 2}
+    config = replace(CONFIG, residual_threshold=0.05)
+    floor, backend = ResidualFloor(1.0, known), reference_backend()
+    found = moved_since(WORLD.scene, dark, dark_before, config=config, backend=backend, floor=floor)
+    plain = moved_since(WORLD.scene, dark, dark_before, config=CONFIG, backend=backend)
+    assert torch.equal(found.anchors, plain.anchors)
+
+
+def test_what_a_mask_hides_gets_no_vote_from_its_view() -> None:
+    frames = [replace(WORLD.frames[t], masks={}) for t in (0, 1)]
+    hidden = {name: np.zeros((32, 48), bool) for name in WORLD.rig.training}
+    for mask in hidden.values():
+        mask[:, :3] = True  # a camera that shows something still is present
+    for count, expected in ((2, True), (3, False)):
+        masks = {name: hidden[name] for name in WORLD.rig.training[:count]}
+        views, before = (
+            training_views(replace(frame, masks=masks), WORLD.rig, CPU) for frame in (frames[1], frames[0])
+        )
+        found = moved_since(WORLD.scene, views, before, config=CONFIG, backend=reference_backend())
+        assert bool(found.anchors[:20].any()) == expected  # two of the four see it, then one

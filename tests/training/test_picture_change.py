@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What two pictures of one camera tell, with no scene at hand."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
-import pytest
 import torch
 
 from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.picture_change import PictureChange, detect_picture_changes
-from structgstream.training.views import View, training_views
+from structgstream.training.picture_change import detect_picture_changes
+from structgstream.training.views import View, blackened, training_views
 
 RIG = arc_rig(3)
 
@@ -23,7 +25,9 @@ def views(*, square_at: int | None = None) -> list[View]:
     return training_views(MultiViewFrame(0, 0.0, images), RIG, torch.device("cpu"))
 
 
-def changes(now: list[View], before: list[View], *, reach_pixels: int = 0, flow_from: tuple[int, ...] = ()):
+def changes(
+    now: list[View], before: list[View], *, reach_pixels: int = 0, flow_from: tuple[int, ...] = ()
+) -> list[Any]:
     return detect_picture_changes(
         now,
         before,
@@ -58,8 +62,30 @@ def test_flow_is_looked_for_where_it_was_asked_for() -> None:
     assert not flow.requires_grad
 
 
-def test_views_without_their_like_are_an_error() -> None:
-    with pytest.raises(ValueError, match="shorter"):
-        changes(views(), views()[:1])
-    assert changes([], []) == []
-    assert PictureChange(torch.zeros(1, 1, dtype=torch.bool), True).flow is None
+def test_a_camera_is_compared_with_itself_or_not_at_all() -> None:
+    """A missing picture shifts no other camera's."""
+    both, alone = views(square_at=5), views()[1:]
+    first, second = changes(both, alone)
+    assert first is None
+    assert second.identical
+    (only,) = changes(both[:1], views())
+    assert only.changed.any()
+    assert changes(both[1:], views()[:1]) == [None]
+
+
+def test_what_either_picture_leaves_out_has_not_changed_and_has_no_flow() -> None:
+    now, before = views(square_at=8), views(square_at=4)
+    mask = torch.ones(32, 48, dtype=torch.bool)
+    mask[:, 12:] = False
+    whole = changes(now, before, flow_from=(0,))[0]
+    for pair in ((mask, None), (None, mask), (mask, mask)):
+        masked = [
+            [replace(own[0], image=blackened(own[0].image, part), mask=part), *own[1:]]
+            for own, part in zip((now, before), pair, strict=True)
+        ]
+        found = changes(*masked, reach_pixels=3, flow_from=(0,))[0]
+        assert not found.changed[:, 12:].any()
+        assert found.changed[:, :12].any()
+        assert not found.flow[:, 6:, :3].any()
+    assert whole.changed[:, 12:].any()
+    assert whole.flow[:, 6:, :3].any()

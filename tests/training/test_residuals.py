@@ -8,7 +8,7 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
 from structgstream.training.residuals import apply_camera_color, box_mean, residual, residual_floor
-from structgstream.training.views import training_views
+from structgstream.training.views import blackened, training_views
 from worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
@@ -77,3 +77,17 @@ def test_what_frame_0_already_missed_does_not_count() -> None:
     assert not moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()
     free_of_it = replace(floor, maps={index: torch.zeros_like(values) for index, values in floor.maps.items()})
     assert moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=free_of_it).anchors.any()
+
+
+def test_masked_pixels_miss_nothing_and_their_floor_is_out_of_reach() -> None:
+    mask = torch.ones(32, 48, dtype=torch.bool)
+    mask[5:20, 10:30] = False
+    spoiled = [replace(view, image=blackened(view.image, mask), mask=mask) for view in views(0)]
+    picture = torch.rand(32, 48, 3, generator=torch.Generator().manual_seed(0))
+    found = residual(picture, spoiled[0].image, mask)
+    assert not found[~mask].any()
+    assert torch.equal(found, residual(torch.where(mask[..., None], picture, 0.5), spoiled[0].image, mask))
+    floor = residual_floor(WORLD.scene, spoiled, scale=1.0, backend=BACKEND).maps
+    assert (floor[0][~mask] == 1.0).all()
+    clean = residual_floor(WORLD.scene, views(0), scale=1.0, backend=BACKEND).maps
+    torch.testing.assert_close(floor[0][24:], clean[0][24:])

@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import pytest
 import torch
 
+from backends import quickest_backend
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.reference_ssim import l1_ssim as reference_l1_ssim
+from structgstream.scene.color import CameraColor
+from structgstream.scene.focus import Focus
+from structgstream.scene.render import draw
 from structgstream.training.losses import LossWeights
 from structgstream.training.parameters import Parameters
-from structgstream.training.step import view_loss, with_term
+from structgstream.training.step import picture_loss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import View
+from structgstream.training.views import View, blackened
 
 CPU = torch.device("cpu")
 
@@ -55,3 +63,63 @@ def test_a_further_term_counts_by_its_weight() -> None:
     assert more.total.item() == pytest.approx(loss.total.item() + 0.5)
     assert (more.terms["more"].item(), "more" in loss.terms) == (2.0, False)
     assert more.structured is loss.structured
+
+
+@pytest.mark.parametrize("focused", [False, True])
+@pytest.mark.parametrize("learned", [False, True])
+def test_masked_pixels_have_no_influence_on_loss_and_gradient(learned: bool, focused: bool) -> None:
+    """Against the definition in plain torch: both pictures black where the mask is False, means over all pixels."""
+    backend, weights = quickest_backend(), LossWeights(volume=0.0)
+    generator = torch.Generator().manual_seed(3)
+    camera = arc_rig(width=96, height=64)["cam01"]
+    mask = torch.rand(64, 96, generator=generator) > 0.3
+    mask[10:30, 20:50] = False
+    noise = torch.randint(0, 256, (2, 64, 96, 3), generator=generator).to(torch.uint8)
+    truth = blackened(noise[0], mask)
+    color = CameraColor(torch.full((1, 3), 0.9).requires_grad_(learned), torch.full((1, 3), 0.02))
+    scene = random_scene(60)
+    gaussians = scene.gaussians(camera, backend)
+    colors = gaussians.colors.detach().requires_grad_()
+    tiles = TileSelection(torch.arange(24).reshape(4, 6) % 3 > 0, 96, 64)
+    drawn = draw(gaussians, camera, backend).image.detach()
+    focus = Focus(tiles, drawn.clone(), gaussians.select(torch.zeros(len(gaussians), dtype=torch.bool)))
+    loss = picture_loss(
+        replace(gaussians, colors=colors),
+        View(0, camera, truth, mask),
+        color,
+        backend=backend,
+        weights=weights,
+        track_screen=False,
+        watch=Stopwatch(CPU),
+        focus=focus if focused else None,
+    )
+    (found,) = torch.autograd.grad(loss.total, colors)
+
+    image = draw(replace(gaussians, colors=colors), camera, backend).image * color.gains[0] + color.biases[0]
+    shown = torch.where(mask[..., None], image, torch.zeros(()))
+    l1, similarity = reference_l1_ssim(shown, truth, tiles=tiles if focused else None)
+    expected = weights.l1 * l1 + weights.ssim * (1 - similarity)
+    assert loss.total.item() == pytest.approx(expected.item(), rel=1e-4)
+    (gradient,) = torch.autograd.grad(expected, colors)
+    torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-6)
+
+    squares = (image.clamp(0, 1) - truth / 255.0).square()[mask & tiles.pixels() if focused else mask]
+    assert loss.squared_error(View(0, camera, truth, mask)).item() == pytest.approx(squares.mean().item(), rel=1e-4)
+
+
+def test_the_rendering_under_a_mask_gets_no_gradient() -> None:
+    """Its values do not matter to the loss, and nothing pulls at them."""
+    backend, generator = quickest_backend(), torch.Generator().manual_seed(0)
+    image = torch.rand(40, 56, 3, generator=generator).requires_grad_()
+    other = torch.rand(40, 56, 3, generator=generator)
+    target = torch.randint(0, 256, (40, 56, 3), generator=generator).to(torch.uint8)
+    mask = torch.rand(40, 56, generator=generator) > 0.4
+    truth = blackened(target, mask)
+    losses = [
+        torch.stack(backend.l1_ssim(blackened(shown, mask), truth)).sum()
+        for shown in (image, torch.where(mask[..., None], image, other))
+    ]
+    assert losses[0].item() == losses[1].item()
+    (gradient,) = torch.autograd.grad(losses[0], image)
+    assert not gradient[~mask].any()
+    assert (gradient[mask] != 0).any(-1).float().mean() > 0.95

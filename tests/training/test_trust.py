@@ -64,3 +64,11 @@ def test_a_light_switched_on_is_a_jump() -> None:
     assert found.scene_cut
     assert found.evidence is None
     assert len(found.trusted) == len(views)
+
+
+def test_a_view_that_was_absent_before_is_trusted_and_no_measure_for_others() -> None:
+    back = ViewChange(changed_share=None, wrong_share=0.0, identical=False)
+    odd = replace(USUAL, changed_share=0.9)
+    assert trusted_views([USUAL, back, odd, USUAL, back]) == [True, True, False, True, True]
+    assert is_scene_cut([odd, odd, back, back, back])
+    assert not is_scene_cut([USUAL, back])

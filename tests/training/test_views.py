@@ -8,6 +8,8 @@ from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.training.views import View, reduced, shuffled_views, training_views
 
+RIG = arc_rig()
+
 
 class Guarded(Mapping[str, np.ndarray]):
     """Pictures that refuse to be read for held-out cameras."""
@@ -49,3 +51,34 @@ def test_reduction_averages_areas_and_keeps_the_camera() -> None:
     assert small.image.shape == (16, 24, 3)
     assert (small.image == 100).all()
     assert torch.allclose(small.camera.K[:2], camera.K[:2] * 0.5)
+
+
+def test_absent_cameras_have_no_view_and_shift_no_index() -> None:
+    images = {name: np.full((32, 48, 3), 10 * n, np.uint8) for n, name in enumerate(RIG) if name != "cam01"}
+    masks = {"cam03": np.zeros((32, 48), bool)}
+    views = training_views(MultiViewFrame(0, 0.0, images), RIG, torch.device("cpu"))
+    assert [view.index for view in views] == [1, 2]
+    assert [int(view.image[0, 0, 0]) for view in views] == [20, 30]
+    (left,) = training_views(MultiViewFrame(0, 0.0, images, masks), RIG, torch.device("cpu"))
+    assert left.index == 1
+
+
+def test_masked_pixels_are_black_and_reduce_to_pixels_that_do_not_count() -> None:
+    mask = np.random.default_rng(0).random((32, 48)) > 0.1
+    mask[:, 40:] = True
+    frame = MultiViewFrame(0, 0.0, {"cam02": np.full((32, 48, 3), 200, np.uint8)}, {"cam02": mask})
+    (view,) = training_views(frame, RIG, torch.device("cpu"))
+    assert view.mask is not None
+    assert not view.image[~view.mask].any()
+    assert (view.image[view.mask] == 200).all()
+    for scale in (0.5, 0.25, 0.4):
+        small = view.reduced(scale)
+        assert small.mask is not None
+        assert not small.image[~small.mask].any()
+        assert (small.image[small.mask] == 200).all()
+        assert small.mask.any()
+    half = view.reduced(0.5).mask
+    assert half is not None
+    assert torch.equal(half, view.mask.reshape(16, 2, 24, 2).all(3).all(1))
+    frame = MultiViewFrame(0, 0.0, frame.images, {"cam02": np.ones((32, 48), bool)})
+    assert training_views(frame, RIG, torch.device("cpu"))[0].mask is None

@@ -2,7 +2,7 @@
 """What the user sees while frames are fitted: bars on a terminal, a line for each frame elsewhere."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from structgstream.frame_report import FrameReport
     from structgstream.training.result import Step
 
+MOST_NAMES = 5
 QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a frame
 
 
@@ -50,7 +51,7 @@ def summary(report: "FrameReport", frames: int) -> str:
         f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
-        f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}"
+        f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}{absences(report.absent)}"
     )
 
 
@@ -69,6 +70,14 @@ def remarks(counts: Mapping[str, int]) -> str:
     if counts.get("births refused"):
         found.append("no births: too many pixels are missing at once")
     return "".join(f"  [{remark}]" for remark in found)
+
+
+def absences(cameras: Sequence[str]) -> str:
+    """A remark on the cameras without a picture of the frame; empty without any."""
+    if not cameras:
+        return ""
+    names = ", ".join(cameras[:MOST_NAMES]) + (", ..." if len(cameras) > MOST_NAMES else "")
+    return f"  [absent: {names}]" if len(cameras) == 1 else f"  [{len(cameras)} cameras absent: {names}]"
 
 
 def human_bytes(count: float) -> str:

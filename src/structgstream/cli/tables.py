@@ -119,6 +119,12 @@ def _not_available(report: "Report") -> Table:
 def _facts(report: "Report") -> Table:
     s = report.stream
     table = name_value_table()
+    if s["absent_frames"]:
+        counts = (f"{name} from {count} of {s['frames']} frames" for name, count in s["absent_frames"].items())
+        table.add_row("absent", Text(f"{', '.join(counts)}; means are over the pictures that exist"))
+    if s["masked_share"]:
+        shares = (f"{name} {share:.1%}" for name, share in s["masked_share"].items())
+        table.add_row("masked", Text(f"{', '.join(shares)} of the pixels, which are not scored"))
     table.add_row(
         "PSNR over time",
         f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
@@ -161,7 +167,9 @@ def _facts(report: "Report") -> Table:
     return table
 
 
-def _scores(scores: "Scores") -> list[str]:
+def _scores(scores: "Scores | None") -> list[str]:
+    if scores is None:  # Every scored camera is absent.
+        return ["-"] * len(BASIC)
     values = (scores.psnr, scores.psnr_camera_color, scores.ssim, scores.psnr_changed, scores.psnr_still)
     digits = (2, 2, 4, 2, 2)
     return ["-" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]

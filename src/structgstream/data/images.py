@@ -2,12 +2,13 @@
 """Captures whose frames are picture files: one list of files per camera."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +29,17 @@ class ImageSource:
         name: the capture's name.
         rig: its cameras, at the size of the pictures.
         fps: frames a second.
-        files: camera name to its pictures in order; all cameras have the same number.
+        files: camera name to its picture in each frame; None where it has none.
         points: ``[P, 3]`` points that came with the capture, or None.
+        instants: name of each frame in the files; empty if frames have no names.
     """
 
     name: str
     rig: CameraRig
     fps: float
-    files: Mapping[str, tuple[Path, ...]]
+    files: Mapping[str, tuple[Path | None, ...]]
     points: NDArray[np.float64] | None = None
+    instants: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return min(len(files) for files in self.files.values())
@@ -45,14 +48,14 @@ class ImageSource:
         """The frames from stream index ``start``; the pictures of one instant are read in parallel.
 
         Raises:
-            CaptureError: a picture is missing, cannot be decoded, or has another size than its intrinsics.
+            CaptureError: a picture has gone, cannot be decoded, or has another size than its intrinsics.
         """
         cv2 = opencv()
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
-                paths = [self.files[camera][index] for camera in self.rig]
-                pictures = pool.map(partial(_picture, cv2), paths, self.rig.cameras.values())
-                yield MultiViewFrame(index, index / self.fps, dict(zip(self.rig, pictures, strict=True)))
+                paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
+                pictures = pool.map(partial(_picture, cv2), paths.values(), [self.rig[name] for name in paths])
+                yield MultiViewFrame(index, index / self.fps, dict(zip(paths, pictures, strict=True)))
 
 
 def opencv() -> ModuleType:
@@ -64,12 +67,27 @@ def opencv() -> ModuleType:
     return cv2
 
 
-def common_pictures(files: Mapping[str, Mapping[str, Path]], *, where: Path) -> dict[str, tuple[Path, ...]]:
-    """The pictures of the time steps that all cameras have.
+class CommonPictures(NamedTuple):
+    """The pictures of a capture's frames.
+
+    Args:
+        files: camera name to its picture in each frame; None where it has none.
+        instants: name of each frame.
+    """
+
+    files: dict[str, tuple[Path | None, ...]]
+    instants: tuple[str, ...]
+
+
+def common_pictures(
+    files: Mapping[str, Mapping[str, Path]], *, where: Path, training: Collection[str] | None = None
+) -> CommonPictures:
+    """The pictures of the time steps of a capture, of which cameras may lack some.
 
     Args:
         files: camera name to its pictures, by the name of the instant.
         where: the capture, for messages.
+        training: names of the cameras that are not held out; None for all.
 
     Raises:
         CaptureError: see :func:`~structgstream.data.timeline.common_slots`.
@@ -77,8 +95,11 @@ def common_pictures(files: Mapping[str, Mapping[str, Path]], *, where: Path) -> 
     instants = sorted({instant for pictures in files.values() for instant in pictures}, key=natural)
     slot_of = {instant: slot for slot, instant in enumerate(instants)}
     slots = {camera: sorted(slot_of[instant] for instant in pictures) for camera, pictures in files.items()}
-    common = common_slots(slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}")
-    return {camera: tuple(pictures[instants[slot]] for slot in common) for camera, pictures in files.items()}
+    common = common_slots(slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}", training=training)
+    return CommonPictures(
+        {camera: tuple(pictures.get(instants[slot]) for slot in common) for camera, pictures in files.items()},
+        tuple(instants[slot] for slot in common),
+    )
 
 
 def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
@@ -97,7 +118,8 @@ def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:
         raise CaptureError(
-            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it."
+            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it, or delete "
+            "it: its camera then is absent from that frame."
         )
     height, width = picture.shape[:2]
     if (width, height) != (camera.width, camera.height):
@@ -106,3 +128,13 @@ def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
             f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
         )
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """``mask`` ``[H, W]`` at another ``size``, width and height: a pixel counts if all that it is made of counts."""
+    if mask.shape[1::-1] == size:
+        return mask
+    cv2 = opencv()
+    shrinks = size[0] <= mask.shape[1] and size[1] <= mask.shape[0]
+    taken = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    return taken > 1 - 1e-4

@@ -19,7 +19,8 @@ import numpy as np
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
 from structgstream.data.timeline import natural
-from structgstream.data.video import VideoSource, scan_videos, synchronised
+from structgstream.data.video import VideoSource, synchronised
+from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 
 FILE = "cameras.json"

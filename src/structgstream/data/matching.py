@@ -31,8 +31,10 @@ class Features:
     descriptors: NDArray[np.float32]
 
 
-def sift_features(image: NDArray[np.uint8], *, count: int, contrast: float = 0.01) -> Features:
-    """The strongest ``count`` SIFT keypoints of an RGB picture ``[H, W, 3]``.
+def sift_features(
+    image: NDArray[np.uint8], *, count: int, contrast: float = 0.01, mask: NDArray[np.bool_] | None = None
+) -> Features:
+    """The strongest ``count`` SIFT keypoints of an RGB picture ``[H, W, 3]``, of its pixels ``mask`` ``[H, W]``.
 
     Descriptors are square-rooted after L1 normalisation, so that their dot product is the Hellinger kernel
     (Arandjelovic and Zisserman, CVPR 2012).
@@ -50,7 +52,8 @@ def sift_features(image: NDArray[np.uint8], *, count: int, contrast: float = 0.0
         sigma=1.6,
         enable_precise_upscale=True,
     )
-    keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.empty(0))
+    within = np.empty(0) if mask is None else mask.astype(np.uint8)
+    keypoints, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), within)
     if descriptors is None or len(keypoints) == 0:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
     pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5

@@ -20,7 +20,8 @@ from structgstream.data.aligned_points import aligned_points
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.timeline import natural
-from structgstream.data.video import VideoSource, VideoTrack, scan_videos, synchronised
+from structgstream.data.video import VideoSource, synchronised
+from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.errors import CalibrationError
 
 POSES = "poses_bounds.npy"

@@ -8,6 +8,7 @@ from structgstream.data.calibration import with_near
 from structgstream.data.colmap_capture import open_colmap, recognizes_colmap
 from structgstream.data.immersive import open_immersive, recognizes_immersive
 from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
+from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
 from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
 from structgstream.data.source import FrameSource
@@ -84,7 +85,7 @@ def _recognized(path: Path) -> FrameSource:
     path = path.resolve()  # a name, even for "."
     for recognises, opens in FORMATS:
         if recognises(path):
-            return opens(path)
+            return with_masks(opens(path), path / FOLDER)
     content = sorted(entry.name for entry in path.iterdir())
     if not content:
         raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS}")

@@ -30,7 +30,7 @@ def open_panoptic(path: Path) -> ImageSource:
     """The capture at ``path``.
 
     Raises:
-        CaptureError: a file is missing or is not what the layout asks for.
+        CaptureError: a file is not what the layout asks for, or a camera has no pictures.
         CalibrationError: broken numbers, or a camera that moves.
     """
     cameras: dict[str, Camera] = {}
@@ -48,9 +48,9 @@ def open_panoptic(path: Path) -> ImageSource:
             held_out += found
     names = sorted(cameras, key=natural)
     rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
-    _check_present(files)
-    common = common_pictures({name: files[name] for name in names}, where=path)
-    return ImageSource(path.name, rig, PANOPTIC_FPS, common)
+    present = _present(files)
+    common = common_pictures({name: present[name] for name in names}, where=path, training=rig.training)
+    return ImageSource(path.name, rig, PANOPTIC_FPS, common.files, instants=common.instants)
 
 
 def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
@@ -95,16 +95,16 @@ def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
         return False
 
 
-def _check_present(files: dict[str, dict[str, Path]]) -> None:
-    """Every listed picture exists; one listing per folder is cheaper than one lookup per picture."""
+def _present(files: dict[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
+    """The pictures that exist; one listing per folder is cheaper than one lookup per picture."""
     listings: dict[Path, set[str]] = {}
+    present: dict[str, dict[str, Path]] = {}
     for camera, pictures in files.items():
-        for file in pictures.values():
+        present[camera] = {}
+        for instant, file in pictures.items():
             if file.parent not in listings:
                 entries = file.parent.iterdir() if file.parent.is_dir() else ()
                 listings[file.parent] = {entry.name for entry in entries}
-            if file.name not in listings[file.parent]:
-                raise CaptureError(
-                    f"The picture {file} of camera {camera!r} is missing although the metadata lists it; "
-                    "restore the file, or remove its frame from the metadata."
-                )
+            if file.name in listings[file.parent]:
+                present[camera][instant] = file
+    return present

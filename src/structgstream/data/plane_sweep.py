@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.data.images import reduced_mask
 from structgstream.data.matching import Floats, back_project, inside, load_cv2, project
 
 FloatImage = NDArray[np.float32]
@@ -93,21 +94,28 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class SweepView:
-    """A picture ready for the sweep: reduced camera, grey ``[H, W]`` in [0, 1] and colours ``[H, W, 3]``."""
+    """A picture ready for the sweep: reduced camera, grey ``[H, W]`` in [0, 1] and colours ``[H, W, 3]``.
+
+    ``mask`` ``[H, W]`` has the pixels that may get a depth; None for all.
+    """
 
     camera: Camera
     grey: FloatImage
     colors: NDArray[np.uint8]
+    mask: NDArray[np.bool_] | None = None
 
 
-def sweep_view(camera: Camera, image: NDArray[np.uint8], *, width: int) -> SweepView:
-    """The picture averaged down to at most ``width`` pixels, with its camera."""
+def sweep_view(
+    camera: Camera, image: NDArray[np.uint8], *, width: int, mask: NDArray[np.bool_] | None = None
+) -> SweepView:
+    """The picture averaged down to at most ``width`` pixels, with its camera and its mask."""
     cv2 = load_cv2()
     width = min(width, camera.width)
     height = max(1, round(camera.height * width / camera.width))
     colors = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     grey = cv2.cvtColor(colors.astype(np.float32) / 255, cv2.COLOR_RGB2GRAY)
-    return SweepView(camera.resized(width, height), np.asarray(grey, np.float32), colors)
+    mask = None if mask is None else reduced_mask(mask, (width, height))
+    return SweepView(camera.resized(width, height), np.asarray(grey, np.float32), colors, mask)
 
 
 def sweep_depth(
@@ -129,6 +137,8 @@ def sweep_depth(
         lead = np.minimum(np.where(better, other_lead, lead), gap)
         inverse, peak = np.where(better, other_inverse, inverse), np.maximum(other_peak, peak)
     believed = (peak > config.min_score) & (lead > config.min_margin)
+    if reference.mask is not None:
+        believed &= reference.mask
     return DepthMap(reference.camera, inverse, step, believed)
 
 
@@ -165,8 +175,11 @@ def sweep_points(
     bounds: Mapping[str, SweepBounds],
     workers: int,
     levels: Sequence[SweepConfig] = DEFAULT_LEVELS,
+    masks: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8.
+
+    ``masks`` ``[H, W]`` leave pixels of a camera out.
 
     A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
@@ -181,7 +194,10 @@ def sweep_points(
     covered: dict[str, FloatImage] = {}
     with ThreadPoolExecutor(workers) as pool:
         for config in levels:
-            views = {name: sweep_view(camera, images[name], width=config.width) for name, camera in cameras.items()}
+            views = {
+                name: sweep_view(camera, images[name], width=config.width, mask=(masks or {}).get(name))
+                for name, camera in cameras.items()
+            }
             pending = {
                 name: pool.submit(
                     sweep_depth,

@@ -97,22 +97,32 @@ def initial_points(
 ) -> InitialPoints:
     """Points of one frame from the training cameras' pictures and poses; held-out pictures are never read.
 
+    Absent cameras and pixels that do not count give no points.
+
     The result does not depend on the number of threads; ``seed`` is used for random points only.
 
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cameras = {name: rig[name] for name in rig.training}
-    images = {name: frame.images[name] for name in rig.training}
+    cameras = {name: rig[name] for name in frame.present(rig.training)}
+    images, masks = {name: frame.images[name] for name in cameras}, frame.masks
     distance = viewing_distance(cameras)
     neighbours = neighbor_views(cameras, count=config.neighbours, distance=distance)
     workers = max(1, min(len(cameras), os.cpu_count() or 1))
-    positions, colors = _sift_points(cameras, images, neighbours, distance=distance, workers=workers, config=config)
+    positions, colors = _sift_points(
+        cameras, images, neighbours, masks=masks, distance=distance, workers=workers, config=config
+    )
     sources = np.zeros(len(positions), np.uint8)
     if config.sweep_levels:
         bounds = _sweep_bounds(cameras, positions, distance=distance, config=config)
         swept, swept_colors = sweep_points(
-            cameras, images, neighbours=neighbours, bounds=bounds, workers=workers, levels=config.sweep_levels
+            cameras,
+            images,
+            neighbours=neighbours,
+            bounds=bounds,
+            workers=workers,
+            levels=config.sweep_levels,
+            masks=masks,
         )
         positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
         sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
@@ -127,7 +137,7 @@ def initial_points(
             config.random_points,
         )
         positions, colors = _random_points(
-            cameras, images, distance=distance, rng=np.random.default_rng(seed), config=config
+            cameras, images, masks=masks, distance=distance, rng=np.random.default_rng(seed), config=config
         )
         return InitialPoints(positions, colors, {"random": len(positions)})
     counts = {"sift": int((sources[kept] == 0).sum()), "sweep": int((sources[kept] == 1).sum())}
@@ -139,6 +149,7 @@ def _sift_points(
     images: Mapping[str, NDArray[np.uint8]],
     neighbours: Mapping[str, tuple[str, ...]],
     *,
+    masks: Mapping[str, NDArray[np.bool_]],
     distance: float,
     workers: int,
     config: PointsConfig,
@@ -146,7 +157,7 @@ def _sift_points(
     """Triangulated keypoints that a third view confirms."""
     pairs = unique_pairs(neighbours)
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(lambda name: sift_features(images[name], count=config.features), cameras)
+        found = pool.map(lambda name: sift_features(images[name], count=config.features, mask=masks.get(name)), cameras)
         features = dict(zip(cameras, found, strict=True))
 
         def match(pair: tuple[str, str]) -> NDArray[np.intp]:
@@ -277,6 +288,7 @@ def _random_points(
     cameras: Mapping[str, Camera],
     images: Mapping[str, NDArray[np.uint8]],
     *,
+    masks: Mapping[str, NDArray[np.bool_]],
     distance: float,
     rng: np.random.Generator,
     config: PointsConfig,
@@ -289,6 +301,9 @@ def _random_points(
         near = max(config.near_share * distance, camera.near)
         pixels = rng.random((each, 2)) * (camera.width, camera.height)
         inverse = rng.uniform(1 / (3 * distance), 1 / near, each)
+        if name in masks:
+            counts = masks[name][tuple(pixels.astype(np.intp).T[::-1])]
+            pixels, inverse = pixels[counts], inverse[counts]
         column, row = pixels.astype(np.intp).T
         positions.append(back_project(camera, pixels, 1 / inverse))
         colors.append(images[name][row, column])

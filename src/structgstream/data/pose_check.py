@@ -93,7 +93,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
         CalibrationError: most good matches violate the epipolar geometry of the poses.
         MissingExtraError: cv2 is not installed.
     """
-    given = {name: rig[name] for name in rig.training}
+    given = {name: rig[name] for name in frame.present(rig.training)}
     matcher = _Matcher(frame, config)
     check = _judge(given, matcher.matches(_pairs(given, config)), config)
     if check.conclusive and check.share_violating <= config.max_share:
@@ -170,7 +170,7 @@ class _Matcher:
         return {pair: self._matches[pair] for pair in pairs}
 
     def _extract(self, name: str) -> Features:
-        return sift_features(self._frame.images[name], count=self._config.features)
+        return sift_features(self._frame.images[name], count=self._config.features, mask=self._frame.masks.get(name))
 
     def _match(self, pair: tuple[str, str]) -> tuple[Floats, Floats]:
         config, empty = self._config, (np.empty((0, 2)), np.empty((0, 2)))

@@ -30,7 +30,8 @@ from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import rectilinear, undistort
-from structgstream.data.video import VIDEO_SUFFIXES, VideoSource, scan_videos, synchronised
+from structgstream.data.video import VideoSource, synchronised
+from structgstream.data.video_index import VIDEO_SUFFIXES, scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 
 log = logging.getLogger(__name__)
@@ -40,6 +41,7 @@ STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estima
 REDUCED = ("images_2", "images_4", "images_8")
 # In the order in which they are looked through; the last but one are those of the CMU Panoptic toolbox.
 ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "", *REDUCED)
+MASKS = "masks"  # of ``masks.py``: no camera and no frame
 
 Of = TypeVar("Of")
 Pictures = Mapping[str, Mapping[str, Path]]  # camera, then instant
@@ -115,10 +117,15 @@ def of_pictures(
         CalibrationError: ``files`` are of other cameras, or have other proportions.
     """
     _check(poses, files, calibration=calibration, root=root)
-    common = common_pictures({name: files[name] for name in sorted(poses, key=natural)}, where=path)
-    filmed = _filmed(poses, {name: picture_size(pictures[0]) for name, pictures in common.items()}, calibration)
+    held_out = set(calibration.held_out)
+    names = sorted(poses, key=natural)
+    common = common_pictures(
+        {name: files[name] for name in names}, where=path, training=[name for name in names if name not in held_out]
+    )
+    sizes = {name: picture_size(next(filter(None, pictures))) for name, pictures in common.files.items()}
+    filmed = _filmed(poses, sizes, calibration)
     rig = _rig(filmed, calibration, path)
-    return ImageSource(path.name, rig, PICTURE_FPS, common, calibration.points), filmed
+    return ImageSource(path.name, rig, PICTURE_FPS, common.files, calibration.points, common.instants), filmed
 
 
 def _files(root: Path, suffixes: Collection[str]) -> dict[str, Path]:
@@ -136,7 +143,7 @@ def _folders(root: Path) -> dict[str, dict[str, Path]]:
     """Folders below ``root`` that hold pictures: folder name, then file stem."""
     if not root.is_dir():
         return {}
-    folders = (folder for folder in root.iterdir() if folder.is_dir() and folder.name not in ROOTS)
+    folders = (folder for folder in root.iterdir() if folder.is_dir() and folder.name not in (*ROOTS, MASKS))
     return {folder.name: pictures for folder in folders if (pictures := _files(folder, PICTURE_SUFFIXES))}
 
 

@@ -14,8 +14,9 @@ from structgstream.frames import MultiViewFrame
 class FrameSource(Protocol):
     """A capture: a calibrated rig and its frames, in order.
 
-    ``frames(start)`` may be called again, each time from the given stream index; it opens its own decoders, and every
-    frame it yields has all cameras of the rig at the size the rig states. Problems are raised as ``CaptureError``.
+    ``frames(start)`` may be called again, each time from the given stream index; it opens its own decoders, and the
+    pictures it yields have the size the rig states. Cameras without a picture of an instant are absent from its frame,
+    whatever the frame that reading starts from. Problems are raised as ``CaptureError``.
     """
 
     @property
@@ -33,7 +34,7 @@ class FrameSource(Protocol):
         ...
 
     def __len__(self) -> int:
-        """Number of frames that every camera has."""
+        """Number of frames, from the one in which the last camera begins (``timeline.common_slots``)."""
         ...
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]: ...

@@ -1,14 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time steps that all cameras have."""
+"""The time steps of a capture, of which cameras may lack some."""
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError
 
 log = logging.getLogger(__name__)
+
+LEAST_CAMERAS = 2
+"""Training cameras that a frame needs: one picture does not say where things are."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A camera's clock: common time = ``offset_seconds`` + ``rate`` * time stamp in seconds."""
+
+    offset_seconds: float = 0.0
+    rate: float = 1.0
+
+    def common_seconds(self, stamps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Times of time stamps (seconds) on the common clock, seconds."""
+        return self.offset_seconds + self.rate * stamps
 
 
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:
@@ -17,51 +36,61 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts)
 
 
-def common_slots(slots: Mapping[str, Sequence[int]], *, where: str, label: Callable[[int], str]) -> range:
-    """The range of slots that every camera has.
+def common_slots(
+    slots: Mapping[str, Sequence[int]],
+    *,
+    where: str,
+    label: Callable[[int], str],
+    training: Collection[str] | None = None,
+) -> range:
+    """The range of slots of a capture, of which cameras may lack some.
 
-    Cameras that start late or end early shorten the range, with a logged warning for each end; a missing or duplicate
-    frame inside the range is an error.
+    It begins where the last camera begins, and ends where most cameras have ended: with the last slot that at least
+    half of the cameras, and two of those for training, reach. Cameras are absent from the slots in between that they
+    lack. What is left out, and which cameras are absent from when on, is told in the log, once for each camera.
 
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
         where: the capture, for messages.
         label: says which instant a slot is, for messages ("at 0.133 s", "000017").
+        training: names of the cameras that are not held out; None for all.
 
     Raises:
-        CaptureError: no camera pictures, no frames in common, or a missing or duplicate frame.
+        CaptureError: no camera pictures, no frames in common, or two frames of a camera for one slot.
     """
     for camera, own in slots.items():
         if not own:
             raise CaptureError(f"Camera {camera!r} of {where} has no frames; add them or remove the camera.")
-    first = max(own[0] for own in slots.values())
-    last = min(own[-1] for own in slots.values())
-    if first > last:
+    first, last = max(own[0] for own in slots.values()), _end(slots, training)
+    lost = next((camera for camera, own in slots.items() if not any(first <= slot <= last for slot in own)), None)
+    if lost is not None:
         late = next(camera for camera, own in slots.items() if own[0] == first)
-        early = next(camera for camera, own in slots.items() if own[-1] == last)
+        early = min(slots, key=lambda camera: slots[camera][-1]) if lost == late else lost
         raise CaptureError(
-            f"The cameras of {where} have no frames in common: {early!r} ends with {label(last)} "
+            f"The cameras of {where} have no frames in common: {early!r} ends with {label(slots[early][-1])} "
             f"and {late!r} starts with {label(first)}; check that all belong to one take and share one clock."
         )
-    for camera, own in slots.items():
-        inside = [slot for slot in own if first <= slot <= last]
-        repeated = next((a for a, b in pairwise(inside) if a == b), None)
+    inside = {camera: [slot for slot in own if first <= slot <= last] for camera, own in slots.items()}
+    for camera, own in inside.items():
+        repeated = next((a for a, b in pairwise(own) if a == b), None)
         if repeated is not None:
             raise CaptureError(
                 f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per "
                 "camera and instant at one common rate. Re-encode it at the rate of the others."
             )
-        if len(inside) != last - first + 1:
-            hole = next(slot for slot, has in zip(range(first, last + 1), [*inside, last + 1]) if slot != has)
-            raise CaptureError(
-                f"Camera {camera!r} of {where} has no frame for {label(hole)}, inside the capture; "
-                "restore the frame, or choose a range of frames without it."
-            )
-    _warn_of_cuts(slots, first, last, where=where, label=label)
+    _tell_cuts(slots, first, last, where=where, label=label)
+    _tell_absences(inside, first, last, where=where, label=label, training=training)
     return range(first, last + 1)
 
 
-def _warn_of_cuts(
+def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -> int:
+    """The last slot that half of the cameras, and two training cameras, reach."""
+    ends = sorted((own[-1] for own in slots.values()), reverse=True)
+    trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
+    return min(ends[(len(ends) - 1) // 2], trained[min(LEAST_CAMERAS, len(trained)) - 1])
+
+
+def _tell_cuts(
     slots: Mapping[str, Sequence[int]], first: int, last: int, *, where: str, label: Callable[[int], str]
 ) -> None:
     starts = min(own[0] for own in slots.values())
@@ -77,4 +106,40 @@ def _warn_of_cuts(
         log.warning(
             "%s: camera %r ends with %s; %d later frames of other cameras are left out",
             where, early, label(last), ends - last,
+        )  # fmt: skip
+
+
+def _tell_absences(
+    slots: Mapping[str, Sequence[int]],
+    first: int,
+    last: int,
+    *,
+    where: str,
+    label: Callable[[int], str],
+    training: Collection[str] | None,
+) -> None:
+    """Warnings of absent cameras; ``slots`` are those of the range."""
+    count = last - first + 1
+    for camera, own in slots.items():
+        lacking = sorted({*range(first, own[-1] + 1)}.difference(own))
+        if lacking:
+            log.warning(
+                "%s: camera %r lacks %d of %d frames, the first of them %s; it is absent there",
+                where, camera, len(lacking), count, label(lacking[0]),
+            )  # fmt: skip
+        if own[-1] < last:
+            log.warning(
+                "%s: camera %r ends with %s; it is absent from the %d frames after that",
+                where, camera, label(own[-1]), last - own[-1],
+            )  # fmt: skip
+    seeing = np.zeros(count, np.int64)
+    for camera, own in slots.items():
+        if training is None or camera in training:
+            seeing[np.array(own) - first] += 1
+    sparse = np.flatnonzero(seeing < LEAST_CAMERAS)
+    if len(sparse) and (training is None or len(training) >= LEAST_CAMERAS):
+        log.warning(
+            "%s: %d frames, the first of them %s, have pictures of fewer than %d training cameras, so a reconstruction "
+            "stops there; restore them, or choose frames before or after",
+            where, len(sparse), label(first + int(sparse[0])), LEAST_CAMERAS,
         )  # fmt: skip

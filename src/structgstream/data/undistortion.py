@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.lenses import Floats, LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig
@@ -158,6 +158,19 @@ class Undistortion:
             result[~self.shown] = 0
         return result
 
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """``[H, W]`` of the lens to ``[H, W]`` of the pinhole: a pixel counts if all that it is sampled from counts."""
+        cv2 = opencv()
+        result = np.ones((self.target.height, self.target.width), bool)
+        for number, level in enumerate(self._levels):
+            mask = reduced_mask(mask, self._size(number))
+            # Bicubic sampling reads from one pixel before to two behind.
+            whole = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1)
+            taken = cv2.remap(whole, *level.maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) > 0
+            used = np.ones(taken.shape, bool) if level.weights is None else level.weights > 0
+            result[level.rows, level.columns] &= taken | ~used
+        return result
+
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
         """Mask ``[H, W]`` of the pinhole's pixels that the lens shows; None if all."""
@@ -230,22 +243,29 @@ def _rays(camera: Camera) -> Floats:
 class UndistortedSource(WithRig):
     """The frames of ``source``, taken with the lenses of ``filmed``, undistorted to the pinholes of the rig ``other``.
 
-    Pictures of cameras without distortion whose size stays are passed through.
+    Pictures of cameras without distortion whose size stays are passed through. Pixels that a lens does not show do not
+    count.
     """
 
     filmed: Mapping[str, LensCamera]
     _plans: dict[str, Undistortion | None] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _masks: dict[str, tuple[NDArray[np.bool_], NDArray[np.bool_]]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        plans = [self._plan(name) for name in self.rig]
+        plans = {name: self._plan(name) for name in self.rig}
 
         def pinhole(plan: Undistortion | None, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
             return picture if plan is None else plan(picture)
 
-        with ThreadPoolExecutor(min(len(plans), os.cpu_count() or 1), "lenses") as pool:
+        with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "lenses") as pool:
             for frame in self.source.frames(start):
-                pictures = pool.map(pinhole, plans, [frame.images[name] for name in self.rig])
-                yield replace(frame, images=dict(zip(self.rig, pictures, strict=True)))
+                names = [name for name in self.rig if name in frame.images]
+                pictures = pool.map(pinhole, [plans[name] for name in names], [frame.images[name] for name in names])
+                images = dict(zip(names, pictures, strict=True))
+                masks = {name: mask for name in names if (mask := self._mask(name, frame.masks.get(name))) is not None}
+                yield replace(frame, images=images, masks=masks)
 
     def shown(self, name: str) -> NDArray[np.bool_] | None:
         """Mask ``[H, W]`` of a camera's pixels that its lens shows; None if all."""
@@ -260,6 +280,17 @@ class UndistortedSource(WithRig):
         """Whether the pictures of a camera are passed through."""
         filmed = self.filmed[name]
         return isinstance(filmed.lens, Pinhole) and torch.equal(filmed.camera.K, self.rig[name].K)
+
+    def _mask(self, name: str, given: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        """Which pixels of the pinhole count: those that the lens shows and that no mask of its picture leaves out."""
+        plan = self._plan(name)
+        if plan is None or given is None:
+            return given if plan is None else plan.shown
+        known = self._masks.get(name)
+        if known is None or known[0] is not given:  # Most masks are one for all frames.
+            mask = plan.mask(given)
+            known = self._masks[name] = (given, mask if plan.shown is None else mask & plan.shown)
+        return known[1]
 
     def _plan(self, name: str) -> Undistortion | None:
         if name not in self._plans:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.images import ImageSource, opencv
+from structgstream.data.images import ImageSource, opencv, reduced_mask
 from structgstream.data.source import FrameSource
 from structgstream.data.video import VideoSource
 from structgstream.errors import CaptureError, ConfigError
@@ -69,7 +69,8 @@ class Resized(WithRig):
                 name: cv2.resize(image, sizes[name], interpolation=cv2.INTER_AREA)
                 for name, image in frame.images.items()
             }
-            yield MultiViewFrame(frame.index, frame.pts_seconds, images)
+            masks = {name: reduced_mask(mask, sizes[name]) for name, mask in frame.masks.items()}
+            yield replace(frame, images=images, masks=masks)
 
 
 @runtime_checkable
@@ -94,7 +95,7 @@ class Section(SourceWrapper):
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         for frame in islice(self.source.frames(self.first + start), max(self.length - start, 0)):
             index = frame.index - self.first
-            yield MultiViewFrame(index, index / self.fps, frame.images)
+            yield replace(frame, index=index, pts_seconds=index / self.fps)
 
 
 def resized(source: FrameSource, scale: float) -> FrameSource:
@@ -114,6 +115,11 @@ def resized(source: FrameSource, scale: float) -> FrameSource:
             for name, camera in cameras.items()
         }
     )
+    return resized_to(source, rig)
+
+
+def resized_to(source: FrameSource, rig: CameraRig) -> FrameSource:
+    """The capture with pictures of the sizes of ``rig``, which has the same cameras."""
     return source.resized(rig) if isinstance(source, Resizable) else Resized(source, rig)
 
 
@@ -160,8 +166,8 @@ class EveryNthFrame(SourceWrapper):
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         for index in range(start, len(self)):
             # Seeking to each frame lets the source skip those between without decoding.
-            images = next(self.source.frames(index * self.step)).images
-            yield MultiViewFrame(index, index / self.fps, images)
+            frame = next(self.source.frames(index * self.step))
+            yield replace(frame, index=index, pts_seconds=index / self.fps)
 
 
 def every_nth_frame(source: FrameSource, step: int) -> FrameSource:

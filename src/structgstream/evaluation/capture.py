@@ -6,6 +6,7 @@ from pathlib import Path
 from structgstream.codec.packets import StreamHeader
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import resized, section
 
 
 def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) -> FrameSource:
@@ -20,8 +21,9 @@ def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) 
         CaptureError: the folder holds no capture, or less than the stream begins with.
     """
     start = int(header.metadata.get("start", 0))
-    whole = open_capture(folder, start=start)
+    whole = open_capture(folder)
     shared = [name for name in header.rig if name in whole.rig.cameras]
     scale = header.rig[shared[0]].width / whole.rig[shared[0]].width if shared else 1.0
-    wanted = len(whole) if frames is None else min(frames, len(whole))
-    return open_capture(folder, start=start, frames=wanted, scale=min(scale, 1.0))
+    left = len(whole) - start
+    wanted = left if frames is None else min(frames, left)
+    return section(resized(whole, min(scale, 1.0)), start=start, frames=wanted)

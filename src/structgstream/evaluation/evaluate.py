@@ -22,14 +22,16 @@ from structgstream.evaluation.environment import environment
 from structgstream.evaluation.facts import (
     check_same_frames,
     check_same_rig,
+    comparison_facts,
     scored_cameras,
     stream_facts,
     training_facts,
 )
 from structgstream.evaluation.flow import Flow
-from structgstream.evaluation.masks import changed_pixels
-from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors, ssim
+from structgstream.evaluation.masks import blackened, both, changed_pixels
+from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
 from structgstream.evaluation.optional_metrics import (
+    OF_WHOLE_PICTURES,
     ComparedFrame,
     MetricSelection,
     OptionalMetrics,
@@ -44,6 +46,7 @@ from structgstream.memory import PeakMeter
 from structgstream.scene.render import render, to_8bit_image
 
 Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -110,17 +113,25 @@ def evaluate(
         select_cameras(source, names).frames(), decoded(recording, backend.device)
     ):
         compared = []
-        for name in names:
-            compared.append(comparison.compare(name, scene, frame.images[name], index=info.index))
+        for name in frame.present(names):
+            truth, mask = frame.images[name], frame.masks.get(name)
+            compared.append(comparison.compare(name, scene, truth, index=info.index, mask=mask))
             if observer is not None:
                 observer(info.index, compared[-1])
         frames.append(_frame_scores(info, scene, compared, decode_seconds, dict((log or {}).get(info.index, {}))))
-    by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in names}
+    if recording.packets and not any(frame.cameras for frame in frames):
+        raise CaptureError(
+            f"No frame of the capture {source.name} has a picture of {' or '.join(names)}; name other cameras with "
+            "--cameras."
+        )
+    seen = [name for name in names if any(name in frame.cameras for frame in frames)]
+    by_camera = {name: mean_scores(frame.cameras[name] for frame in frames if name in frame.cameras) for name in seen}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
-    facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames])
+    facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames if frame.mean])
+    facts |= comparison_facts(frames, names, comparison.left_out)
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
     facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
-    facts |= {"metrics": metrics, "not_available": dict(optional_metrics.not_available) if optional_metrics else {}}
+    facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, facts["masked_share"])}
     facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
     peaks.end(EVALUATION)
     machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)
@@ -135,36 +146,66 @@ class _Comparison:
         views: cameras by name, scene units.
         backend: the compute back-end.
         optional_metrics: the metrics that take longer; None for none.
-        first: each camera's picture of frame 0.
+        first: each camera's first picture, and its mask.
         colors: each camera's colour response, fitted to frame 0.
-        before: each camera's last frame, for temporal metrics.
+        before: each camera's last frame and its number, for temporal metrics.
+        left_out: each camera's share of masked pixels, by frame.
     """
 
     views: Mapping[str, Camera]
     backend: Backend
     optional_metrics: OptionalMetrics | None
-    first: dict[str, Picture] = field(default_factory=dict)
+    first: dict[str, tuple[Picture, Mask | None]] = field(default_factory=dict)
     colors: dict[str, ChannelFit] = field(default_factory=dict)
-    before: dict[str, ComparedFrame] = field(default_factory=dict)
+    before: dict[str, tuple[int, ComparedFrame]] = field(default_factory=dict)
+    left_out: dict[str, list[float]] = field(default_factory=dict)
 
-    def compare(self, camera: str, scene: Drawable, truth: Picture, *, index: int) -> Compared:
-        """The rendering of frame ``index`` by ``camera``, and its scores."""
-        first = self.first.setdefault(camera, truth)
+    def compare(
+        self, camera: str, scene: Drawable, truth: Picture, *, index: int, mask: Mask | None = None
+    ) -> Compared:
+        """The rendering of frame ``index`` by ``camera``, and its scores over the pixels of ``mask``.
+
+        Both pictures are black in the other pixels, so that these do not reach into the scores of their neighbours.
+        """
+        truth = blackened(truth, mask)
+        first, first_mask = self.first.setdefault(camera, (truth, mask))
         picture, seconds = rendered(scene, self.views[camera], self.backend)
+        picture = blackened(picture, mask)
         if camera not in self.colors:
-            self.colors[camera] = channel_fit(picture, truth)
-        scores = score(picture, truth, first, backend=self.backend, seconds=seconds, color=self.colors[camera])
+            self.colors[camera] = channel_fit(*counting(mask, picture, truth))
+        scores = score(
+            picture,
+            truth,
+            first,
+            backend=self.backend,
+            seconds=seconds,
+            color=self.colors[camera],
+            mask=mask,
+            first_mask=first_mask,
+        )
+        self.left_out.setdefault(camera, []).append(0.0 if mask is None else 1.0 - float(mask.mean()))
         if self.optional_metrics is not None:
-            further, self.before[camera] = optional_scores(
+            number, last = self.before.get(camera, (-1, None))
+            further, now = optional_scores(
                 self.optional_metrics,
                 truth=truth,
                 picture=picture,
-                before=self.before.get(camera),
+                before=last if number == index - 1 else None,
                 camera=camera,
                 index=index,
+                mask=mask,
             )
+            self.before[camera] = index, now
             scores = replace(scores, **further)
         return Compared(camera, truth, picture, scores)
+
+
+def _not_available(metrics: OptionalMetrics | None, masked_share: Mapping[str, float]) -> dict[str, str]:
+    """Reasons for missing scores; those of what is missing altogether come before those of masks."""
+    if metrics is None:
+        return {}
+    reason = f"masks leave out pixels of {', '.join(masked_share)}, and this score compares whole pictures"
+    return (dict.fromkeys(OF_WHOLE_PICTURES, reason) if masked_share else {}) | dict(metrics.not_available)
 
 
 def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[PacketInfo, Drawable, float]]:
@@ -186,6 +227,8 @@ def score(
     backend: Backend,
     seconds: float = 0.0,
     color: ChannelFit | None = None,
+    mask: Mask | None = None,
+    first_mask: Mask | None = None,
 ) -> Scores:
     """The scores of a rendering against ``truth``.
 
@@ -196,6 +239,8 @@ def score(
         backend: computes SSIM.
         seconds: duration of the rendering.
         color: the camera's colour response, fitted to frame 0; None to leave out that score.
+        mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
+        first_mask: that of ``first``.
 
     Raises:
         CaptureError: the pictures have different sizes.
@@ -206,12 +251,16 @@ def score(
                 f"A rendering of {picture.shape[1]}x{picture.shape[0]} pixels cannot be scored against a {what} of "
                 f"{other.shape[1]}x{other.shape[0]}; open the capture at the scale of the reconstruction."
             )
-    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first)
+    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first, both(mask, first_mask))
+    ssim_score = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
+    if mask is not None:
+        errors, changed = errors[mask], changed[mask]
+        picture, truth = counting(mask, picture, truth)
     total, moving = int(errors.sum(dtype=np.int64)), int(np.count_nonzero(changed))
     in_changed = int(np.sum(errors, where=changed, dtype=np.int64))
     return Scores(
         psnr=decibels(mean_of_squares(total, errors.size)),
-        ssim=ssim(picture, truth, backend),
+        ssim=ssim_score,
         psnr_affine=psnr_affine(picture, truth),
         psnr_changed=decibels(mean_of_squares(in_changed, moving)) if moving else None,
         psnr_still=decibels(mean_of_squares(total - in_changed, errors.size - moving))
@@ -221,6 +270,11 @@ def score(
         render_seconds=seconds,
         psnr_camera_color=None if color is None else psnr_camera_color(picture, truth, color),
     )
+
+
+def counting(mask: Mask | None, *pictures: Picture) -> tuple[Picture, ...]:
+    """The pixels of each picture ``[H, W, 3]`` that count, as a picture ``[P, 1, 3]``; without a mask as they are."""
+    return pictures if mask is None else tuple(picture[mask][:, None] for picture in pictures)
 
 
 def rendered(scene: Drawable, camera: Camera, backend: Backend) -> tuple[Picture, float]:
@@ -233,7 +287,7 @@ def rendered(scene: Drawable, camera: Camera, backend: Backend) -> tuple[Picture
 def compared_frames(
     recording: Recording, source: FrameSource, *, backend: Backend, camera: str
 ) -> Iterator[tuple[Picture, Picture]]:
-    """Truth and rendering of one camera, frame by frame.
+    """Truth and rendering of one camera, frame by frame; both black in frames that the camera is absent from.
 
     Raises:
         CaptureError: see :func:`evaluate`.
@@ -241,7 +295,9 @@ def compared_frames(
     check_same_rig(recording.header, source, (camera,))
     view = recording.header.camera(camera)
     for frame, (_, scene) in zip(select_cameras(source, (camera,)).frames(), recording.scenes(0)):
-        yield frame.images[camera], rendered(to_device(scene, backend.device), view, backend)[0]
+        picture = rendered(to_device(scene, backend.device), view, backend)[0]
+        truth = frame.images.get(camera)
+        yield (np.zeros_like(picture), np.zeros_like(picture)) if truth is None else (truth, picture)
 
 
 def _frame_scores(
@@ -257,7 +313,7 @@ def _frame_scores(
         **counts(scene),
         decode_seconds=decode_seconds,
         cameras=scores,
-        mean=mean_scores(scores.values()),
+        mean=mean_scores(scores.values()) if scores else None,
         log=log,
     )
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Facts of a recording, its capture and its log, without rendering."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from structgstream.data.video import VideoSource
 from structgstream.data.wrappers import Section, SourceWrapper
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.recording import Recording
+from structgstream.evaluation.report import FrameScores
 
 
 def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -139,3 +140,23 @@ def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
         for stage, size in log.get("peak_memory_bytes_by_stage", {}).items():
             largest[f"{part}, {stage}"] = max(size, largest.get(f"{part}, {stage}", 0))
     return largest
+
+
+def comparison_facts(
+    frames: Sequence[FrameScores], names: Sequence[str], left_out: Mapping[str, Sequence[float]]
+) -> dict[str, Any]:
+    """What was not compared: frames that cameras are absent from, and mean shares of masked pixels; both by camera.
+
+    Cameras of which everything was compared are left out.
+
+    Args:
+        frames: the evaluated frames.
+        names: of the scored cameras.
+        left_out: camera name to the share of masked pixels in each of its pictures.
+    """
+    absent = {name: sum(name not in frame.cameras for frame in frames) for name in names}
+    masked = {name: float(np.mean(shares)) for name, shares in left_out.items()}
+    return {
+        "absent_frames": {name: count for name, count in absent.items() if count},
+        "masked_share": {name: share for name, share in masked.items() if share > 0.0},
+    }

@@ -99,9 +99,10 @@ def flip_map(one: FlipFeatures, other: FlipFeatures) -> Plane:
     return np.power(error, np.subtract(1.0, feature, out=feature), out=error)
 
 
-def flip_of(one: FlipFeatures, other: FlipFeatures) -> float:
-    """Mean of :func:`flip_map`; 0 for equal pictures, 1 at most."""
-    return float(flip_map(one, other).mean(dtype=np.float64))
+def flip_of(one: FlipFeatures, other: FlipFeatures, *, mask: NDArray[np.bool_] | None = None) -> float:
+    """Mean of :func:`flip_map` over the pixels of ``mask`` ``[H, W]``, or all; 0 for equal pictures, 1 at most."""
+    found = flip_map(one, other)
+    return float((found if mask is None else found[mask]).mean(dtype=np.float64))
 
 
 def _linear_levels() -> NDArray[np.float32]:

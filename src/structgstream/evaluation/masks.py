@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks of the pixels that changed since the first frame.
+"""Masks of the pixels that changed since the first frame, and of those that count.
 
 In typical captures nine of ten pixels are static, so a mean over all pixels hides the quality of moving parts. The
 masks are computed from the camera's pictures, never from renderings.
@@ -12,12 +12,28 @@ THRESHOLD = 0.1  # of full scale
 SMOOTHED, GROWN = 1, 3  # half widths in pixels: a 3x3 mean against noise, a 7x7 dilation to include edges
 
 
-def changed_pixels(truth: NDArray[np.uint8], first: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def blackened(picture: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """``picture`` ``[H, W, 3]``, black where the mask ``[H, W]`` is False; None leaves it as it is."""
+    return picture if mask is None else np.where(mask[..., None], picture, np.uint8(0))
+
+
+def both(mask: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Pixels of both masks; None for all."""
+    if mask is None or other is None:
+        return other if mask is None else mask
+    return mask & other
+
+
+def changed_pixels(
+    truth: NDArray[np.uint8], first: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> NDArray[np.bool_]:
     """Dilated mask ``[H, W]`` of the pixels that changed since the camera's first picture.
 
     The absolute difference of the two pictures ``[H, W, 3]``, averaged over channels and 3x3 pixels, is thresholded at
-    0.1 of full scale, and the mask dilated by 3 pixels.
+    0.1 of full scale, and the mask dilated by 3 pixels. Pixels outside of ``mask`` have not changed.
     """
+    if mask is not None:
+        return changed_pixels(blackened(truth, mask), blackened(first, mask)) & mask
     # Sums of integers: exact, and half the memory of floats.
     channels = np.abs(np.subtract(truth, first, dtype=np.int16))
     difference = channels[..., 0] + channels[..., 1] + channels[..., 2]

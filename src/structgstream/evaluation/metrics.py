@@ -94,6 +94,14 @@ def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | Non
     return float(product.mean())
 
 
+def masked_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float:
+    """Mean of :func:`ssim_map` over the pixels of ``mask`` ``[H, W]``, of pictures that are black in the others.
+
+    So a masked pixel is treated as one beyond the border.
+    """
+    return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
+
+
 def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:
     """Mean of :func:`ssim_map` over pixels and channels, as Gaussian splatting papers report it.
 

@@ -5,7 +5,7 @@ If a requirement is missing, the metric is None, and the reason and its remedy a
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,16 +16,19 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of, opencv
-from structgstream.evaluation.flow import Flow, dis_flow
+from structgstream.evaluation.flow import Flow, FlowField, dis_flow
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
-from structgstream.evaluation.masks import changed_pixels
+from structgstream.evaluation.masks import both, changed_pixels
 from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim
 from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
+from structgstream.flow import sampled
 
 Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 MetricSelection = Literal["all", "basic"]
 """All metrics, or only the cheap ones of two pictures: PSNR and its variants, and SSIM."""
 
+OF_WHOLE_PICTURES = ("ms_ssim", "lpips_alex", "lpips_vgg", "temporal_flip", "t_lpips")
 TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 
 
@@ -52,13 +55,14 @@ class OptionalMetrics:
 class ComparedFrame:
     """One camera's frame, kept for the temporal metrics of the next: pictures and their FLIP and LPIPS features.
 
-    Each pair is of truth and rendering, or None where that metric is not computed.
+    Each pair is of truth and rendering, or None where that metric is not computed. Only the pixels of ``mask`` count.
     """
 
     truth: Picture
     picture: Picture
     flip: tuple[FlipFeatures, FlipFeatures] | None
     lpips: tuple[Features, Features] | None
+    mask: Mask | None = None
 
 
 def load_optional_metrics(
@@ -120,8 +124,12 @@ def optional_scores(
     before: ComparedFrame | None,
     camera: str,
     index: int,
+    mask: Mask | None = None,
 ) -> tuple[dict[str, float | None], ComparedFrame]:
     """Further scores of one picture, by their names in ``Scores``, and the state for the next frame.
+
+    FLIP, flicker and the warping error are of the pixels of ``mask``. MS-SSIM, LPIPS and the differences of changes
+    compare whole pictures, so with a mask they are None.
 
     Args:
         optional_metrics: the available metrics.
@@ -130,28 +138,40 @@ def optional_scores(
         before: the same camera's previous frame; None for the first.
         camera: its name.
         index: number of the frame.
+        mask: ``[H, W]``, the pixels that count; None for all. Both pictures are black in the others.
     """
-    alex, vgg = (_usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))
-    scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth)}
+    alex, vgg = (None if mask is not None else _usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))
+    scores: dict[str, float | None] = {"ms_ssim": ms_ssim(picture, truth) if mask is None else None}
     seen = None if optional_metrics.flip is None else (optional_metrics.flip(truth), optional_metrics.flip(picture))
-    scores["flip"] = None if seen is None else flip_of(*seen)
+    scores["flip"] = None if seen is None else flip_of(*seen, mask=mask)
     features = None if alex is None else (alex.features(truth), alex.features(picture))
     scores["lpips_alex"] = None if alex is None or features is None else alex.distance(*features)
     scores["lpips_vgg"] = None if vgg is None else vgg.distance(vgg.features(truth), vgg.features(picture))
     if before is not None:
-        still = ~changed_pixels(truth, before.truth)
+        counting = both(mask, before.mask)
+        still = ~changed_pixels(truth, before.truth, counting)
+        still = still if counting is None else still & counting
         scores["flicker"] = flicker(picture, before.picture, still)
         scores["truth_flicker"] = flicker(truth, before.truth, still)
         if optional_metrics.flow is not None:
             field = optional_metrics.flow(before.truth, truth, camera, index)
+            field = _counting(field, mask, before.mask)
             scores["e_warp"] = warping_error(picture, before.picture, field)
-        if seen is not None and before.flip is not None:
+        if seen is not None and before.flip is not None and counting is None:
             true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))
             scores["temporal_flip"] = difference_of_change(rendered, true)
         if alex is not None and features is not None and before.lpips is not None:
             true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
             scores["t_lpips"] = difference_of_change(rendered, true)
-    return scores, ComparedFrame(truth, picture, seen, features)
+    return scores, ComparedFrame(truth, picture, seen, features, mask)
+
+
+def _counting(field: FlowField, mask: Mask | None, before: Mask | None) -> FlowField:
+    """The flow of pixels that count now and counted where they were."""
+    seen = field.seen if mask is None else field.seen & mask
+    if before is not None:
+        seen = seen & (sampled(before.astype(np.float32)[..., None].repeat(3, axis=2), field.offsets)[..., 0] > 0.999)
+    return replace(field, seen=seen)
 
 
 def _usable(optional_metrics: OptionalMetrics, name: str, picture: Picture) -> Lpips | None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison pictures of a result: truth, rendering, and their difference."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +62,8 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
     side = 110  # for the row labels
     bands = {name: _tiles(cells) for name, cells in pictures.items()}
     columns = sorted({index for cells in pictures.values() for index in cells})
-    heights = {name: tiles[0][0].shape[0] for name, tiles in bands.items()}
-    tile_width = max(tiles[0][0].shape[1] for tiles in bands.values())
+    heights = {name: next(iter(tiles.values()))[0].shape[0] for name, tiles in bands.items()}
+    tile_width = max(next(iter(tiles.values()))[0].shape[1] for tiles in bands.values())
     width = side + len(columns) * (tile_width + GAP) + MARGIN
     height = 2 * LABEL + MARGIN + sum(3 * (h + GAP) + LABEL // 2 for h in heights.values())
     figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
@@ -80,7 +80,8 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
     for name, tiles in bands.items():
         for row, caption in enumerate((f"camera {name}\ntruth", "rendering", f"difference x{DIFFERENCE_GAIN}")):
             label(side - 6, top + heights[name] / 2, caption, ha="right", fontsize=8, color="#444")
-            for number, cell in enumerate(tiles):
+            for index, cell in tiles.items():
+                number = columns.index(index)
                 x, y = side + number * (tile_width + GAP), height - top - cell[row].shape[0]
                 # figimage puts pixels on pixels; an axes would resample them.
                 figure.figimage(cell[row], x, y, origin="upper")
@@ -90,9 +91,9 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
     figure.savefig(path, dpi=100)
 
 
-def _tiles(cells: Mapping[int, tuple[Picture, Picture]]) -> Sequence[tuple[Picture, Picture, Picture]]:
-    tiles = []
-    for index in sorted(cells):
-        truth, picture = cells[index]
-        tiles.append((thumbnail(truth), thumbnail(picture), thumbnail(difference(picture, truth))))
-    return tiles
+def _tiles(cells: Mapping[int, tuple[Picture, Picture]]) -> Mapping[int, tuple[Picture, Picture, Picture]]:
+    """The three pictures of each frame, by its number."""
+    return {
+        index: (thumbnail(truth), thumbnail(picture), thumbnail(difference(picture, truth)))
+        for index, (truth, picture) in sorted(cells.items())
+    }

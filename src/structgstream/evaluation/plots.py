@@ -48,7 +48,8 @@ def write_plots(path: Path, report: Report, *, title: str) -> None:
 def _quality(axis: "Axes", report: Report) -> None:
     index = [frame.index for frame in report.frames]
     for number, name in enumerate(report.cameras):
-        values = [frame.cameras[name].psnr for frame in report.frames]
+        scores = [frame.cameras.get(name) for frame in report.frames]
+        values = [float("nan") if found is None else found.psnr for found in scores]
         axis.plot(
             index,
             values,
@@ -58,7 +59,7 @@ def _quality(axis: "Axes", report: Report) -> None:
             label=f"camera {name}",
         )
     if len(report.cameras) > 1:
-        axis.plot(index, [frame.mean.psnr for frame in report.frames], color=INK, linewidth=2, label="mean")
+        axis.plot(*zip(*_known(report, "psnr")), color=INK, linewidth=2, label="mean")
     if colored := _known(report, "psnr_camera_color"):
         axis.plot(*zip(*colored), color=INK, linewidth=1.5, linestyle="--", label="mean, frame 0's colour fit")
     if changed := _known(report, "psnr_changed"):
@@ -88,7 +89,7 @@ def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> Non
 
 def _known(report: Report, key: str) -> list[tuple[int, float]]:
     """Frame number and mean of a score, where there is one."""
-    values = [(frame.index, getattr(frame.mean, key)) for frame in report.frames]
+    values = [(frame.index, getattr(frame.mean, key)) for frame in report.frames if frame.mean is not None]
     return [(index, value) for index, value in values if value is not None]
 
 

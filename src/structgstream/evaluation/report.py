@@ -71,8 +71,8 @@ class FrameScores:
         anchors: anchors of the decoded scene.
         free: free Gaussians of the decoded scene; of another method's drawable all of them.
         decode_seconds: wall-clock time from the file to the scene on its device.
-        cameras: scores by camera name.
-        mean: their mean.
+        cameras: scores by camera name, without cameras that are absent from the frame.
+        mean: their mean; None without any.
         log: the frame's entry in the trainer's log; empty without a log.
     """
 
@@ -85,7 +85,7 @@ class FrameScores:
     free: int
     decode_seconds: float
     cameras: Mapping[str, Scores]
-    mean: Scores
+    mean: Scores | None
     log: Mapping[str, Any]
 
 
@@ -95,8 +95,8 @@ class Report:
 
     Args:
         frames: one entry for each frame, in order.
-        cameras: mean over frames, by camera name.
-        mean: mean over all frames and cameras.
+        cameras: mean over the frames with a picture, by camera name.
+        mean: mean over all pictures.
         stream: facts of the file, sizes and the course of PSNR over time (``stream_facts``).
         environment: the machine that rendered.
     """
@@ -136,7 +136,7 @@ def psnr_trend(psnrs: Sequence[float]) -> dict[str, float]:
 
 def drawing_facts(frames: Sequence[FrameScores]) -> dict[str, float]:
     """Renderings per second, without and with decoding of the frame before each rendering."""
-    drawing = float(np.mean([frame.mean.render_seconds for frame in frames]))
+    drawing = float(np.mean([frame.mean.render_seconds for frame in frames if frame.mean]))
     decoding = float(np.mean([frame.decode_seconds for frame in frames]))
     return {
         "decode_seconds": decoding,
@@ -157,7 +157,7 @@ def as_json(report: Report) -> dict[str, Any]:
     }
     frames = [
         {key: value for key, value in vars(frame).items() if key not in ("cameras", "mean", "log")}
-        | vars(frame.mean)
+        | ({entry.name: None for entry in fields(Scores)} if frame.mean is None else vars(frame.mean))
         | {"cameras": {name: vars(scores) for name, scores in frame.cameras.items()}}
         | {"log": dict(frame.log)}
         for frame in report.frames

@@ -47,6 +47,8 @@ def log_entry(report: "FrameReport") -> dict[str, Any]:
     """One line of the log: the frame's report as plain values, with seconds and memory of the whole frame beside it."""
     entry = asdict(report)
     del entry["peak_device_bytes"]
+    if not report.absent:
+        del entry["absent"]
     return entry | {
         "kind": report.kind.name.lower(),
         "train_psnr": report.train_psnr if math.isfinite(report.train_psnr) else None,

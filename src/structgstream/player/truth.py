@@ -43,7 +43,7 @@ class Truth:
         self.cached_bytes = 0
 
     def jpeg(self, camera: str, frame: int) -> bytes | None:
-        """A camera's picture as JPEG; None if there is no such camera or frame.
+        """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it.
 
         Raises:
             CaptureError: the picture cannot be read.
@@ -54,6 +54,8 @@ class Truth:
             picture = self._kept.get((camera, frame))
             if picture is None:
                 picture = self._encoded(camera, frame)
+                if picture is None:
+                    return None
                 self._keep((camera, frame), picture)
             self._kept.move_to_end((camera, frame))
             return picture
@@ -64,8 +66,10 @@ class Truth:
         while self.cached_bytes > self._most_bytes and len(self._kept) > 1:
             self.cached_bytes -= len(self._kept.popitem(last=False)[1])
 
-    def _encoded(self, camera: str, frame: int) -> bytes:
-        image = self._at(camera, frame).images[camera]
+    def _encoded(self, camera: str, frame: int) -> bytes | None:
+        image = self._at(camera, frame).images.get(camera)
+        if image is None:
+            return None
         cv2 = self._cv2
         # No chroma subsampling, because pixels are compared.
         sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]

@@ -80,11 +80,15 @@ def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, c
     small = view.reduced(scale)
     size = (small.camera.height, small.camera.width)
     seen = area_mean(picture.permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
-    off = residual(seen, small.image)
+    off = residual(seen, small.image, small.mask)
     limit = off.new_full((), config.residual_threshold)
+    if floor is not None and view.index not in floor.maps:  # Absent from frame 0: nothing here is known to be new.
+        nothing = torch.zeros_like(off, dtype=torch.bool)
+        return ViewResidual(View(small.index, small.camera, small.image, nothing), nothing, torch.zeros_like(off))
     if floor is not None:
         limit = limit + interpolate(floor.maps[view.index][None, None], size=size, mode="bilinear")[0, 0]
-    return ViewResidual(small, off > config.residual_threshold, box_mean((off > limit).float(), MASK_PIXELS))
+    missing = box_mean((off > limit).float(), MASK_PIXELS)
+    return ViewResidual(small, off > config.residual_threshold, missing if small.mask is None else missing * small.mask)
 
 
 def blamed_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, config: BirthConfig) -> Tensor:
@@ -158,6 +162,9 @@ def sweep_births(
 
 def _sweep_view(entry: ViewResidual, depths: Tensor, color: CameraColor) -> SweepView:
     camera, index = entry.view.camera, entry.view.index
+    if entry.view.mask is not None:
+        # Behind a depth of 0 nothing is visible, so a masked pixel neither supports nor contradicts a point.
+        depths = torch.where(entry.view.mask, depths, 0.0)
     colors = (entry.view.colors - color.biases[index]) / color.gains[index].clamp(min=1e-3)
     viewport = camera.viewport(colors)
     return SweepView(colors, entry.missing_share, depths, viewport.viewmat, viewport.K, camera.near)

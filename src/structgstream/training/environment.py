@@ -63,6 +63,8 @@ def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentC
         gains, biases = (value[view.index].cpu().double() for value in (color.gains, color.biases))
         colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
         weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.least_weight
+        if view.mask is not None:
+            weights = weights * view.mask.reshape(-1)[pixels].cpu()
         basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.degree)
         products += (basis * weights[:, None]).T @ basis
         targets += (basis * weights[:, None]).T @ (colors - 0.5)

@@ -12,7 +12,9 @@ CONTEXT_PIXELS = 16
 """Margin in pixels around the bounding box of the changed pixels, in which flow is estimated."""
 
 
-def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, int]) -> Tensor:
+def flow_map(
+    first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, int], *, mask: Tensor | None = None
+) -> Tensor:
     """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
 
     c is the share of consistent pixels (``flow.consistency_mask``), zero outside a box around
@@ -23,6 +25,7 @@ def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, in
         second: ``[H, W, 3]`` uint8.
         changed: ``[H, W]`` bool, where the two differ.
         size: h and w of the maps; flow is in pixels of the pictures.
+        mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
     """
     height, width = changed.shape
     maps = torch.zeros(height, width, 3)
@@ -33,6 +36,8 @@ def flow_map(first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, in
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
         forward, backward = search(earlier, later), search(later, earlier)
         confidence = consistency_mask(forward, backward).astype(np.float32)[..., None]
+        if mask is not None:
+            confidence *= mask[rows, columns, None].numpy(force=True)
         maps[rows, columns] = torch.from_numpy(np.concatenate([confidence, confidence * forward], axis=-1))
     small = area_mean(maps.permute(2, 0, 1)[None], size)
     return small[0].permute(1, 2, 0).to(first.device)

@@ -190,7 +190,7 @@ def fit_first_frame(
     """Reconstruct frame 0 from its training views.
 
     Args:
-        frame: the pictures; only those of ``rig.training`` are read.
+        frame: the pictures; only those of ``rig.training`` are read. The colour of an absent camera stays neutral.
         rig: cameras in normalised units.
         points: ``[P, 3]`` initial points in normalised units.
         config: of frame 0.
@@ -200,7 +200,7 @@ def fit_first_frame(
     """
     generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
     views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
-    template = _seeded(points, cameras=len(views), config=config, device=backend.device, generator=generator)
+    template = _seeded(points, cameras=len(rig.training), config=config, device=backend.device, generator=generator)
     parameters = Parameters.of(template, trained=_trained(config))
     adam = Adam(backend, parameters.values)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)

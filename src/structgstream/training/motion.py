@@ -4,7 +4,8 @@
 In each view a mover gets a vote if it covers enough changed pixels, in number and as a share of the pixels that it
 covers. Coverage is by blending weight, so occluded Gaussians get no votes. A pixel has changed if it differs from the
 previous picture, or if the rendering's residual there exceeds frame 0's: the residual also finds change that is too
-slow between two frames, and errors that earlier frames left behind.
+slow between two frames, and errors that earlier frames left behind. Cameras that were absent from the previous frame do
+not vote, and shares are of the views that can.
 """
 
 from collections.abc import Collection, Sequence
@@ -21,7 +22,7 @@ from structgstream.training.observation import MotionEvidence, flow_evidence, ga
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
 from structgstream.training.residuals import ResidualFloor, rendering_residual
 from structgstream.training.trust import ViewChange, is_scene_cut, trusted_views
-from structgstream.training.views import View, area_mean
+from structgstream.training.views import View, area_mean, mean_of_counting
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def detect_changes(
     config: MotionConfig,
     backend: Backend,
     flow_from: Collection[int] = (),
-) -> list[PictureChange]:
+) -> list[PictureChange | None]:
     """:func:`~structgstream.training.picture_change.detect_picture_changes` with the values of ``config``."""
     return detect_picture_changes(
         views,
@@ -138,7 +139,7 @@ def detect_changes(
 def segment_motion(
     scene: Scene,
     views: Sequence[View],
-    changes: Sequence[PictureChange],
+    changes: Sequence[PictureChange | None],
     *,
     config: MotionConfig,
     backend: Backend,
@@ -150,7 +151,7 @@ def segment_motion(
     Args:
         scene: of the previous frame.
         views: of this frame.
-        changes: of each view since the previous frame (:func:`detect_changes`).
+        changes: of each view since the previous frame (:func:`detect_changes`); a view without one does not vote.
         config: thresholds.
         backend: the compute back-end.
         older: the scene two frames before, for ``moved_ease``; None for none.
@@ -181,7 +182,7 @@ def segment_motion(
         trusted=tuple(trusted),
         scene_cut=is_scene_cut(view_changes),
     )
-    views_with_flow = [n for n in trusted if changes[n].flow is not None]
+    views_with_flow = [n for n in trusted if getattr(changes[n], "flow", None) is not None]
     if not views_with_flow or found.scene_cut:
         return found
     evidence = flow_evidence(
@@ -207,7 +208,7 @@ class _ViewEvidence:
 def _view_evidence(
     scene: Scene,
     view: View,
-    change: PictureChange,
+    change: PictureChange | None,
     *,
     config: MotionConfig,
     backend: Backend,
@@ -217,19 +218,25 @@ def _view_evidence(
     small = view.reduced(config.picture_scale)
     gaussians = scene.gaussians(small.camera, backend)
     size = (small.camera.height, small.camera.width)
+    counting = torch.ones(size).to(gaussians.means) if small.mask is None else small.mask.to(gaussians.means)
+    enlarged = view.camera.height * view.camera.width / counting.numel()
+    if change is None:
+        covered = enlarged * gather_maps(gaussians, scene, small.camera, counting[..., None], backend)
+        none = torch.zeros_like(ease, dtype=torch.bool)
+        return _ViewEvidence(none, none, covered[:, 0], covered, ViewChange(None, 0.0, identical=False))
     part = area_mean(change.changed[None, None].to(gaussians.means), size)
-    difference = float(part.mean())
+    difference = float(part.mean() if view.mask is None else mean_of_counting(change.changed.float(), view.mask))
     wrong_share = 0.0
-    if floor is not None and config.residual_threshold > 0.0:
+    if floor is not None and view.index in floor.maps and config.residual_threshold > 0.0:
         missing = rendering_residual(gaussians, small, scene, backend)
         wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
-        wrong_share = float(wrong.mean())
+        wrong_share = float(mean_of_counting(wrong, small.mask))
         part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
-    maps = [torch.ones_like(part[0, 0, :, :, None]), part[0, 0, :, :, None]]
+    maps = [counting[..., None], (part[0, 0] * counting)[..., None]]
     if change.flow is not None:
         maps.append(change.flow)
     sums = gather_maps(gaussians, scene, small.camera, torch.cat(maps, dim=-1), backend)
-    sums *= view.camera.height * view.camera.width / part.numel()
+    sums *= enlarged
     total, inside = sum_by_mover(sums[:, :2], scene).unbind(1)
     return _ViewEvidence(
         seen=total > config.least_pixels,

@@ -138,11 +138,13 @@ def residual_motion(
             gaussians = folded.gaussians(view.camera, backend)
             image = apply_camera_color(focus.picture, moving.camera_color, view.index)
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-            inside = focus.tiles.pixels()
+            inside = focus.tiles.pixels() if view.mask is None else focus.tiles.pixels() & view.mask
             # Outside the tiles nothing was drawn: there the picture replaces the rendering.
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)
-            maps = [flow_map(picture, view.image, inside, size), torch.ones(*size, 1).to(image), small.colors]
+            counting = torch.ones(size) if small.mask is None else small.mask
+            flow = flow_map(picture, view.image, inside, size, mask=view.mask)
+            maps = [flow, counting[..., None].to(image), small.colors]
             found = gather_maps(gaussians, folded, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
             found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
             sums.append(sum_by_mover(found, folded))

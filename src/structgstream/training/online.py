@@ -126,7 +126,7 @@ def fit_next_frame(
 
     Args:
         scene: the initial scene (Note [Closed loop]).
-        frame: the pictures; only those of ``rig.training`` are read.
+        frame: the pictures; only those of ``rig.training`` are read, of which some may be absent.
         rig: cameras in normalised units.
         config: of online frames.
         backend: the compute back-end.
@@ -273,7 +273,7 @@ def _fit_moving_part(
     fit: _FrameFit,
     scene: Scene,
     views: list[View],
-    changes: list[PictureChange],
+    changes: list[PictureChange | None],
     *,
     older: Scene | None,
     floor: ResidualFloor | None,

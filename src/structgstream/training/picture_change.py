@@ -12,7 +12,7 @@ from torch import Tensor
 
 from structgstream.kernels.backend import Backend
 from structgstream.training.flow_maps import flow_map
-from structgstream.training.views import View
+from structgstream.training.views import View, blackened
 
 
 @dataclass(frozen=True)
@@ -40,25 +40,43 @@ def detect_picture_changes(
     scale: float,
     backend: Backend,
     flow_from: Collection[int] = (),
-) -> list[PictureChange]:
-    """Change of each of ``views`` since the picture of the same camera in ``before``.
+) -> list[PictureChange | None]:
+    """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
+
+    A camera that was absent is not compared with an older picture: what changed since then is in the scene already.
+    Pixels that either picture leaves out have not changed, and their flow has no confidence.
 
     Args:
         views: of a frame.
-        before: of the previous frame, in the same order.
+        before: of the previous frame.
         threshold: mean absolute difference of 3 x 3 pixels, in 0 ... 1, above which a pixel has changed.
         reach_pixels: changed pixels are dilated by this many pixels.
         scale: of the maps of flow, relative to the pictures.
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
     """
-    changes = []
+    changes: list[PictureChange | None] = []
+    earlier = {last.index: last for last in before}
     with torch.no_grad():
-        for view, last in zip(views, before, strict=True):
-            changed = backend.changed_pixels(last.image, view.image, threshold=threshold, reach_pixels=reach_pixels)
+        for view in views:
+            last = earlier.get(view.index)
+            if last is None:
+                changes.append(None)
+                continue
+            both = _both(view.mask, last.mask)
+            then, now = blackened(last.image, both), blackened(view.image, both)
+            changed = backend.changed_pixels(then, now, threshold=threshold, reach_pixels=reach_pixels)
+            changed = changed if both is None else changed & both
             small, flow = view.reduced(scale).camera, None
             if view.index in flow_from:
-                maps = flow_map(last.image, view.image, changed, (small.height, small.width))
+                maps = flow_map(then, now, changed, (small.height, small.width), mask=both)
                 flow = torch.cat([maps, last.reduced(scale).colors], dim=-1)
-            changes.append(PictureChange(changed, torch.equal(last.image, view.image), flow))
+            changes.append(PictureChange(changed, torch.equal(then, now), flow))
     return changes
+
+
+def _both(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Pixels of both masks; None for all."""
+    if mask is None or other is None:
+        return other if mask is None else mask
+    return mask & other

@@ -17,12 +17,13 @@ class FramePictures:
     """The training views of a frame.
 
     Args:
-        views: in rig order.
-        changes: of each of them since the previous frame; None without motion segmentation.
+        views: in rig order, without absent cameras.
+        changes: of each of them since the previous frame, None for a camera that was absent from that; None without
+            motion segmentation.
     """
 
     views: list[View]
-    changes: list[PictureChange] | None
+    changes: list[PictureChange | None] | None
 
 
 def pictures_of(
@@ -36,6 +37,8 @@ def pictures_of(
 ) -> FramePictures:
     """The pictures of ``frame``, and their changes since the frame ``before`` (None: without motion segmentation).
 
+    With fewer cameras in both frames than a mover needs votes there is no motion segmentation: everything is trained.
+
     Raises:
         MissingExtraError: flow is needed and OpenCV is not installed.
     """
@@ -43,6 +46,10 @@ def pictures_of(
     full = motion.full_every_frames > 0 and frame.index % motion.full_every_frames == 0
     if before is None or not motion.enabled or full:
         return FramePictures(views, None)
-    flow_from = flow_views(views, frame.index, start)
     earlier = training_views(before, rig, backend.device)
+    known = {view.index for view in earlier}
+    compared = [view for view in views if view.index in known]
+    if len(compared) < min(motion.least_views, len(rig.training)):
+        return FramePictures(views, None)
+    flow_from = flow_views(compared, frame.index, start)
     return FramePictures(views, detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from))

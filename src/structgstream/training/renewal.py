@@ -19,7 +19,7 @@ from structgstream.training.observation import gather_maps
 from structgstream.training.partition import Partition
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.residuals import ResidualFloor, apply_camera_color
-from structgstream.training.views import View
+from structgstream.training.views import View, mean_of_counting
 
 LEAST_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
@@ -82,7 +82,8 @@ def renew_free_gaussians(
             _view_residual(moving, view, focuses, backend, floor=floor, config=config) if drawn else entry
             for entry, view, drawn in zip(missing, views, again, strict=True)
         ]
-        share = float(torch.stack([(entry.missing_share > 0.5).float().mean() for entry in missing]).mean())
+        shares = [mean_of_counting((entry.missing_share > 0.5).float(), entry.view.mask) for entry in missing]
+        share = float(torch.stack(shares).mean())
         if share > config.most_missing_share:
             return replace(none, missing_share=share, refused=True)
         kept = everything
@@ -154,7 +155,9 @@ def _blamed_mask(
         focus, camera = focuses.get(entry.view.index), entry.view.camera
         if focus is None:
             continue
-        maps = torch.stack([torch.ones_like(entry.missing_share), entry.wrong.to(entry.missing_share)], dim=-1)
+        wrong_pixels = entry.wrong.to(entry.missing_share)
+        counting = torch.ones_like(wrong_pixels) if entry.view.mask is None else entry.view.mask.to(wrong_pixels)
+        maps = torch.stack([counting, wrong_pixels], dim=-1)
         sums = gather_maps(moving.gaussians(camera, backend), moving, camera, maps, backend, still=focus.still)
         of_free = sums[len(sums) - len(moving.free) :]
         coverage.append(of_free[:, 0])

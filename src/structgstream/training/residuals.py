@@ -16,7 +16,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.views import View
+from structgstream.training.views import View, blackened
 
 SMOOTHED_PIXELS = 3
 FLOOR_PIXELS = 5
@@ -29,7 +29,8 @@ class ResidualFloor:
 
     Args:
         scale: size of the maps relative to the pictures.
-        maps: by view index ``[h, w]``, maximum residual over the 5 x 5 pixels around each, in 0 ... 1.
+        maps: by view index ``[h, w]``, maximum residual over the 5 x 5 pixels around each, in 0 ... 1, and 1 where a
+            mask left a pixel out. Cameras that were absent from frame 0 have none: their residuals indicate nothing.
     """
 
     scale: float
@@ -46,16 +47,17 @@ def box_mean(values: Tensor, pixels: int) -> Tensor:
     return avg_pool2d(values[None, None], pixels, stride=1, padding=pixels // 2, count_include_pad=False)[0, 0]
 
 
-def residual(picture: Tensor, image: Tensor) -> Tensor:
+def residual(picture: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean absolute difference ``[H, W]`` of ``picture`` ``[H, W, 3]`` in 0 ... 1 to ``image`` (uint8), over channels
-    and 3 x 3 pixels."""
-    return box_mean((picture - image.to(picture) / 255.0).abs().mean(-1), SMOOTHED_PIXELS)
+    and 3 x 3 pixels; 0 where ``mask`` is False, where ``image`` is black."""
+    found = box_mean((blackened(picture, mask) - image.to(picture) / 255.0).abs().mean(-1), SMOOTHED_PIXELS)
+    return found if mask is None else found * mask
 
 
 def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
     """The :func:`residual` of drawing ``gaussians``, those of ``scene``, for ``view``."""
     rendering = draw(gaussians, view.camera, backend, background=scene.background(view.camera))
-    return residual(apply_camera_color(rendering.image, scene.camera_color, view.index), view.image)
+    return residual(apply_camera_color(rendering.image, scene.camera_color, view.index), view.image, view.mask)
 
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
@@ -66,5 +68,6 @@ def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend
         for view in views:
             small = view.reduced(scale)
             found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
-            maps[view.index] = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
+            floor = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
+            maps[view.index] = floor if small.mask is None else torch.where(small.mask, floor, 1.0)
     return ResidualFloor(scale, maps)

@@ -17,7 +17,7 @@ from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene
 from structgstream.training.losses import LossWeights, offset_distance, volume
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import View
+from structgstream.training.views import View, blackened
 
 LossT = TypeVar("LossT", bound="Loss")
 
@@ -65,13 +65,16 @@ class ViewLoss(Loss):
         return self.rendering.image * self.gains + self.biases
 
     def squared_error(self, view: View) -> Tensor:
-        """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels."""
+        """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels that count."""
         with torch.no_grad():
             squares = (self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square()
-            if self.focus is None:
+            drawn = None if self.focus is None else self.focus.tiles.pixels()
+            if drawn is None and view.mask is None:
                 return squares.mean()
-            inside = self.focus.tiles.pixels()[..., None].to(squares)
-            return (squares * inside).sum() / (3.0 * inside.sum())
+            masks = [mask for mask in (drawn, view.mask) if mask is not None]
+            inside = torch.stack(masks).all(0) if len(masks) > 1 else masks[0]
+            inside = inside[..., None].to(squares)
+            return (squares * inside).sum() / (3.0 * inside.sum().clamp(min=1.0))
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,9 @@ def picture_loss(
     with watch.stage("loss"):
         image, tiles = rendering.image, None if focus is None else focus.tiles
         gains, biases = color.gains[view.index], color.biases[view.index]
-        if gains.requires_grad:
+        if view.mask is not None:  # Note [Masked pixels]
+            l1, ssim = backend.l1_ssim(blackened(image * gains + biases, view.mask), view.image, tiles=tiles)
+        elif gains.requires_grad:
             l1, ssim = backend.l1_ssim(image * gains + biases, view.image, tiles=tiles)
         else:  # The loss kernel applies a constant correction at no cost.
             l1, ssim = backend.l1_ssim(image, view.image, gains=gains, biases=biases, tiles=tiles)

@@ -24,23 +24,23 @@ class ViewChange:
     """Change of one view's picture.
 
     Args:
-        changed_share: share of its pixels that changed since the last frame.
+        changed_share: share of its pixels that changed since the last frame; None if the camera was absent from that.
         wrong_share: share of its pixels with a residual above frame 0's.
         identical: whether it equals the last picture bit for bit.
     """
 
-    changed_share: float
+    changed_share: float | None
     wrong_share: float
     identical: bool
 
 
 def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
     """For each view whether it is no outlier. If fewer than two views are left, none counts as an outlier."""
-    usual_change, usual_wrong = median(c.changed_share for c in changes), median(c.wrong_share for c in changes)
+    usual_change, usual_wrong = _usual_change(changes), median(c.wrong_share for c in changes)
     few_same = 4 * sum(c.identical for c in changes) <= len(changes)
     found = [
         not (
-            (c.changed_share > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
+            ((c.changed_share or 0.0) > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
             or (c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE)
             or (c.identical and few_same and usual_change > FROZEN_SHARE)
         )
@@ -51,4 +51,9 @@ def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
 
 def is_scene_cut(changes: Sequence[ViewChange]) -> bool:
     """Whether most pictures changed everywhere, so that motion cannot be segmented."""
-    return median(c.changed_share for c in changes) > WHOLE_PICTURE_SHARE
+    return _usual_change(changes) > WHOLE_PICTURE_SHARE
+
+
+def _usual_change(changes: Sequence[ViewChange]) -> float:
+    """Median share of changed pixels, over the views that know theirs."""
+    return median(c.changed_share for c in changes if c.changed_share is not None)

@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training pictures of one frame as tensors, and their random order in training."""
+"""The training pictures of one frame as tensors, and their random order in training.
+
+Note [Masked pixels]
+~~~~~~~~~~~~~~~~~~~~
+A pixel that a mask leaves out is treated as if it lay outside of the picture: both pictures are black there when they
+are compared, as SSIM's window sees zeros beyond the border. So neither what the camera nor what the scene shows there
+has any influence, on the loss or on its gradient. Losses stay means over all pixels, in which masked ones count as
+equal, as tiles that are not drawn do: the weight of a pixel against prices and regularisers, and the thresholds of
+view-space gradients, then mean the same with and without a mask. Scores, shares and PSNR are over the pixels that
+count. A pixel of a reduced picture counts if all of its pixels do.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,12 +29,14 @@ class View:
     Args:
         index: row of the camera in the rig's training cameras (and so in the colour correction).
         camera: in scene units.
-        image: ``[H, W, 3]`` uint8.
+        image: ``[H, W, 3]`` uint8, black where ``mask`` is False.
+        mask: ``[H, W]`` bool, the pixels that count (Note [Masked pixels]); None if all do.
     """
 
     index: int
     camera: Camera
     image: Tensor
+    mask: Tensor | None = None
     _reduced: "dict[float, View]" = field(default_factory=dict, repr=False, compare=False)
 
     def reduced(self, scale: float) -> "View":
@@ -42,8 +54,27 @@ class View:
 
 
 def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) -> list[View]:
-    """The frame's training views in rig order; held-out pictures are not read."""
-    return [View(i, rig[name], torch.from_numpy(frame.images[name]).to(device)) for i, name in enumerate(rig.training)]
+    """The frame's training views in rig order, without absent cameras; held-out pictures are not read."""
+    rows = {name: i for i, name in enumerate(rig.training)}
+    return [_view(rows[name], name, frame, rig[name], device) for name in frame.present(rig.training)]
+
+
+def _view(index: int, name: str, frame: MultiViewFrame, camera: Camera, device: torch.device) -> View:
+    image, mask = torch.from_numpy(frame.images[name]).to(device), frame.masks.get(name)
+    if mask is None or mask.all():
+        return View(index, camera, image)
+    counts = torch.from_numpy(mask).to(device)
+    return View(index, camera, blackened(image, counts), counts)
+
+
+def blackened(picture: Tensor, mask: Tensor | None) -> Tensor:
+    """``picture`` ``[H, W, 3]``, black where the mask ``[H, W]`` is False; None leaves it as it is."""
+    return picture if mask is None else torch.where(mask[..., None], picture, 0)
+
+
+def mean_of_counting(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean ``[]`` of ``values`` ``[H, W]`` over the pixels of the mask, outside of which they are 0."""
+    return values.mean() if mask is None else values.sum() / mask.sum().clamp(min=1)
 
 
 def reduced(view: View, scale: float) -> View:
@@ -52,7 +83,11 @@ def reduced(view: View, scale: float) -> View:
     pixels = view.image.permute(2, 0, 1)[None].float()
     small = area_mean(pixels, (height, width))
     image = small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
-    return View(view.index, view.camera.resized(width, height), image)
+    camera = view.camera.resized(width, height)
+    if view.mask is None:
+        return View(view.index, camera, image)
+    mask = area_mean(view.mask[None, None].float(), (height, width))[0, 0] > 1.0 - 1e-4
+    return View(view.index, camera, blackened(image, mask), mask)
 
 
 def area_mean(planes: Tensor, size: tuple[int, int]) -> Tensor:

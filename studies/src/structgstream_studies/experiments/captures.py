@@ -83,6 +83,8 @@ def fingerprint(source: "FrameSource") -> str:
         digest.update(camera.viewmat.numpy().tobytes() + camera.K.numpy().tobytes())
     for index in sorted({0, len(source) - 1}):
         frame = next(source.frames(index))
-        for name in source.rig:
-            digest.update(frame.images[name].tobytes())
+        for name, image in frame.images.items():
+            digest.update(image.tobytes())
+            if name in frame.masks:
+                digest.update(frame.masks[name].tobytes())
     return digest.hexdigest()

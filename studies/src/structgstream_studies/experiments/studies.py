@@ -261,7 +261,7 @@ def _write_details(
 
     def spread(index: int) -> float:
         values = [found.frames[index // run.capture.every]["psnr"] for run, found in results.items()]
-        return max(values) - min(values)
+        return -1.0 if None in values else max(values) - min(values)  # absent cameras have no score
 
     index = max(range(0, len(source), every), key=spread)
     truth = next(select_cameras(source, (camera,)).frames(index)).images[camera]

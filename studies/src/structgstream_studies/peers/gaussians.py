@@ -93,7 +93,10 @@ def point_colors(points: Tensor, views: list[View]) -> Tensor:
         size = pixels.new_tensor([camera.width, camera.height])
         shown = (local[:, 2] > camera.near) & (pixels >= 0).all(1) & (pixels < size).all(1)
         columns, rows = pixels[shown].long().unbind(1)
-        seen[row, shown] = view.image[rows, columns].to(points) / 255.0
+        found = view.image[rows, columns].to(points) / 255.0
+        if view.mask is not None:
+            found[~view.mask[rows, columns]] = float("nan")
+        seen[row, shown] = found
     return seen.nanmedian(dim=0).values.nan_to_num(0.5)
 
 
@@ -152,7 +155,7 @@ def fit_gaussians(
     """Reconstruct one frame from its training views.
 
     Args:
-        frame: the pictures; only those of ``rig.training`` are read.
+        frame: the pictures; only those of ``rig.training`` are read. The colour of an absent camera stays neutral.
         rig: cameras in normalised units.
         points: ``[P, 3]`` initial points in normalised units.
         config: the schedule.
@@ -167,7 +170,7 @@ def fit_gaussians(
     views = training_views(frame, rig, backend.device)
     with watch.stage("initialise"):
         start = initial_gaussians(points, views, config)
-        identity = CameraColor.identity(len(views), start.means)
+        identity = CameraColor.identity(len(rig.training), start.means)
         camera = {p.name: getattr(identity, p.attribute) for p in CAMERA} if config.camera_color else {}
         samples = coarse_to_fine(
             views,

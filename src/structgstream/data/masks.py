@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Masks beside a capture of any layout: what is black in them does not count.
+
+::
+
+    masks/CAMERA.png          for all frames
+    masks/CAMERA/FRAME.png    for one; FRAME is the name of the frame's pictures, of videos its number from 0
+
+They have the size of the pictures or videos as stored (before undistortion). Where a camera has both, both hold.
+"""
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import CameraRig
+from structgstream.data.calibration import listed
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
+from structgstream.data.source import FrameSource
+from structgstream.data.timeline import natural
+from structgstream.data.undistortion import UndistortedSource
+from structgstream.data.wrappers import SourceWrapper, resized_to
+from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame
+
+log = logging.getLogger(__name__)
+
+FOLDER = "masks"
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CameraMasks:
+    """The mask files of one camera.
+
+    Args:
+        size: width and height of its stored pictures.
+        always: for all frames, or None.
+        frames: by frame number, for one.
+    """
+
+    size: tuple[int, int]
+    always: Path | None
+    frames: Mapping[int, Path]
+
+
+@dataclass(frozen=True)
+class MaskedSource(SourceWrapper):
+    """The frames of ``source`` with masks, resampled where its pictures are."""
+
+    files: Mapping[str, CameraMasks]
+    _always: dict[str, Mask | None] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        """The frames from stream index ``start``.
+
+        Raises:
+            CaptureError: a mask cannot be read, or has another size than its camera's pictures.
+        """
+        with ThreadPoolExecutor(min(len(self.files), os.cpu_count() or 1) or 1, "masks") as pool:
+            for frame in self.source.frames(start):
+                names = [name for name in frame.images if name in self.files]
+                masks = pool.map(self._mask, names, [frame.index] * len(names))
+                counting = {name: mask for name, mask in zip(names, masks, strict=True) if mask is not None}
+                yield replace(frame, masks={**frame.masks, **counting})
+
+    def resized(self, rig: CameraRig) -> "MaskedSource":
+        """The same frames at the sizes of ``rig``."""
+        return replace(self, source=resized_to(self.source, rig))
+
+    def _mask(self, name: str, index: int) -> Mask | None:
+        """The mask of a camera in a frame, at the size of its pictures; None if everything counts."""
+        files = self.files[name]
+        if name not in self._always:
+            self._always[name] = None if files.always is None else self._read(files.always, name)
+        always, file = self._always[name], files.frames.get(index)
+        if file is None:
+            return always
+        own = self._read(file, name)
+        return own if always is None else always if own is None else always & own
+
+    def _read(self, file: Path, name: str) -> Mask | None:
+        camera = self.rig[name]
+        mask = reduced_mask(read_mask(file, size=self.files[name].size, camera=name), (camera.width, camera.height))
+        return None if mask.all() else mask
+
+
+def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
+    """The mask ``[H, W]`` of a file: True where it is not black.
+
+    Raises:
+        CaptureError: it cannot be read, or has another size than ``size`` (width, height).
+    """
+    cv2 = opencv()
+    try:
+        data = np.frombuffer(file.read_bytes(), np.uint8)
+    except OSError as error:
+        raise CaptureError(f"The mask {file} cannot be read ({error.strerror}); restore it.") from None
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    if picture is None:
+        raise CaptureError(f"The mask {file} cannot be decoded ({len(data)} bytes); write it again as PNG.")
+    if picture.shape[1::-1] != size:
+        raise CaptureError(
+            f"The mask {file} has {picture.shape[1]}x{picture.shape[0]} pixels, the pictures of camera {camera!r} have "
+            f"{size[0]}x{size[1]}; a mask is of the stored picture's size."
+        )
+    return picture.any(axis=2)
+
+
+def with_masks(source: FrameSource, folder: Path) -> FrameSource:
+    """The capture with the masks of ``folder``; the source itself when there are none.
+
+    Args:
+        source: the whole capture, as its layout is read.
+        folder: its folder ``masks``.
+
+    Raises:
+        CaptureError: a mask of an unknown camera, of no frame, of another size, or in a lossy format.
+    """
+    found = sorted(folder.iterdir(), key=lambda entry: natural(entry.name)) if folder.is_dir() else []
+    entries = [entry for entry in found if entry.is_dir() or _is_mask(entry)]
+    if not entries:
+        return source
+    names = {entry.name if entry.is_dir() else entry.stem: entry for entry in entries}
+    for name, entry in names.items():
+        if name not in source.rig.cameras:
+            raise CaptureError(
+                f"{entry} is a mask of camera {name!r}, which the capture {source.name} does not have; its cameras are "
+                f"{', '.join(source.rig)}."
+            )
+
+    def masked(stored: FrameSource) -> FrameSource:
+        return MaskedSource(stored, {name: _files(folder, name, stored) for name in stored.rig if name in names})
+
+    log.warning("%s: what is black in the masks of %s does not count", source.name, listed(names))
+    return _below_lenses(source, masked)
+
+
+def _below_lenses(source: FrameSource, wrap: Callable[[FrameSource], FrameSource]) -> FrameSource:
+    """``source`` with the stored pictures, which are undistorted where they have a lens, wrapped."""
+    if isinstance(source, UndistortedSource):
+        return replace(source, source=wrap(source.source))
+    if isinstance(source, SourceWrapper) and _has_lenses(source.source):
+        return replace(source, source=_below_lenses(source.source, wrap))
+    return wrap(source)
+
+
+def _has_lenses(source: FrameSource) -> bool:
+    return isinstance(source, UndistortedSource) or (isinstance(source, SourceWrapper) and _has_lenses(source.source))
+
+
+def _is_mask(file: Path) -> bool:
+    suffix = file.suffix.lower()
+    if suffix in PICTURE_SUFFIXES - {".png"}:
+        raise CaptureError(f"The mask {file} is no PNG; write it as one, because other formats change what is black.")
+    return suffix == ".png"
+
+
+def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
+    """The mask files of a camera, the first of which is checked."""
+    always = folder / f"{name}.png"
+    own = folder / name
+    files = {file.stem: file for file in own.iterdir() if _is_mask(file)} if own.is_dir() else {}
+    instants = source.instants if isinstance(source, ImageSource) else ()
+    numbers = {instant: index for index, instant in enumerate(instants or map(str, range(len(source))))}
+    if not instants:
+        files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
+    frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
+    if files and not frames:
+        expected = f"{instants[0]}.png" if instants else "000000.png, the frame's number from 0"
+        raise CaptureError(
+            f"None of the masks in {own} is of a frame of the capture, such as {next(iter(files.values())).name}; "
+            f"expected names such as {expected}."
+        )
+    size = (source.rig[name].width, source.rig[name].height)
+    masks = CameraMasks(size, always if always.is_file() else None, frames)
+    for file in filter(None, (masks.always, next(iter(frames.values()), None))):
+        read_mask(file, size=size, camera=name)
+    return masks

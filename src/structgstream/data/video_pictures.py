@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decodes the pictures of a video at given time stamps.
+
+Note [Damaged videos]
+~~~~~~~~~~~~~~~~~~~~~
+A frame counts as decodable if all frames from the key frame before it on are. So what is lost does not depend on where
+reading starts, and a resumed stream sees what the first run saw. After a damage reading goes on at the next key frame.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.video_index import VideoTrack, load_av, open_video
+
+if TYPE_CHECKING:
+    from av.video.frame import VideoFrame
+    from av.video.reformatter import VideoReformatter
+
+Picture = NDArray[np.uint8]
+Damage = Callable[[int, int | None, str], None]
+"""Called with the time stamps, in ticks, of the first frame that is lost and of the next key frame, and the reason."""
+
+# Values of libswscale and of ISO/IEC 23091-2 that the bindings name differently from version to version.
+AREA, BICUBIC, FULL_CHROMA, ACCURATE_ROUNDING = 0x20, 0x4, 0x2000, 0x40000
+BT709, BT601, FULL_RANGE, LIMITED_RANGE = 1, 5, 2, 1
+MATRICES = {1: BT709, 4: 4, 5: BT601, 6: BT601, 7: 7, 9: 9, 10: 9}
+
+
+def pictures_at(
+    track: VideoTrack, stamps: Sequence[int | None], *, size: tuple[int, int], on_damage: Damage
+) -> Generator[Picture | None]:
+    """For each of ``stamps`` the picture ``[H, W, 3]`` sRGB, or None.
+
+    Args:
+        track: the video.
+        stamps: time stamps of its frames, ascending, in ticks; None where no picture is wanted.
+        size: width and height of the pictures.
+        on_damage: told of frames that cannot be decoded, whose pictures are None.
+    """
+    reformatter = load_av().video.reformatter.VideoReformatter()
+    with closing(_decoded(track, [stamp for stamp in stamps if stamp is not None], on_damage)) as decoded:
+        ready = next(decoded, None)
+        for stamp in stamps:
+            if ready is None or ready.pts != stamp:
+                yield None
+                continue
+            yield _shown(ready, reformatter, track, size)
+            ready = next(decoded, None)
+
+
+def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Generator["VideoFrame"]:
+    """The frames at the time stamps ``wanted``, without those that are lost (Note [Damaged videos])."""
+    if not wanted:
+        return
+    at, begin, seeks = 0, _key_before(track, wanted[0]), True
+    while at < len(wanted):
+        run = _Run(track, begin)
+        with closing(run.frames()) as frames:
+            for frame in frames:
+                if frame.pts == wanted[at]:
+                    at += 1
+                    yield frame
+                    if at == len(wanted):
+                        return
+        if run.landed_late:  # Such a file is read from its beginning, and given up at its first damage.
+            begin, seeks = None, False
+            continue
+        following = bisect_right(track.keyframes, run.lost if begin is None else max(run.lost, begin))
+        begin = track.keyframes[following] if seeks and following < len(track.keyframes) else None
+        on_damage(run.lost, begin, run.reason)
+        if begin is None:
+            return
+        at = max(at, bisect_left(wanted, begin))
+        if at < len(wanted):
+            begin = max(begin, _key_before(track, wanted[at]) or begin)
+
+
+@dataclass
+class _Run:
+    """Decodes a file from a key frame on, or from its beginning, up to the first damage.
+
+    Args:
+        track: the video.
+        begin: time stamp of a key frame; None for the beginning.
+        expected: number of the next frame in the video's order.
+        met: whether the first frame came.
+        landed_late: whether the seek landed after the key frame, as it may without an index (MPEG-TS).
+        reason: why it ended.
+    """
+
+    track: VideoTrack
+    begin: int | None
+    expected: int = 0
+    met: bool = False
+    landed_late: bool = False
+    reason: str = "a frame is missing or broken"
+
+    @property
+    def lost(self) -> int:
+        """Time stamp of the first frame that did not come."""
+        if not self.met and self.begin is not None:
+            return self.begin
+        return self.track.stamps[min(self.expected, len(self.track.stamps) - 1)]
+
+    def frames(self) -> Generator["VideoFrame"]:
+        """The frames in the order in which they are shown, each as the index says."""
+        av, stamps, begin = load_av(), self.track.stamps, self.begin
+        with open_video(self.track.path) as container:
+            stream = container.streams.video[0]
+            stream.codec_context.thread_count = 1  # the cameras are the parallelism
+            try:
+                if begin is not None:
+                    container.seek(begin, stream=stream, backward=True)
+                for frame in container.decode(stream):
+                    if frame.pts is None or frame.pts < (stamps[0] if begin is None else begin):
+                        continue  # cut by the container's edit list, or before the key frame
+                    if not self.met and begin is not None and frame.pts > begin:
+                        self.landed_late = container.format.name == "mpegts"
+                        return
+                    if not self.met:
+                        self.expected, self.met = bisect_left(stamps, frame.pts), True
+                    if self.expected == len(stamps) or frame.pts != stamps[self.expected] or frame.is_corrupt:
+                        return
+                    self.expected += 1
+                    yield frame
+            except av.error.FFmpegError as error:
+                self.reason = str(error.strerror)
+
+
+def _key_before(track: VideoTrack, stamp: int) -> int | None:
+    """The last key frame up to ``stamp``; None for the beginning of the file."""
+    found = bisect_right(track.keyframes, stamp)
+    return track.keyframes[found - 1] if found > 1 else None
+
+
+def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
+    """The picture as it is shown, at ``size``."""
+    if not track.quarter_turns:
+        return _srgb(frame, reformatter, width=size[0], height=size[1])
+    width, height = size[::-1] if track.quarter_turns % 2 else size
+    return np.ascontiguousarray(np.rot90(_srgb(frame, reformatter, width=width, height=height), track.quarter_turns))
+
+
+def _srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:
+    """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
+
+    A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one
+    that states no range is taken as limited unless its pixel format says otherwise.
+    """
+    matrix = MATRICES.get(int(frame.colorspace), BT709 if frame.height >= 720 else BT601)
+    source_range = int(frame.color_range)
+    if source_range not in (FULL_RANGE, LIMITED_RANGE):
+        full = frame.format.name.startswith(("yuvj", "rgb", "bgr", "gbr"))
+        source_range = FULL_RANGE if full else LIMITED_RANGE
+    shrinks = width < frame.width or height < frame.height
+    converted = reformatter.reformat(
+        frame,
+        width=width,
+        height=height,
+        format="rgb24",
+        src_colorspace=matrix,
+        dst_colorspace=matrix,
+        src_color_range=source_range,
+        dst_color_range=FULL_RANGE,
+        interpolation=(AREA if shrinks else BICUBIC) | FULL_CHROMA | ACCURATE_ROUNDING,
+        threads=1,
+    )
+    return cast(NDArray[np.uint8], converted.to_ndarray())

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Masks beside captures: which pixels count, through resampling and undistortion, and what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from captures import HEIGHT, WIDTH, small_rig, write_clip, write_panoptic, write_picture
+from structgstream.data.images import reduced_mask
+from structgstream.data.lenses import LensCamera, RadialTangential
+from structgstream.data.masks import with_masks
+from structgstream.data.open import open_capture
+from structgstream.data.undistortion import Undistortion, rectilinear, undistort
+from structgstream.data.wrappers import every_nth_frame
+from structgstream.errors import CaptureError
+
+Mask = NDArray[np.bool_]
+
+
+def write_mask(path: Path, mask: Mask) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
+
+
+def left_half(width: int = WIDTH, height: int = HEIGHT) -> Mask:
+    return np.broadcast_to(np.arange(width) < width // 2, (height, width)).copy()
+
+
+def test_one_mask_for_all_frames_and_one_for_each(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_panoptic(tmp_path, frames=3)
+    top = left_half(HEIGHT, WIDTH).T
+    write_mask(tmp_path / "masks/1.png", left_half())
+    write_mask(tmp_path / "masks/2/000091.png", top)
+    write_mask(tmp_path / "masks/3.png", left_half())
+    write_mask(tmp_path / "masks/3/000092.png", top)
+    frames = list(open_capture(tmp_path).frames())
+    assert "what is black in the masks of cameras '1', '2', '3' does not count" in caplog.text
+    for frame in frames:
+        assert list(frame.images) == ["0", "1", "2", "3"]
+        np.testing.assert_array_equal(frame.masks["1"], left_half())
+        assert ("2" in frame.masks) == (frame.index == 1)
+        np.testing.assert_array_equal(frame.masks["3"], left_half() & top if frame.index == 2 else left_half())
+    np.testing.assert_array_equal(frames[1].masks["2"], top)
+
+
+def test_masks_of_videos_are_numbered_and_follow_sections_and_sizes(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=5)
+    mask = left_half()
+    mask[10, 10] = False
+    write_mask(tmp_path / "masks/cam01/000003.png", mask)
+    whole = open_capture(tmp_path)
+    assert [list(frame.masks) for frame in whole.frames()] == [[], [], [], ["cam01"], []]
+    part = open_capture(tmp_path, start=2, scale=0.5)
+    frame = list(part.frames())[1]
+    expected = left_half(WIDTH // 2, HEIGHT // 2)
+    expected[5, 5] = False  # one of its four pixels is left out
+    np.testing.assert_array_equal(frame.masks["cam01"], expected)
+    assert [list(frame.masks) for frame in every_nth_frame(whole, 3).frames()] == [[], ["cam01"]]
+
+
+@pytest.mark.parametrize("size", [(32, 24), (21, 17), (64, 48)])
+def test_a_reduced_pixel_counts_if_all_that_it_is_made_of_counts(size: tuple[int, int]) -> None:
+    mask = np.random.default_rng(0).random((HEIGHT, WIDTH)) > 0.03
+    image = np.where(mask, 0.0, 1e6).astype(np.float32)
+    touched = cv2.resize(image, size, interpolation=cv2.INTER_AREA) > 0
+    np.testing.assert_array_equal(reduced_mask(mask, size), ~touched if size != (64, 48) else mask)
+
+
+def filmed(width: int = 96, height: int = 72) -> LensCamera:
+    camera = small_rig(3)["cam00"].resized(width, height)
+    return LensCamera(camera, RadialTangential(-0.25, 0.08, 0.002, -0.001))
+
+
+@pytest.mark.parametrize("size", [(96, 72), (60, 45), (150, 110)])
+def test_masked_pixels_of_a_lens_have_no_influence_after_undistortion(size: tuple[int, int]) -> None:
+    camera = filmed()
+    plan = Undistortion(camera, rectilinear(camera, size=size))
+    rng = np.random.default_rng(1)
+    mask = np.ones((72, 96), bool)
+    mask[20:40, 30:55] = mask[5, 80] = mask[:, 0] = False
+    picture = rng.integers(0, 255, (72, 96, 3), dtype=np.uint8)
+    other = np.where(mask[..., None], picture, rng.integers(0, 255, (72, 96, 3), dtype=np.uint8))
+    counts = plan.mask(mask)
+    np.testing.assert_array_equal(plan(picture)[counts], plan(other)[counts])
+    assert 0.6 < counts.mean() < mask.mean()
+
+
+def test_a_mask_and_what_the_lens_shows_join(tmp_path: Path) -> None:
+    rig = write_clip(tmp_path, frames=2)
+    write_mask(tmp_path / "masks/cam02.png", left_half())
+    source = open_capture(tmp_path)
+    lens = RadialTangential(-0.25, 0.08)
+    wide = {name: LensCamera(source.rig[name], lens) for name in rig}
+    made = undistort(open_capture(tmp_path), wide, target=lambda each: rectilinear(each, degrees=100))
+    frame = next(made.frames())
+    shown = made.shown("cam02")  # type: ignore[attr-defined]
+    assert set(frame.masks) == set(rig)
+    assert 0.2 < shown.mean() < 0.9
+    np.testing.assert_array_equal(frame.masks["cam01"], shown)
+    assert not (frame.masks["cam02"] & ~shown).any()
+    middle = frame.masks["cam02"][HEIGHT // 2]
+    assert middle[: WIDTH // 2 - 4].any()
+    assert not middle[WIDTH // 2 + 2 :].any()
+
+
+def test_masks_lie_below_the_lenses_whatever_lies_above(tmp_path: Path) -> None:
+    rig = write_clip(tmp_path, frames=2)
+    write_mask(tmp_path / "others/cam02.png", left_half())
+    lens = RadialTangential(-0.1)
+    source = open_capture(tmp_path)
+    made = undistort(source, {name: LensCamera(source.rig[name], lens) for name in rig})
+    thinned = with_masks(every_nth_frame(made, 2), tmp_path / "others")
+    expected = Undistortion(LensCamera(source.rig["cam02"], lens), made.rig["cam02"]).mask(left_half())
+    np.testing.assert_array_equal(next(thinned.frames()).masks["cam02"], expected)
+
+
+def test_a_mask_that_leaves_nothing_out_costs_nothing(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=2)
+    write_mask(tmp_path / "masks/cam01.png", np.ones((HEIGHT, WIDTH), bool))
+    assert not next(open_capture(tmp_path).frames()).masks
+
+
+def test_a_camera_of_which_nothing_counts_is_not_present(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=2)
+    write_mask(tmp_path / "masks/cam01.png", np.zeros((HEIGHT, WIDTH), bool))
+    frame = next(open_capture(tmp_path).frames())
+    assert frame.present(("cam00", "cam01", "cam02")) == ("cam00", "cam02")
+    assert replace(frame, masks={}).present(("cam01",)) == ("cam01",)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        (
+            "cam09.png",
+            "cam09.png is a mask of camera 'cam09', which the capture .* does not have; its cameras are cam00",
+        ),
+        ("cam01/17.png", r"None of the masks in .*cam01 is of a frame of the capture, such as 17\.png; .* 000000\.png"),
+        ("cam01.jpg", r"cam01\.jpg is no PNG"),
+    ],
+)
+def test_masks_that_do_not_belong_are_refused(tmp_path: Path, name: str, words: str) -> None:
+    write_clip(tmp_path, frames=3)
+    write_picture(tmp_path / "masks" / name, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(CaptureError, match=words):
+        open_capture(tmp_path)
+
+
+def test_masks_of_another_size_and_broken_ones_are_refused(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=3)
+    write_mask(tmp_path / "masks/cam01.png", left_half(32, 24))
+    with pytest.raises(CaptureError, match=r"cam01\.png has 32x24 pixels, the pictures of camera 'cam01' have 64x48"):
+        open_capture(tmp_path)
+    (tmp_path / "masks/cam01.png").write_bytes(b"nothing")
+    with pytest.raises(CaptureError, match=r"cam01\.png cannot be decoded"):
+        open_capture(tmp_path)
