@@ -4,11 +4,20 @@
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 from structgstream.errors import CaptureError
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How a camera's clock relates to the common one: ``common = offset_seconds + rate * stamp_seconds``."""
+
+    offset_seconds: float = 0.0
+    rate: float = 1.0
 
 
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:

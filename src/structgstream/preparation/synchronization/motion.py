@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Instants that pairs of cameras share, from what moves in their pictures.
+
+Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With epipolar geometry
+signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame for one pair. A first round
+considers all lags; the second one looks, near those that most pairs agree on, in each part of the take.
+"""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from structgstream.errors import CaptureError
+from structgstream.preparation.synchronization.changes import Changes
+from structgstream.preparation.synchronization.correlation import Signal, best_lag, chance_deviation, resampled
+from structgstream.preparation.synchronization.epipolar import line_signals
+from structgstream.preparation.synchronization.geometry import Geometry
+from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
+from structgstream.preparation.synchronization.streams import period_seconds
+
+_log = logging.getLogger(__name__)
+
+LEAST_SAMPLES = 6  # that two views must have in common, in frames
+LEAST_OVERLAP = 0.2  # of the shorter take
+LEAST_PEAK = 0.25  # correlation of views that see the same
+# Of activities, and of lines whose geometry is an estimate from few features, a peak must stand out more.
+CHANCE_DEVIATIONS = 4.5
+ESTIMATED_PEAK, CONTROL_RATIO = 0.5, 1.2
+RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
+LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
+PART_SECONDS, MOST_PARTS = 8.0, 12
+NEAR_PERIODS = 2.0
+OPTIMISM = 1.5  # true errors of pairs over their jackknife errors, measured on three captures with known clocks
+
+
+@dataclass(frozen=True)
+class PairSignals:
+    """Signals of two cameras that rise and fall together.
+
+    Args:
+        epipolar: whether they belong to corresponding epipolar lines, else to whole pictures.
+        estimated: whether the epipolar geometry is an estimate that may be wrong.
+    """
+
+    first: str
+    second: str
+    signals: tuple[Signal, Signal]
+    epipolar: bool
+    estimated: bool = False
+
+
+def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> list[PairSignals]:
+    """Signals of all pairs of cameras in which something moves: of epipolar lines where the geometry is known."""
+    moving = [name for name, change in changes.items() if change.moving]
+    found = []
+    for first, second in combinations(moving, 2):
+        one, other = changes[first], changes[second]
+        step = min(period_seconds(one.times), period_seconds(other.times))
+        pair = geometry.pair(first, second) if geometry else None
+        values = line_signals(one, other, pair) if pair else None
+        both = values or (one.activity, other.activity)
+        signals = resampled(both[0], one.times, step=step), resampled(both[1], other.times, step=step)
+        found.append(PairSignals(first, second, signals, values is not None, pair is not None and pair.estimated))
+    return found
+
+
+def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -> list[Tie]:
+    """Ties from signals of pairs.
+
+    Args:
+        pairs: what :func:`pair_signals` gives.
+        near: clocks near which lags are looked for, in each part of the take; None looks at all lags of the whole take.
+    """
+    ties = []
+    for pair in pairs:
+        ties += _whole(pair) if near is None else _parts(pair, near)
+    return ties
+
+
+def solve_by_motion(
+    takes: Mapping[str, tuple[float, float]], pairs: Sequence[PairSignals], *, slack_seconds: float, drift: bool
+) -> tuple[Solution, list[Tie]]:
+    """Clocks by motion, and the ties that they come from.
+
+    Args:
+        takes: camera to the first and last second of its take.
+        pairs: what :func:`pair_signals` gives.
+        slack_seconds: half a frame period.
+        drift: whether rates other than 1 are considered.
+
+    Raises:
+        CaptureError: cameras that share no motion with the others.
+    """
+    ties = motion_ties(pairs)
+    demand_connected(takes, ties)
+    coarse = solve_clocks(takes, ties, drift=False, slack_seconds=slack_seconds)
+    agreeing = [tie for tie, agrees in zip(ties, coarse.agreeing, strict=True) if agrees]
+    demand_connected(takes, [tie for tie in agreeing if _supported(tie, ties, agreeing)])
+    good = {(tie.first, tie.second) for tie in agreeing}
+    finer = motion_ties([pair for pair in pairs if (pair.first, pair.second) in good], near=coarse)
+    if len(connected(list(takes), finer)) > 1:
+        return coarse, ties
+    return solve_clocks(takes, finer, drift=drift, slack_seconds=slack_seconds), finer
+
+
+def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
+    """Whether enough pairs of both cameras agree with their clocks, so that it is no chance."""
+    for name in (tie.first, tie.second):
+        all_, own = (sum(name in (each.first, each.second) for each in some) for some in (ties, agreeing))
+        if own < LEAST_SUPPORT * all_ or (own == 1 and all_ > 1):
+            return False
+    return True
+
+
+def demand_connected(takes: Mapping[str, tuple[float, float]], ties: Sequence[Tie]) -> None:
+    """
+    Raises:
+        CaptureError: ties leave cameras apart.
+    """
+    groups = connected(list(takes), ties)
+    if len(groups) > 1:
+        apart = [name for group in groups[1:] for name in group]
+        names = ", ".join(repr(name) for name in apart)
+        raise CaptureError(
+            f"Nothing that moves is seen to move at the same time by {names} and by the other cameras, so their clocks are not "
+            "connected; film motion that all cameras see (a person who claps, jumps and walks) or give timestamps.csv."
+        )
+
+
+def _whole(pair: PairSignals) -> list[Tie]:
+    one, other = pair.signals
+    least = max(LEAST_SAMPLES, round(LEAST_OVERLAP * min(len(one.values), len(other.values))))
+    lag = best_lag(one, other, least_overlap=least)
+    if lag is None or lag.peak < LEAST_PEAK or lag.rival > RIVAL_RATIO * lag.judged:
+        return []
+    if not pair.epipolar and lag.judged < CHANCE_DEVIATIONS * chance_deviation(one, other):
+        return []
+    if pair.estimated and (lag.peak < ESTIMATED_PEAK or lag.judged < CONTROL_RATIO * _control(pair, least)):
+        return []
+    return [_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.judged / max(lag.rival, 0.1))]
+
+
+def _control(pair: PairSignals, least: int) -> float:
+    """The best correlation when lines are paired wrongly: a right geometry does better than that."""
+    one, other = pair.signals
+    half = other.values.shape[1] // 2
+    wrong = (other.values[:, ::-1], np.roll(other.values, half, 1), np.roll(other.values[:, ::-1], half, 1))
+    lags = [best_lag(one, replace(other, values=values), least_overlap=least) for values in wrong]
+    return max((lag.judged for lag in lags if lag is not None), default=0.0)
+
+
+def _parts(pair: PairSignals, near: Solution) -> list[Tie]:
+    one, other = pair.signals
+    step = one.step
+    rates, offsets = near.rates, near.offsets
+    # By the first camera's clock; rates differ so little that a constant lag holds within a part.
+    ratio = rates[pair.first] / rates[pair.second]
+    shift = (offsets[pair.first] - offsets[pair.second]) / rates[pair.second]
+    start = max(one.start, (other.start - shift) / ratio)
+    end = min(one.end, (other.end - shift) / ratio)
+    count = max(min(int((end - start) / PART_SECONDS), MOST_PARTS), 1)
+    ties = []
+    for part in range(count):
+        low, high = start + (end - start) * part / count, start + (end - start) * (part + 1) / count
+        expected = shift + (ratio - 1) * (low + high) / 2
+        reach = NEAR_PERIODS * step
+        cut = one.cut(low, high), other.cut(low + expected - reach, high + expected + reach)
+        least = max(LEAST_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
+        if min(len(signal.values) for signal in cut) < LEAST_SAMPLES:
+            continue
+        lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
+        if lag is not None and lag.peak >= LEAST_PEAK and abs(lag.seconds - expected) < reach - step / 2:
+            ties.append(_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak))
+    return ties
+
+
+def _tie(pair: PairSignals, middle: float, seconds: float, sigma: float, confidence: float) -> Tie:
+    weight = confidence * (4.0 if pair.epipolar else 1.0)
+    return Tie(pair.first, pair.second, middle, middle + seconds, OPTIMISM * sigma, weight)
