@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where and when the pictures of a still camera change."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,13 @@ from structgstream.data.images import opencv
 
 Floats = NDArray[np.float64]
 
-WIDTH = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
+LONGER_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
+SMOOTHING = 1.0  # standard deviation, reduced pixels
+SAMPLED = 100  # frames whose noise is measured
 NOISE_FACTOR, LEAST_NOISE = 4.0, 0.5  # changes below this many times the median change are noise
 MOST = 30.0  # larger changes count as this one: a bright shirt is not more of an event than a dark one
-STILL = 2e-3  # mean change below which nothing moves, of MOST
+UNITS = 4  # of stored changes in a grey level
+STILL = 5e-4  # share of MOST of a mean change below which nothing moves
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Changes:
     """Changes of a camera's pictures.
 
     Args:
-        amounts: ``[T - 1, h, w]`` uint8: change from a frame to the next one above noise, at most :data:`MOST`.
+        amounts: ``[T - 1, h, w]`` uint8: change from a frame to the next one above noise, in quarters of a grey level.
         times: ``[T - 1]`` seconds by the camera's clock, halfway between both frames.
         size: width and height of the camera's pictures, pixels.
     """
@@ -39,7 +42,7 @@ class Changes:
     @property
     def moving(self) -> bool:
         """Whether anything moves."""
-        return len(self.amounts) > 1 and float(self.amounts.mean()) > STILL * MOST
+        return len(self.amounts) > 1 and float(self.amounts.mean()) > STILL * MOST * UNITS
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
@@ -48,32 +51,46 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Ch
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cv2 = opencv()
     reduced: list[NDArray[np.uint8]] = []
     size = (0, 0)
     for picture in pictures:
-        height, width = picture.shape[:2]
-        size = (width, height)
-        small = (WIDTH, max(round(WIDTH * height / width), 1)) if width >= height else (
-            max(round(WIDTH * width / height), 1), WIDTH)  # fmt: skip
-        grey = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), small, interpolation=cv2.INTER_AREA)
-        reduced.append(grey)
-    return _changes(reduced, stamps[: len(reduced)], size)
+        size = (picture.shape[1], picture.shape[0])
+        reduced.append(reduced_picture(picture))
+    return reduced_changes(reduced, stamps[: len(reduced)], size)
 
 
-def _changes(reduced: list[NDArray[np.uint8]], stamps: Floats, size: tuple[int, int]) -> Changes:
+def reduced_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 3]`` as grey ``[h, w]`` whose longer side is :data:`LONGER_SIDE`."""
     cv2 = opencv()
-    steps = []
-    before = None
-    for grey in reduced:
-        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
-        if before is not None:
-            steps.append(np.abs(smooth - before).astype(np.float16))
-        before = smooth
-    if not steps:
+    height, width = picture.shape[:2]
+    factor = LONGER_SIDE / max(width, height)
+    small = (max(round(width * factor), 1), max(round(height * factor), 1))
+    # Reduced first: grey of a large picture would take longer than all else.
+    return cv2.cvtColor(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+
+
+def reduced_changes(reduced: Sequence[NDArray[np.uint8]], stamps: Floats, size: tuple[int, int]) -> Changes:
+    """Changes of reduced pictures ``[h, w]`` at ``stamps`` ``[T]`` of a camera of this width and height."""
+    if len(reduced) < 2:
         return Changes(np.zeros((0, 1, 1), np.uint8), np.zeros(0), size)
-    stacked = np.stack(steps)
-    noise = NOISE_FACTOR * max(float(np.median(stacked[:: max(len(stacked) // 100, 1)])), LEAST_NOISE)
-    amounts = np.clip(stacked - np.float16(noise), 0, MOST)
-    # Half units, so that uint8 keeps twice as many levels as needed.
-    return Changes(np.rint(amounts * 2).astype(np.uint8), (stamps[1:] + stamps[:-1]) / 2, size)
+    cv2 = opencv()
+    noise = _noise(reduced)
+    amounts = np.empty((len(reduced) - 1, *reduced[0].shape), np.uint8)
+    before = cv2.GaussianBlur(reduced[0].astype(np.float32), (0, 0), SMOOTHING)
+    for index, grey in enumerate(reduced[1:]):
+        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING)
+        above = np.clip(np.abs(smooth - before) - noise, 0, MOST)
+        amounts[index] = np.rint(above * UNITS)
+        before = smooth
+    return Changes(amounts, (stamps[1:] + stamps[:-1]) / 2, size)
+
+
+def _noise(reduced: Sequence[NDArray[np.uint8]]) -> float:
+    """The change that counts as noise: a multiple of the median one, of some of the frames."""
+    cv2 = opencv()
+    firsts = np.unique(np.linspace(0, len(reduced) - 2, min(len(reduced) - 1, SAMPLED)).astype(int))
+    steps = []
+    for first in firsts.tolist():
+        pair = [cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING) for grey in reduced[first : first + 2]]
+        steps.append(np.abs(pair[1] - pair[0]))
+    return NOISE_FACTOR * max(float(np.median(np.stack(steps))), LEAST_NOISE)

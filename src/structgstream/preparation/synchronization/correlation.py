@@ -5,6 +5,7 @@ Means and energies are those of the overlap at each lag, so neither a constant l
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +56,8 @@ class Lag:
 
 
 def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:
-    """A signal from values ``[T, B]`` at ascending ``stamps`` ``[T]``, linearly interpolated at multiples of ``step``."""
+    """A signal from values ``[T, B]`` at ascending ``stamps`` ``[T]``, linearly interpolated at multiples of
+    ``step``."""
     count = max(int(np.floor((stamps[-1] - stamps[0]) / step + 1e-6)) + 1, 1)
     times = stamps[0] + np.arange(count) * step
     if len(times) == len(stamps) and np.abs(times - stamps).max() < 0.02 * step:
@@ -102,8 +104,8 @@ def best_lag(
 
 
 def chance_deviation(first: Signal, second: Signal) -> float:
-    """Standard deviation that the correlation of two independent signals with these autocorrelations would have (Bartlett's
-    formula); of the first channels."""
+    """Standard deviation that the correlation of two independent signals with these autocorrelations would have
+    (Bartlett's formula); of the first channels."""
     from scipy.signal import correlate
 
     count = min(len(first.values), len(second.values))
@@ -124,8 +126,9 @@ def _scores(
 
     x, y = first.values - first.values.mean(0), second.values - second.values.mean(0)
     n, m = len(x), len(y)
-    size = next_fast_len(n + m, real=True)
-    products = irfft(np.conj(rfft(x, size, axis=0)) * rfft(y, size, axis=0), size, axis=0)
+    size = int(next_fast_len(n + m, real=True) or 0)
+    spectra = [np.asarray(rfft(values, size, axis=0)) for values in (x, y)]
+    products = np.asarray(irfft(np.conj(spectra[0]) * spectra[1], size, axis=0))
     lags = np.arange(-(n - 1), m)
     products = products[lags % size]
     starts, ends = np.maximum(0, -lags), np.minimum(n, m - lags)  # of the overlap, in the first signal
@@ -182,7 +185,7 @@ def _sigma(numerators: Floats, energy: Floats, best: int, step: float) -> float:
     total = numerators[near].sum(1)
     bounds = np.linspace(0, numerators.shape[1], groups + 1).astype(int)
     peaks = []
-    for low, high in zip(bounds[:-1], bounds[1:]):
+    for low, high in pairwise(bounds):
         rest = (total - numerators[near, low:high].sum(1)) / energy[near]
         curvature = rest[0] - 2 * rest[1] + rest[2]
         peaks.append(np.clip((rest[0] - rest[2]) / (2 * curvature), -1, 1) if curvature < 0 else 1.0)

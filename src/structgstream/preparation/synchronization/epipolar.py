@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events under epipolar geometry: what changes on an epipolar line at an instant changes on the corresponding line of the
-other view at the same instant, whatever the depth.
+"""Events under epipolar geometry: what changes on an epipolar line at an instant changes on the corresponding line of
+the other view at the same instant, whatever the depth.
 
-The changes of each view are summed over bundles of corresponding epipolar lines, which gives a signal for each bundle that both
-views see at the same time, without matching a point. (Motion barcodes of lines: Ben-Artzi, Kasten, Peleg and Werman, CVPR
-2016; frontier points of silhouettes, which both views see on the same line: Hartley and Zisserman, chapter 9.)
+The changes of each view are summed over bundles of corresponding epipolar lines, which gives a signal for each bundle
+that both views see at the same time, without matching a point. (Motion barcodes of lines: Ben-Artzi, Kasten, Peleg
+and Werman, CVPR 2016; frontier points of silhouettes, which both views see on the same line: Hartley and Zisserman,
+chapter 9.)
 """
 
 from collections.abc import Callable
@@ -108,5 +109,7 @@ def _summed(view: Changes, angles: Floats, edges: Floats) -> Floats:
     membership = csr_matrix((np.ones(len(pixels), np.float32), (pixels, bundle[inside])), shape=shape)
     counts = np.maximum(np.bincount(bundle[inside], minlength=BUNDLES), 1)
     flat = view.amounts.reshape(len(view.amounts), -1)
-    sums = np.concatenate([part.astype(np.float32) @ membership for part in np.array_split(flat, max(len(flat) // 200, 1))])
+    sums = np.concatenate(
+        [part.astype(np.float32) @ membership for part in np.array_split(flat, max(len(flat) // 200, 1))]
+    )
     return np.sqrt(sums / counts, dtype=np.float64)

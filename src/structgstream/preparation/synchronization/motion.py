@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Instants that pairs of cameras share, from what moves in their pictures.
 
-Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With epipolar geometry
-signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame for one pair. A first round
-considers all lags; the second one looks, near those that most pairs agree on, in each part of the take.
+Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With
+epipolar geometry signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame
+for one pair. A first round considers all lags; the second one looks, near those that most pairs agree on, in each
+part of the take.
 """
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -21,8 +21,6 @@ from structgstream.preparation.synchronization.geometry import Geometry
 from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
 from structgstream.preparation.synchronization.streams import period_seconds
 
-_log = logging.getLogger(__name__)
-
 LEAST_SAMPLES = 6  # that two views must have in common, in frames
 LEAST_OVERLAP = 0.2  # of the shorter take
 LEAST_PEAK = 0.25  # correlation of views that see the same
@@ -33,6 +31,8 @@ RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
 LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
 PART_SECONDS, MOST_PARTS = 8.0, 12
 NEAR_PERIODS = 2.0
+BIAS_PERIODS = 0.06  # a camera's own error, that all its pairs share: views see different parts of what moves
+ACTIVITY_BIAS_PERIODS = 0.5  # the same, where only activities are compared
 OPTIMISM = 1.5  # true errors of pairs over their jackknife errors, measured on three captures with known clocks
 
 
@@ -63,7 +63,9 @@ def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> l
         values = line_signals(one, other, pair) if pair else None
         both = values or (one.activity, other.activity)
         signals = resampled(both[0], one.times, step=step), resampled(both[1], other.times, step=step)
-        found.append(PairSignals(first, second, signals, values is not None, pair is not None and pair.estimated))
+        epipolar = values is not None
+        estimated = epipolar and pair is not None and pair.estimated
+        found.append(PairSignals(first, second, signals, epipolar, estimated))
     return found
 
 
@@ -82,8 +84,8 @@ def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -
 
 def solve_by_motion(
     takes: Mapping[str, tuple[float, float]], pairs: Sequence[PairSignals], *, slack_seconds: float, drift: bool
-) -> tuple[Solution, list[Tie]]:
-    """Clocks by motion, and the ties that they come from.
+) -> Solution:
+    """Clocks by motion.
 
     Args:
         takes: camera to the first and last second of its take.
@@ -94,16 +96,41 @@ def solve_by_motion(
     Raises:
         CaptureError: cameras that share no motion with the others.
     """
+    group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=slack_seconds)
+    if coarse is None or len(group) < len(takes):
+        raise CaptureError(_apart([name for name in takes if name not in group], group))
+    ties = motion_ties(good, near=coarse)
+    if len(connected(list(takes), ties)) > 1:  # parts of the take are too short or too still
+        ties = motion_ties(good)
+    solution = solve_clocks(takes, ties, drift=drift, slack_seconds=slack_seconds)
+    exact = {name for pair in good if pair.epipolar for name in (pair.first, pair.second)}
+    shares = {name: BIAS_PERIODS if name in exact else ACTIVITY_BIAS_PERIODS for name in takes}
+    errors = {name: float(np.hypot(solution.sigmas[name], shares[name] * 2 * slack_seconds)) for name in takes}
+    return replace(solution, sigmas=errors)
+
+
+def agreeing_cameras(
+    takes: Mapping[str, tuple[float, float]], pairs: Sequence[PairSignals], *, slack_seconds: float
+) -> tuple[tuple[str, ...], Solution | None, list[PairSignals]]:
+    """The largest group of cameras whose motion agrees, its clocks by whole takes, and the pairs that agree with
+    these."""
     ties = motion_ties(pairs)
-    demand_connected(takes, ties)
-    coarse = solve_clocks(takes, ties, drift=False, slack_seconds=slack_seconds)
-    agreeing = [tie for tie, agrees in zip(ties, coarse.agreeing, strict=True) if agrees]
-    demand_connected(takes, [tie for tie in agreeing if _supported(tie, ties, agreeing)])
-    good = {(tie.first, tie.second) for tie in agreeing}
-    finer = motion_ties([pair for pair in pairs if (pair.first, pair.second) in good], near=coarse)
-    if len(connected(list(takes), finer)) > 1:
-        return coarse, ties
-    return solve_clocks(takes, finer, drift=drift, slack_seconds=slack_seconds), finer
+    group = connected(list(takes), ties)[0]
+    solution = None
+    good: list[PairSignals] = []
+    while len(group) > 1:
+        inside = [tie for tie in ties if tie.first in group and tie.second in group]
+        own = {name: takes[name] for name in group}
+        solution = solve_clocks(own, inside, drift=False, slack_seconds=slack_seconds)
+        agreeing = [tie for tie, agrees in zip(inside, solution.agreeing, strict=True) if agrees]
+        supported = [tie for tie in agreeing if _supported(tie, inside, agreeing)]
+        names = {(tie.first, tie.second) for tie in supported}
+        good = [pair for pair in pairs if (pair.first, pair.second) in names]
+        smaller = connected(list(group), supported)[0]
+        if len(smaller) == len(group):
+            return group, solution, good
+        group = smaller
+    return group, None, []
 
 
 def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
@@ -115,19 +142,15 @@ def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
     return True
 
 
-def demand_connected(takes: Mapping[str, tuple[float, float]], ties: Sequence[Tie]) -> None:
-    """
-    Raises:
-        CaptureError: ties leave cameras apart.
-    """
-    groups = connected(list(takes), ties)
-    if len(groups) > 1:
-        apart = [name for group in groups[1:] for name in group]
-        names = ", ".join(repr(name) for name in apart)
-        raise CaptureError(
-            f"Nothing that moves is seen to move at the same time by {names} and by the other cameras, so their clocks are not "
-            "connected; film motion that all cameras see (a person who claps, jumps and walks) or give timestamps.csv."
-        )
+def _apart(apart: Sequence[str], group: Sequence[str]) -> str:
+    names = ", ".join(repr(name) for name in apart)
+    others = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
+    return (
+        f"What moves before {names} cannot be recognised in the motion before {others}, so their clocks are not "
+        "connected; film motion that all see (a person who walks and claps), give the calibration, or synchronise "
+        "by audio or "
+        "timestamps.csv."
+    )
 
 
 def _whole(pair: PairSignals) -> list[Tie]:

@@ -2,9 +2,9 @@
 """Clocks of all cameras from instants that pairs of cameras share.
 
 A tie says that the second ``first_seconds`` of one camera's clock was the second ``second_seconds`` of another's. With
-``common = offset + rate * stamp`` it is linear in both clocks, so all ties are solved by one weighted least squares. Wrong
-ties do not agree around loops of cameras: a start is chosen among spanning trees of the graph of cameras by how many ties it
-explains, and the weights are those of Tukey's biweight (iteratively reweighted least squares).
+``common = offset + rate * stamp`` it is linear in both clocks, so all ties are solved by one weighted least squares.
+Wrong ties do not agree around loops of cameras: a start is chosen among spanning trees of the graph of cameras by how
+many ties it explains, and the weights are those of Tukey's biweight (iteratively reweighted least squares).
 """
 
 from collections.abc import Mapping, Sequence
@@ -206,6 +206,7 @@ def _reweighted(
         moved, covariance = _step(graph, off, weights, corrections, free)
         offsets, corrections = offsets + moved[: graph.cameras], corrections + moved[graph.cameras :]
         inliers = weights > 0
+        spread = slack
         if inliers.any():
             spread = 1.4826 * float(np.median(np.abs(_residuals(graph, offsets, corrections)[inliers])))
             slack = min(slack, max(spread, slack / 2))
@@ -242,9 +243,11 @@ def _step(
 
 
 def _inflation(graph: _Graph, off: Floats, weights: Floats) -> float:
-    """How much larger variances are than stated: the larger one of the reduced chi-squares of ties and of pairs, at least 1.
+    """How much larger variances are than stated: the larger one of the reduced chi-squares of ties and of pairs, at
+    least 1.
 
-    Ties of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged by their means.
+    Ties of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged by their
+    means.
     """
     inliers = weights > 0
     ties, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
@@ -267,7 +270,8 @@ def _pair_numbers(graph: _Graph) -> NDArray[np.intp]:
 def _with_rates(
     graph: _Graph, offsets: Floats, halves: Floats, slack_seconds: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """The solution with rates of the cameras whose rate matters: significant, and more than a millisecond in the take."""
+    """The solution with rates of the cameras whose rate matters: significant, and more than a millisecond in the
+    take."""
     free = np.ones(graph.cameras, bool)
     zeros = np.zeros(graph.cameras)
     start = offsets

@@ -23,8 +23,8 @@ class Streams(Protocol):
         ...
 
     def audio(self, name: str, /) -> tuple[NDArray[np.float32], float] | None:
-        """Mono samples ``[N]`` and their rate in hertz, the first sample at the second 0 of :meth:`stamps`; None without
-        sound."""
+        """Mono samples ``[N]`` and their rate in hertz, the first sample at the second 0 of :meth:`stamps`; None
+        without sound."""
         ...
 
     def size(self, name: str, /) -> tuple[int, int]:
