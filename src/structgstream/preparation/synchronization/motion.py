@@ -31,8 +31,9 @@ RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
 LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
 PART_SECONDS, MOST_PARTS = 8.0, 12
 NEAR_PERIODS = 2.0
-BIAS_PERIODS = 0.06  # a camera's own error, that all its pairs share: views see different parts of what moves
-ACTIVITY_BIAS_PERIODS = 0.5  # the same, where only activities are compared
+# Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
+# in periods, with a known geometry, with one from static features, and by activities.
+BIAS_PERIODS, ESTIMATED_BIAS_PERIODS, ACTIVITY_BIAS_PERIODS = 0.06, 0.3, 1.0
 OPTIMISM = 1.5  # true errors of pairs over their jackknife errors, measured on three captures with known clocks
 
 
@@ -103,9 +104,9 @@ def solve_by_motion(
     if len(connected(list(takes), ties)) > 1:  # parts of the take are too short or too still
         ties = motion_ties(good)
     solution = solve_clocks(takes, ties, drift=drift, slack_seconds=slack_seconds)
-    exact = {name for pair in good if pair.epipolar for name in (pair.first, pair.second)}
-    shares = {name: BIAS_PERIODS if name in exact else ACTIVITY_BIAS_PERIODS for name in takes}
-    errors = {name: float(np.hypot(solution.sigmas[name], shares[name] * 2 * slack_seconds)) for name in takes}
+    errors = {
+        name: float(np.hypot(solution.sigmas[name], _bias(name, good) * 2 * slack_seconds)) for name in solution.sigmas
+    }
     return replace(solution, sigmas=errors)
 
 
@@ -131,6 +132,14 @@ def agreeing_cameras(
             return group, solution, good
         group = smaller
     return group, None, []
+
+
+def _bias(name: str, pairs: Sequence[PairSignals]) -> float:
+    """A camera's own error, in periods, by the best of its pairs."""
+    own = [pair for pair in pairs if name in (pair.first, pair.second)]
+    if any(pair.epipolar and not pair.estimated for pair in own):
+        return BIAS_PERIODS
+    return ESTIMATED_BIAS_PERIODS if any(pair.epipolar for pair in own) else ACTIVITY_BIAS_PERIODS
 
 
 def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:

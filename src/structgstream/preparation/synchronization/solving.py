@@ -203,12 +203,14 @@ def _reweighted(
         scale = np.hypot(graph.sigmas, slack)
         share = np.abs(off) / (SIGMAS * scale)
         weights = np.where(share < 1, (1 - share**2) ** 2, 0.0) / scale**2
-        moved, covariance = _step(graph, off, weights, corrections, free)
+        moved, covariance = _step(graph, off, weights, scale, corrections, free)
         offsets, corrections = offsets + moved[: graph.cameras], corrections + moved[graph.cameras :]
         inliers = weights > 0
         spread = slack
         if inliers.any():
-            spread = 1.4826 * float(np.median(np.abs(_residuals(graph, offsets, corrections)[inliers])))
+            freedom = max(int(inliers.sum()) - graph.cameras + 1, 1) / int(inliers.sum())
+            left = np.abs(_residuals(graph, offsets, corrections)[inliers])
+            spread = 1.4826 * float(np.median(left)) / freedom**0.5
             slack = min(slack, max(spread, slack / 2))
         if np.abs(moved[: graph.cameras]).max() < 1e-8 and slack < 1.05 * max(spread, 1e-9):
             break
@@ -216,7 +218,7 @@ def _reweighted(
 
 
 def _step(
-    graph: _Graph, off: Floats, weights: Floats, corrections: Floats, free: NDArray[np.bool_]
+    graph: _Graph, off: Floats, weights: Floats, scale: Floats, corrections: Floats, free: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
     """One Gauss-Newton step ``[2C]`` (offsets, rate corrections) and the covariance ``[2C, 2C]``.
 
@@ -238,11 +240,11 @@ def _step(
     inverse = np.linalg.pinv(normal[np.ix_(kept, kept)], rcond=1e-13, hermitian=True)
     moved, covariance = np.zeros(2 * count), np.zeros((2 * count, 2 * count))
     moved[kept] = inverse @ right[kept]
-    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights)
+    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights, scale)
     return moved, covariance
 
 
-def _inflation(graph: _Graph, off: Floats, weights: Floats) -> float:
+def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> float:
     """How much larger variances are than stated: the larger one of the reduced chi-squares of ties and of pairs, at
     least 1.
 
@@ -253,7 +255,7 @@ def _inflation(graph: _Graph, off: Floats, weights: Floats) -> float:
     ties, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
     factor = 1.0
     if ties > graph.cameras:
-        factor = max(factor, float((weights * off**2).sum()) / (ties - graph.cameras + 1))
+        factor = max(factor, float(((off / scale)[inliers] ** 2).sum()) / (ties - graph.cameras + 1))
     if len(pairs) > graph.cameras - 1:
         numbers = _pair_numbers(graph)
         total = np.bincount(numbers, weights)[pairs]
