@@ -52,6 +52,6 @@ def test_views_that_share_few_lines_have_no_signals() -> None:
     """The second picture is far above the first one, on rows that no line of the first meets."""
     F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the same rows
     views = spots("cam0", np.zeros((3, 3))), spots("cam1", np.zeros((3, 3)))
-    geometry = PairGeometry(F, (lambda pixels: pixels, lambda pixels: pixels + [0.0, 0.9 * HEIGHT]))
+    geometry = PairGeometry(F, (lambda pixels: pixels, lambda pixels: pixels + np.array([0.0, 0.9 * HEIGHT])))
     assert line_signals(*views, PairGeometry(F, (lambda pixels: pixels, lambda pixels: pixels))) is not None
     assert line_signals(*views, geometry) is None

@@ -46,7 +46,8 @@ def textured(camera: Camera) -> np.ndarray:
         texture = cv2.resize(generator.integers(0, 255, (60, 60), np.uint8), (480, 480), interpolation=cv2.INTER_CUBIC)
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * side / 2 + [0, 0, depth]
         pixels = LensCamera(camera, Pinhole()).pixels(corners)
-        H = cv2.getPerspectiveTransform(np.float32([[0, 0], [480, 0], [480, 480], [0, 480]]), np.float32(pixels))
+        square = np.array([[0, 0], [480, 0], [480, 480], [0, 480]], np.float32)
+        H = cv2.getPerspectiveTransform(square, pixels.astype(np.float32))
         warped = cv2.warpPerspective(texture, H, (camera.width, camera.height))
         inside = cv2.warpPerspective(np.ones_like(texture), H, (camera.width, camera.height)) > 0
         picture[inside] = warped[inside][:, None]

@@ -27,7 +27,8 @@ STEP_SECONDS = 0.004  # of onsets
 BANDS_HERTZ = (150.0, 600.0, 1500.0, 3500.0, 8000.0)
 LEAST_OVERLAP_SECONDS = 1.0
 RIVAL_RATIO = 0.8  # of the second best lag to the best one
-LEAST_PEAK = 0.08
+COARSE_RIVAL_RATIO = 0.5  # the same, where phases do not confirm the lag
+CHANCE_DEVIATIONS = 7.0  # that a coarse peak exceeds: the largest of 300000 normal numbers is at 4.5
 WINDOW_SECONDS, MOST_WINDOWS = 2, 16
 GRID_HERTZ = 96000  # of the fine correlation
 FINE_SIGMA_SECONDS = 1e-4  # of a window's peak in a room that echoes
@@ -93,7 +94,9 @@ def _pair_ties(first: str, second: str, sounds: Mapping[str, Sound], delays: Map
     one, other = sounds[first], sounds[second]
     least = round(LEAST_OVERLAP_SECONDS / STEP_SECONDS)
     coarse = best_lag(one.onsets, other.onsets, least_overlap=least)
-    if coarse is None or coarse.peak < LEAST_PEAK or coarse.rival > RIVAL_RATIO * coarse.judged:
+    if coarse is None or coarse.rival > RIVAL_RATIO * coarse.judged:
+        return []
+    if coarse.judged < CHANCE_DEVIATIONS * coarse.deviation:
         return []
     confidence = coarse.judged / max(coarse.rival, 0.01)
     found = [
@@ -102,6 +105,8 @@ def _pair_ties(first: str, second: str, sounds: Mapping[str, Sound], delays: Map
         if (lag := _phase_lag(one, other, middle, coarse.seconds)) is not None
     ]
     agreeing = _on_a_line(found)
+    if not agreeing and coarse.rival > COARSE_RIVAL_RATIO * coarse.judged:
+        return []  # a bang of one place agrees with a bang of another
     if not agreeing:
         agreeing, sigma, confidence = [(coarse.middle, coarse.seconds)], STEP_SECONDS, confidence / 4
     else:

@@ -44,6 +44,7 @@ class Lag:
         peak: correlation there, at most 1.
         judged: correlation times the square root of the overlap's share of the longest one.
         rival: largest such value outside the peak.
+        deviation: standard deviation of such values over all lags, as chance makes them.
         middle: the middle of the overlap, by the first signal's time.
     """
 
@@ -52,6 +53,7 @@ class Lag:
     peak: float
     judged: float
     rival: float
+    deviation: float
     middle: float
 
 
@@ -69,7 +71,8 @@ def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:
 def best_lag(
     first: Signal, second: Signal, *, within: tuple[float, float] | None = None, least_overlap: int = 8
 ) -> Lag | None:
-    """The lag of the largest correlation; None if there is no overlap, or no change in it.
+    """The lag of the largest correlation; None if there is no overlap, no change in
+    it, or no peak.
 
     Args:
         first: a signal.
@@ -86,7 +89,8 @@ def best_lag(
     # A short overlap agrees by chance; correlations are judged by their significance.
     judged = score * np.sqrt(counts / counts.max())
     best = int(judged.argmax())
-    if score[best] <= 0:
+    # A best lag beside those that are not considered is no peak.
+    if score[best] <= 0 or not 0 < best < len(score) - 1 or not np.isfinite(score[best - 1 : best + 2]).all():
         return None
     shift = _vertex(score, best)
     sigma = _sigma(numerators, energy, best, first.step)
@@ -99,6 +103,7 @@ def best_lag(
         float(score[best]),
         float(judged[best]),
         rival,
+        float(judged[np.isfinite(judged)].std()),
         (overlap_start + overlap_end) / 2,
     )
 
@@ -155,11 +160,9 @@ def _sums(values: Floats, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> t
 
 def _vertex(score: Floats, best: int) -> float:
     """Position of the top of the parabola through three scores, in steps from ``best``."""
-    if not 0 < best < len(score) - 1:
-        return 0.0
     left, middle, right = score[best - 1 : best + 2]
     curvature = left - 2 * middle + right
-    if not np.isfinite(curvature) or curvature >= 0:
+    if curvature >= 0:
         return 0.0
     return float(np.clip((left - right) / (2 * curvature), -0.5, 0.5))
 
@@ -179,7 +182,7 @@ def _rival(score: Floats, best: int) -> float:
 def _sigma(numerators: Floats, energy: Floats, best: int, step: float) -> float:
     """Standard error of the peak by the jackknife over groups of channels."""
     groups = min(GROUPS, numerators.shape[1])
-    if groups < 3 or not 0 < best < len(energy) - 1:
+    if groups < 3:
         return step / 2
     near = slice(best - 1, best + 2)
     total = numerators[near].sum(1)

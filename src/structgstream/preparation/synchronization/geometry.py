@@ -14,6 +14,7 @@ from structgstream.preparation.synchronization.epipolar import PairGeometry
 
 Floats = NDArray[np.float64]
 
+SAME_PLACE = 1e-6  # distance of cameras at one place, as a share of theirs to the origin
 FEATURES = 3000
 LONGER_SIDE = 960  # of pictures in which static features are looked for, pixels
 RATIO = 0.8
@@ -42,7 +43,8 @@ class CalibratedGeometry:
         one, other = self.cameras[first], self.cameras[second]
         relative = other.camera.viewmat.numpy() @ np.linalg.inv(one.camera.viewmat.numpy())
         x, y, z = relative[:3, 3]
-        if not np.linalg.norm(relative[:3, 3]) > 0:
+        size = max(float(np.linalg.norm(own.camera.viewmat.numpy()[:3, 3])) for own in (one, other))
+        if not np.linalg.norm(relative[:3, 3]) > SAME_PLACE * size:
             return None
         essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ relative[:3, :3]
         return PairGeometry(essential, (one.to_normalized, other.to_normalized))
