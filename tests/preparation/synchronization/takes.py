@@ -81,10 +81,11 @@ class MadeStreams:
         seed = self.cameras.index(name)
         generator = np.random.default_rng(seed)
         rough = generator.integers(30, 220, (HEIGHT // 8, WIDTH // 8, 3)).astype(np.uint8)
-        background = cv2.resize(rough, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+        background = np.asarray(cv2.resize(rough, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC), np.uint8)
         clock = self.clocks.get(name, Clock())
         for index in indices:
-            instant = 0.0 if name in self.still else clock.offset_seconds + clock.rate * self.own_stamps[name][index]
+            stamp = float(self.own_stamps[name][index])
+            instant = 0.0 if name in self.still else clock.offset_seconds + clock.rate * stamp
             yield picture(self.views[name], instant, background, generator)
 
     def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:

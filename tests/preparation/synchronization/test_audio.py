@@ -6,9 +6,9 @@ import pytest
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.audio import SPEED_OF_SOUND, audio_ties, sound_of
+from structgstream.preparation.synchronization.audio import SPEED_OF_SOUND, audio_ties, distances_from, sound_of
 from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
-from takes import heard
+from takes import heard, lenses, ring
 
 CLOCKS = {"a": Clock(0.0), "b": Clock(1.2345), "c": Clock(0.6)}
 
@@ -59,6 +59,12 @@ def test_known_distances_are_taken_out() -> None:
     )
     assert right.offsets["b"] == pytest.approx(1.2345, abs=1e-4)
     assert biased.offsets["b"] == pytest.approx(1.2345 - 3 / SPEED_OF_SOUND, abs=1e-4)
+
+
+def test_distances_are_those_of_the_lenses() -> None:
+    distances = distances_from(np.array([0.0, -0.4, 0.0]), lenses(ring(3)))
+    assert distances["cam0"] == pytest.approx(3.0)
+    assert distances["cam1"] == pytest.approx(np.hypot(3.0, 0.5))
 
 
 def test_different_sounds_have_no_ties() -> None:

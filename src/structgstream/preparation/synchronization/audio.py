@@ -16,6 +16,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.lenses import LensCamera
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal, best_lag
 from structgstream.preparation.synchronization.solving import Tie
@@ -68,6 +69,11 @@ def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
             "timestamps.csv."
         )
     return Sound(samples, rate, _onsets(samples, rate))
+
+
+def distances_from(position: Floats, cameras: Mapping[str, LensCamera]) -> dict[str, float]:
+    """Metres from each camera to where a sound was made, ``[3]``, for a calibration in metres."""
+    return {name: float(np.linalg.norm(own.camera.center.numpy() - position)) for name, own in cameras.items()}
 
 
 def audio_ties(sounds: Mapping[str, Sound], *, distances: Mapping[str, float] | None = None) -> list[Tie]:

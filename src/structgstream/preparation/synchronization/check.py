@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.preparation.synchronization.changes import Changes, reduced_changes, reduced_picture
+from structgstream.preparation.synchronization.correlation import demand_scipy
 from structgstream.preparation.synchronization.geometry import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
     agreeing_cameras,
@@ -78,6 +79,7 @@ def check_synchronization(source: FrameSource, *, frames: int = MOST_FRAMES) -> 
         CaptureError: the pictures cannot be read.
         MissingExtraError: cv2 or scipy is not installed.
     """
+    demand_scipy()
     period = 1 / source.fps
     changes = _changes(source, frames)
     cameras = {name: LensCamera(source.rig[name], Pinhole()) for name in source.rig}

@@ -10,6 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.errors import MissingExtraError
+
 Floats = NDArray[np.float64]
 
 GROUPS = 8  # of channels, left out one by one to see how the peak moves
@@ -55,6 +57,17 @@ class Lag:
     rival: float
     deviation: float
     middle: float
+
+
+def demand_scipy() -> None:
+    """
+    Raises:
+        MissingExtraError: scipy is not installed.
+    """
+    try:
+        import scipy  # noqa: F401
+    except ImportError:
+        raise MissingExtraError("scipy", "capture") from None
 
 
 def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:

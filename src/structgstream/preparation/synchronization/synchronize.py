@@ -14,6 +14,7 @@ from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.preparation.synchronization.audio import SPEED_OF_SOUND, audio_ties, sound_of
 from structgstream.preparation.synchronization.changes import Changes, picture_changes
+from structgstream.preparation.synchronization.correlation import demand_scipy
 from structgstream.preparation.synchronization.geometry import (
     CalibratedGeometry,
     Geometry,
@@ -83,6 +84,7 @@ def synchronize(
         return _unchanged(stamps)
     if method == "stamps":
         return _by_stamps(streams, stamps)
+    demand_scipy()
     if method == "motion":
         return _by_motion(streams, stamps, cameras, motion_seconds, "motion was asked for")
     if method == "audio":
