@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events under epipolar geometry: what changes on an epipolar line at an instant changes on the corresponding line of
+the other view at the same instant, whatever the depth.
+
+The changes of each view are summed over bundles of corresponding epipolar lines, which gives a signal for each bundle
+that both views see at the same time, without matching a point. (Motion barcodes of lines: Ben-Artzi, Kasten, Peleg
+and Werman, CVPR 2016; frontier points of silhouettes, which both views see on the same line: Hartley and Zisserman,
+chapter 9.)
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.preparation.synchronization.changes import Changes
+
+Floats = NDArray[np.float64]
+Straighten = Callable[[Floats], Floats]
+"""From pixels ``[S, 2]`` as filmed to points that obey the fundamental matrix; NaN where the lens has no inverse."""
+
+BUNDLES = 64
+LEAST_SHARE = 0.25  # of the pixels of the view that sees less of the common lines
+
+
+@dataclass(frozen=True)
+class PairGeometry:
+    """Epipolar geometry of two views.
+
+    Args:
+        F: ``[3, 3]`` with ``x2^T F x1 = 0`` for homogeneous points.
+        straighten: for each view, from filmed pixels to those points.
+        estimated: whether it is an estimate from pictures that may be wrong.
+    """
+
+    F: Floats
+    straighten: tuple[Straighten, Straighten]
+    estimated: bool = False
+
+
+def line_signals(first: Changes, second: Changes, geometry: PairGeometry) -> tuple[Floats, Floats] | None:
+    """Signals ``[T1, B]`` and ``[T2, B]`` of the bundles that both views see; None if these are too few.
+
+    Square roots are taken, so that a signal says rather where something moves than how much.
+    """
+    angles = _angles(first, second, geometry)
+    cut = _gap(np.concatenate(angles))
+    one, other = ((angle - cut) % np.pi for angle in angles)
+    low = max(_low(one), _low(other))
+    high = min(_high(one), _high(other))
+    if not high > low:
+        return None
+    if min(((each >= low) & (each <= high)).mean() for each in (one, other)) < LEAST_SHARE:
+        return None
+    # Bundles of equally many pixels: lines fan out, and a bundle of few pixels is noise.
+    both = np.concatenate([each[(each >= low) & (each <= high)] for each in (one, other)])
+    edges = np.quantile(both, np.linspace(0, 1, BUNDLES + 1))
+    return _summed(first, one, edges), _summed(second, other, edges)
+
+
+def _angles(first: Changes, second: Changes, geometry: PairGeometry) -> tuple[Floats, Floats]:
+    """For each pixel of both reduced views its epipolar line in the second view, as an angle modulo pi in the pencil of
+    these lines."""
+    F = geometry.F / np.linalg.norm(geometry.F)
+    epipole = np.linalg.svd(F)[0][:, 2]  # of the second view: e2^T F = 0
+    of_first = _points(first, geometry.straighten[0]) @ F.T
+    of_second = np.cross(epipole, _points(second, geometry.straighten[1]))
+    # Lines of a pencil have two coordinates; those in which the view's lines are spread evenly keep angles well scaled.
+    seen = of_second[np.isfinite(of_second).all(1)]
+    values, vectors = np.linalg.eigh(seen.T @ seen / len(seen))
+    coordinates = vectors[:, 1:] / np.sqrt(np.maximum(values[1:], 1e-12 * values[2]))
+    one, other = of_first @ coordinates, of_second @ coordinates
+    return np.arctan2(one[:, 0], one[:, 1]) % np.pi, np.arctan2(other[:, 0], other[:, 1]) % np.pi
+
+
+def _points(view: Changes, straighten: Straighten) -> Floats:
+    """Homogeneous points of the reduced pixels' centres."""
+    _, height, width = view.amounts.shape
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    points = straighten(np.stack([x.ravel() * view.size[0], y.ravel() * view.size[1]], axis=1))
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def _gap(angles: Floats) -> float:
+    """The angle in the middle of the widest range modulo pi that no line has."""
+    ordered = np.sort(angles[np.isfinite(angles)])
+    gaps = np.diff(ordered, append=ordered[0] + np.pi)
+    widest = int(gaps.argmax())
+    return float(ordered[widest] + gaps[widest] / 2) % np.pi
+
+
+def _low(angles: Floats) -> float:
+    return float(np.nanquantile(angles, 0.005))
+
+
+def _high(angles: Floats) -> float:
+    return float(np.nanquantile(angles, 0.995))
+
+
+def _summed(view: Changes, angles: Floats, edges: Floats) -> Floats:
+    """Square roots of the mean change ``[T, B]`` in each bundle."""
+    from scipy.sparse import csr_matrix
+
+    bundle = np.searchsorted(edges, angles, side="right") - 1
+    inside = np.isfinite(angles) & (bundle >= 0) & (bundle < BUNDLES)
+    pixels = np.flatnonzero(inside)
+    shape = (len(angles), BUNDLES)
+    membership = csr_matrix((np.ones(len(pixels), np.float32), (pixels, bundle[inside])), shape=shape)
+    counts = np.maximum(np.bincount(bundle[inside], minlength=BUNDLES), 1)
+    flat = view.amounts.reshape(len(view.amounts), -1)
+    sums = np.concatenate(
+        [part.astype(np.float32) @ membership for part in np.array_split(flat, max(len(flat) // 200, 1))]
+    )
+    return np.sqrt(sums / counts, dtype=np.float64)

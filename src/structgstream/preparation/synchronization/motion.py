@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Instants that pairs of cameras share, from what moves in their pictures.
+
+Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With
+epipolar geometry signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame
+for one pair. A first round considers all lags; the second one looks, near those that most pairs agree on, in each
+part of the take.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from structgstream.errors import CaptureError
+from structgstream.preparation.synchronization.changes import Changes
+from structgstream.preparation.synchronization.correlation import Signal, best_lag, chance_deviation, resampled
+from structgstream.preparation.synchronization.epipolar import line_signals
+from structgstream.preparation.synchronization.geometry import Geometry
+from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
+from structgstream.preparation.synchronization.streams import period_seconds
+
+LEAST_SAMPLES = 6  # that two views must have in common, in frames
+LEAST_OVERLAP = 0.2  # of the shorter take
+LEAST_PEAK = 0.25  # correlation of views that see the same
+# Of activities, and of lines whose geometry is an estimate from few features, a peak must stand out more.
+CHANCE_DEVIATIONS = 4.5
+ESTIMATED_PEAK, CONTROL_RATIO = 0.5, 1.2
+RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
+LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
+PART_SECONDS, MOST_PARTS = 8.0, 12
+NEAR_PERIODS = 2.0
+# Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
+# in periods, with a known geometry, with one from static features, and by activities.
+BIAS_PERIODS, ESTIMATED_BIAS_PERIODS, ACTIVITY_BIAS_PERIODS = 0.06, 0.3, 1.0
+OPTIMISM = 1.5  # true errors of pairs over their jackknife errors, measured on three captures with known clocks
+
+
+@dataclass(frozen=True)
+class PairSignals:
+    """Signals of two cameras that rise and fall together.
+
+    Args:
+        epipolar: whether they belong to corresponding epipolar lines, else to whole pictures.
+        estimated: whether the epipolar geometry is an estimate that may be wrong.
+    """
+
+    first: str
+    second: str
+    signals: tuple[Signal, Signal]
+    epipolar: bool
+    estimated: bool = False
+
+
+def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> list[PairSignals]:
+    """Signals of all pairs of cameras in which something moves: of epipolar lines where the geometry is known."""
+    moving = [name for name, change in changes.items() if change.moving]
+    found = []
+    for first, second in combinations(moving, 2):
+        one, other = changes[first], changes[second]
+        step = min(period_seconds(one.times), period_seconds(other.times))
+        pair = geometry.pair(first, second) if geometry else None
+        values = line_signals(one, other, pair) if pair else None
+        both = values or (one.activity, other.activity)
+        signals = resampled(both[0], one.times, step=step), resampled(both[1], other.times, step=step)
+        epipolar = values is not None
+        estimated = epipolar and pair is not None and pair.estimated
+        found.append(PairSignals(first, second, signals, epipolar, estimated))
+    return found
+
+
+def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -> list[Tie]:
+    """Ties from signals of pairs.
+
+    Args:
+        pairs: what :func:`pair_signals` gives.
+        near: clocks near which lags are looked for, in each part of the take; None looks at all lags of the whole take.
+    """
+    ties = []
+    for pair in pairs:
+        ties += _whole(pair) if near is None else _parts(pair, near)
+    return ties
+
+
+def solve_by_motion(
+    takes: Mapping[str, tuple[float, float]], pairs: Sequence[PairSignals], *, slack_seconds: float, drift: bool
+) -> Solution:
+    """Clocks by motion.
+
+    Args:
+        takes: camera to the first and last second of its take.
+        pairs: what :func:`pair_signals` gives.
+        slack_seconds: half a frame period.
+        drift: whether rates other than 1 are considered.
+
+    Raises:
+        CaptureError: cameras that share no motion with the others.
+    """
+    group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=slack_seconds)
+    if coarse is None or len(group) < len(takes):
+        raise CaptureError(_apart([name for name in takes if name not in group], group))
+    ties = motion_ties(good, near=coarse)
+    if len(connected(list(takes), ties)) > 1:  # parts of the take are too short or too still
+        ties = motion_ties(good)
+    solution = solve_clocks(takes, ties, drift=drift, slack_seconds=slack_seconds)
+    errors = {
+        name: float(np.hypot(solution.sigmas[name], _bias(name, good) * 2 * slack_seconds)) for name in solution.sigmas
+    }
+    return replace(solution, sigmas=errors)
+
+
+def agreeing_cameras(
+    takes: Mapping[str, tuple[float, float]], pairs: Sequence[PairSignals], *, slack_seconds: float
+) -> tuple[tuple[str, ...], Solution | None, list[PairSignals]]:
+    """The largest group of cameras whose motion agrees, its clocks by whole takes, and the pairs that agree with
+    these."""
+    ties = motion_ties(pairs)
+    group = connected(list(takes), ties)[0]
+    solution = None
+    good: list[PairSignals] = []
+    while len(group) > 1:
+        inside = [tie for tie in ties if tie.first in group and tie.second in group]
+        own = {name: takes[name] for name in group}
+        solution = solve_clocks(own, inside, drift=False, slack_seconds=slack_seconds)
+        agreeing = [tie for tie, agrees in zip(inside, solution.agreeing, strict=True) if agrees]
+        supported = [tie for tie in agreeing if _supported(tie, inside, agreeing)]
+        names = {(tie.first, tie.second) for tie in supported}
+        good = [pair for pair in pairs if (pair.first, pair.second) in names]
+        smaller = connected(list(group), supported)[0]
+        if len(smaller) == len(group):
+            return group, solution, good
+        group = smaller
+    return group, None, []
+
+
+def _bias(name: str, pairs: Sequence[PairSignals]) -> float:
+    """A camera's own error, in periods, by the best of its pairs."""
+    own = [pair for pair in pairs if name in (pair.first, pair.second)]
+    if any(pair.epipolar and not pair.estimated for pair in own):
+        return BIAS_PERIODS
+    return ESTIMATED_BIAS_PERIODS if any(pair.epipolar for pair in own) else ACTIVITY_BIAS_PERIODS
+
+
+def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
+    """Whether enough pairs of both cameras agree with their clocks, so that it is no chance."""
+    for name in (tie.first, tie.second):
+        all_, own = (sum(name in (each.first, each.second) for each in some) for some in (ties, agreeing))
+        if own < LEAST_SUPPORT * all_ or (own == 1 and all_ > 1):
+            return False
+    return True
+
+
+def _apart(apart: Sequence[str], group: Sequence[str]) -> str:
+    names = ", ".join(repr(name) for name in apart)
+    others = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
+    return (
+        f"What moves before {names} cannot be recognised in the motion before {others}, so their clocks are not "
+        "connected; film motion that all see (a person who walks and claps), give the calibration, or synchronise "
+        "by audio or "
+        "timestamps.csv."
+    )
+
+
+def _whole(pair: PairSignals) -> list[Tie]:
+    one, other = pair.signals
+    least = max(LEAST_SAMPLES, round(LEAST_OVERLAP * min(len(one.values), len(other.values))))
+    lag = best_lag(one, other, least_overlap=least)
+    if lag is None or lag.peak < LEAST_PEAK or lag.rival > RIVAL_RATIO * lag.judged:
+        return []
+    if not pair.epipolar and lag.judged < CHANCE_DEVIATIONS * chance_deviation(one, other):
+        return []
+    if pair.estimated and (lag.peak < ESTIMATED_PEAK or lag.judged < CONTROL_RATIO * _control(pair, least)):
+        return []
+    return [_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.judged / max(lag.rival, 0.1))]
+
+
+def _control(pair: PairSignals, least: int) -> float:
+    """The best correlation when lines are paired wrongly: a right geometry does better than that."""
+    one, other = pair.signals
+    half = other.values.shape[1] // 2
+    wrong = (other.values[:, ::-1], np.roll(other.values, half, 1), np.roll(other.values[:, ::-1], half, 1))
+    lags = [best_lag(one, replace(other, values=values), least_overlap=least) for values in wrong]
+    return max((lag.judged for lag in lags if lag is not None), default=0.0)
+
+
+def _parts(pair: PairSignals, near: Solution) -> list[Tie]:
+    one, other = pair.signals
+    step = one.step
+    rates, offsets = near.rates, near.offsets
+    # By the first camera's clock; rates differ so little that a constant lag holds within a part.
+    ratio = rates[pair.first] / rates[pair.second]
+    shift = (offsets[pair.first] - offsets[pair.second]) / rates[pair.second]
+    start = max(one.start, (other.start - shift) / ratio)
+    end = min(one.end, (other.end - shift) / ratio)
+    count = max(min(int((end - start) / PART_SECONDS), MOST_PARTS), 1)
+    ties = []
+    for part in range(count):
+        low, high = start + (end - start) * part / count, start + (end - start) * (part + 1) / count
+        expected = shift + (ratio - 1) * (low + high) / 2
+        reach = NEAR_PERIODS * step
+        cut = one.cut(low, high), other.cut(low + expected - reach, high + expected + reach)
+        least = max(LEAST_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
+        if min(len(signal.values) for signal in cut) < LEAST_SAMPLES:
+            continue
+        lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
+        if lag is not None and lag.peak >= LEAST_PEAK and abs(lag.seconds - expected) < reach - step / 2:
+            ties.append(_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak))
+    return ties
+
+
+def _tie(pair: PairSignals, middle: float, seconds: float, sigma: float, confidence: float) -> Tie:
+    weight = confidence * (4.0 if pair.epipolar else 1.0)
+    return Tie(pair.first, pair.second, middle, middle + seconds, OPTIMISM * sigma, weight)

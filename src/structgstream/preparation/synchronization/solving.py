@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks of all cameras from instants that pairs of cameras share.
+
+A tie says that the second ``first_seconds`` of one camera's clock was the second ``second_seconds`` of another's. With
+``common = offset + rate * stamp`` it is linear in both clocks, so all ties are solved by one weighted least squares.
+Wrong ties do not agree around loops of cameras: a start is chosen among spanning trees of the graph of cameras by how
+many ties it explains, and the weights are those of Tukey's biweight (iteratively reweighted least squares).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+TREES = 200
+ITERATIONS = 30
+RATE_PRIOR = 1e-4  # standard deviation of rates of quartz clocks
+RATE_SIGMAS, RATE_EFFECT_SECONDS = 3.0, 1e-3  # a rate other than 1 is kept if it exceeds both
+SIGMAS = 5.0  # ties further off than this many standard deviations are wrong
+
+
+@dataclass(frozen=True)
+class Tie:
+    """One instant by the clocks of two cameras.
+
+    Args:
+        first: name of a camera.
+        second: name of another.
+        first_seconds: the instant by the first camera's clock.
+        second_seconds: the same instant by the second camera's.
+        sigma_seconds: standard error of their difference.
+        confidence: how distinct the match is, larger is better; only orders ties.
+    """
+
+    first: str
+    second: str
+    first_seconds: float
+    second_seconds: float
+    sigma_seconds: float
+    confidence: float = 1.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Clocks that agree with most ties.
+
+    Args:
+        offsets: camera to seconds; the first camera's is 0.
+        rates: camera to rate; the first camera's is 1.
+        sigmas: camera to the standard error of its common time, relative to the mean of all cameras.
+        agreeing: for each tie whether it agrees.
+        residuals: for each tie the difference of its two common times, seconds.
+    """
+
+    offsets: Mapping[str, float]
+    rates: Mapping[str, float]
+    sigmas: Mapping[str, float]
+    agreeing: tuple[bool, ...]
+    residuals: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """Ties as arrays; ``times`` are relative to the middle of each camera's take."""
+
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+    first_times: Floats
+    second_times: Floats
+    differences: Floats
+    sigmas: Floats
+    cameras: int
+
+
+def connected(cameras: Sequence[str], ties: Sequence[Tie]) -> tuple[tuple[str, ...], ...]:
+    """Groups of cameras that ties connect, the largest first."""
+    group = {name: {name} for name in cameras}
+    for tie in ties:
+        one, other = group[tie.first], group[tie.second]
+        if one is not other:
+            one |= other
+            for name in other:
+                group[name] = one
+    unique = {id(members): members for members in group.values()}
+    groups = [tuple(name for name in cameras if name in members) for members in unique.values()]
+    return tuple(sorted(groups, key=len, reverse=True))
+
+
+def solve_clocks(
+    takes: Mapping[str, tuple[float, float]],
+    ties: Sequence[Tie],
+    *,
+    drift: bool,
+    slack_seconds: float,
+) -> Solution:
+    """The clocks of all cameras.
+
+    Args:
+        takes: camera to the first and last second of its take, by its own clock.
+        ties: instants of pairs; they must connect all cameras (:func:`connected`).
+        drift: whether rates other than 1 are considered.
+        slack_seconds: how far right ties may be off before rates are known.
+    """
+    names = list(takes)
+    middles = np.array([(start + end) / 2 for start, end in takes.values()])
+    halves = np.array([(end - start) / 2 for start, end in takes.values()])
+    graph = _graph(names, ties, middles)
+    offsets = _consensus(graph, [tie.confidence for tie in ties], slack_seconds)
+    corrections = np.zeros(len(names))
+    free = np.zeros(len(names), bool)
+    offsets, _, weights, covariance = _reweighted(graph, offsets, corrections, free, slack_seconds)
+    if drift and len(names) > 1:
+        offsets, corrections, weights, covariance = _with_rates(graph, offsets, halves, slack_seconds)
+    residuals = _residuals(graph, offsets, corrections)
+    variances = _relative_variances(covariance, len(names))
+    spread = np.sqrt(variances[0] + halves**2 * variances[1])
+    rates = (1 + corrections) / (1 + corrections[0])
+    at_zero = offsets - middles * corrections
+    at_zero = (at_zero - at_zero[0]) / (1 + corrections[0])
+    return Solution(
+        offsets=dict(zip(names, at_zero.tolist(), strict=True)),
+        rates=dict(zip(names, rates.tolist(), strict=True)),
+        sigmas=dict(zip(names, spread.tolist(), strict=True)),
+        agreeing=tuple((weights > 0).tolist()),
+        residuals=tuple(residuals.tolist()),
+    )
+
+
+def _graph(names: list[str], ties: Sequence[Tie], middles: Floats) -> _Graph:
+    position = {name: index for index, name in enumerate(names)}
+    first = np.array([position[tie.first] for tie in ties], np.intp)
+    second = np.array([position[tie.second] for tie in ties], np.intp)
+    at_first = np.array([tie.first_seconds for tie in ties])
+    at_second = np.array([tie.second_seconds for tie in ties])
+    sigmas = np.array([tie.sigma_seconds for tie in ties])
+    return _Graph(
+        first,
+        second,
+        at_first - middles[first],
+        at_second - middles[second],
+        at_first - at_second,
+        sigmas,
+        len(names),
+    )
+
+
+def _residuals(graph: _Graph, offsets: Floats, corrections: Floats) -> Floats:
+    """Common time by the first camera minus that by the second, for each tie."""
+    one = offsets[graph.first] + corrections[graph.first] * graph.first_times
+    other = offsets[graph.second] + corrections[graph.second] * graph.second_times
+    return one - other + graph.differences
+
+
+def _consensus(graph: _Graph, confidences: Sequence[float], slack_seconds: float) -> Floats:
+    """Offsets along the spanning tree that leaves the least truncated residuals.
+
+    The first tree takes ties by confidence, the others by confidence times a random factor.
+    """
+    generator = np.random.default_rng(0)
+    reach = SIGMAS * np.hypot(graph.sigmas, slack_seconds / 2)
+    share = np.array(confidences) / np.bincount(_pair_numbers(graph))[_pair_numbers(graph)]
+    best, least = np.zeros(graph.cameras), np.inf
+    for trial in range(TREES if len(graph.first) >= graph.cameras else 1):
+        chance = generator.exponential(size=len(share)) if trial else np.ones(len(share))
+        offsets = _along_tree(graph, np.argsort(-share * chance))
+        off = np.abs(_residuals(graph, offsets, np.zeros(graph.cameras)))
+        cost = float((share * np.minimum(off / reach, 1.0)).sum())
+        if cost < least:
+            best, least = offsets, cost
+    return best
+
+
+def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
+    """Offsets that satisfy the ties of a spanning tree, taken greedily in ``order`` (Kruskal)."""
+    group = np.arange(graph.cameras)
+    offsets = np.zeros(graph.cameras)
+    for tie in order:
+        one, other = graph.first[tie], graph.second[tie]
+        if group[one] == group[other]:
+            continue
+        moved = group == group[other]
+        # The whole group of the second camera moves, so that ties that joined it stay satisfied.
+        offsets[moved] += offsets[one] + graph.differences[tie] - offsets[other]
+        group[moved] = group[one]
+    return offsets
+
+
+def _reweighted(
+    graph: _Graph, offsets: Floats, corrections: Floats, free: NDArray[np.bool_], slack_seconds: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Offsets, rate corrections of the cameras that are ``free``, weights of ties, and the covariance of both.
+
+    The slack shrinks to the spread that the ties show.
+    """
+    slack = slack_seconds
+    weights = np.ones(len(graph.first))
+    covariance = np.zeros((2 * graph.cameras, 2 * graph.cameras))
+    for _ in range(ITERATIONS):
+        off = _residuals(graph, offsets, corrections)
+        scale = np.hypot(graph.sigmas, slack)
+        share = np.abs(off) / (SIGMAS * scale)
+        weights = np.where(share < 1, (1 - share**2) ** 2, 0.0) / scale**2
+        moved, covariance = _step(graph, off, weights, scale, corrections, free)
+        offsets, corrections = offsets + moved[: graph.cameras], corrections + moved[graph.cameras :]
+        inliers = weights > 0
+        spread = slack
+        if inliers.any():
+            freedom = max(int(inliers.sum()) - graph.cameras + 1, 1) / int(inliers.sum())
+            left = np.abs(_residuals(graph, offsets, corrections)[inliers])
+            spread = 1.4826 * float(np.median(left)) / freedom**0.5
+            slack = min(slack, max(spread, slack / 2))
+        if np.abs(moved[: graph.cameras]).max() < 1e-8 and slack < 1.05 * max(spread, 1e-9):
+            break
+    return offsets, corrections, weights, covariance
+
+
+def _step(
+    graph: _Graph, off: Floats, weights: Floats, scale: Floats, corrections: Floats, free: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """One Gauss-Newton step ``[2C]`` (offsets, rate corrections) and the covariance ``[2C, 2C]``.
+
+    The mean of the offsets and that of the free rates stay; rates have a prior.
+    """
+    count, rows = graph.cameras, np.arange(len(off))
+    design = np.zeros((len(off), 2 * count))
+    design[rows, graph.first] = 1
+    design[rows, graph.second] = -1
+    design[rows, count + graph.first] += graph.first_times
+    design[rows, count + graph.second] -= graph.second_times
+    used = np.concatenate([np.ones(count, bool), free])
+    normal = (design * weights[:, None]).T @ design
+    right = -(design * weights[:, None]).T @ off
+    prior = np.concatenate([np.zeros(count), np.full(count, 1 / RATE_PRIOR**2)])
+    normal += np.diag(prior)
+    right -= prior * np.concatenate([np.zeros(count), corrections])
+    kept = np.flatnonzero(used)
+    inverse = np.linalg.pinv(normal[np.ix_(kept, kept)], rcond=1e-13, hermitian=True)
+    moved, covariance = np.zeros(2 * count), np.zeros((2 * count, 2 * count))
+    moved[kept] = inverse @ right[kept]
+    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights, scale)
+    return moved, covariance
+
+
+def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> float:
+    """How much larger variances are than stated: the larger one of the reduced chi-squares of ties and of pairs, at
+    least 1.
+
+    Ties of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged by their
+    means.
+    """
+    inliers = weights > 0
+    ties, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
+    factor = 1.0
+    if ties > graph.cameras:
+        factor = max(factor, float(((off / scale)[inliers] ** 2).sum()) / (ties - graph.cameras + 1))
+    if len(pairs) > graph.cameras - 1:
+        numbers = _pair_numbers(graph)
+        total = np.bincount(numbers, weights)[pairs]
+        mean = np.bincount(numbers, weights * off)[pairs] / np.maximum(total, 1e-300)
+        factor = max(factor, float((total * mean**2).sum()) / (len(pairs) - graph.cameras + 1))
+    return factor
+
+
+def _pair_numbers(graph: _Graph) -> NDArray[np.intp]:
+    low, high = np.minimum(graph.first, graph.second), np.maximum(graph.first, graph.second)
+    return low * graph.cameras + high
+
+
+def _with_rates(
+    graph: _Graph, offsets: Floats, halves: Floats, slack_seconds: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """The solution with rates of the cameras whose rate matters: significant, and more than a millisecond in the
+    take."""
+    free = np.ones(graph.cameras, bool)
+    zeros = np.zeros(graph.cameras)
+    start = offsets
+    while True:
+        offsets, corrections, weights, covariance = _reweighted(graph, start, zeros, free, slack_seconds)
+        errors = np.sqrt(_relative_variances(covariance, graph.cameras)[1])
+        # Rates are relative: compared with the median, cameras of one kind of clock keep rate 1 together.
+        relative = corrections - (np.median(corrections) if free.all() else 0.0)
+        effect = np.abs(relative) * 2 * halves * (2 if graph.cameras == 2 else 1)
+        weak = (np.abs(relative) < RATE_SIGMAS * errors) | (effect < RATE_EFFECT_SECONDS)
+        if not (weak & free).any():
+            return offsets, corrections, weights, covariance
+        free &= ~weak
+
+
+def _relative_variances(covariance: Floats, count: int) -> tuple[Floats, Floats]:
+    """Variances of offsets and of rates relative to their means: only differences of clocks are observed."""
+    centering = np.eye(count) - 1 / count
+    offsets, rates = covariance[:count, :count], covariance[count:, count:]
+    common = centering if np.diag(rates).all() else np.eye(count)  # a rate that is fixed is what others are relative to
+    return np.diag(centering @ offsets @ centering), np.diag(common @ rates @ common.T)

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synchronises the files of still cameras that run freely."""
+
+import logging
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.lenses import LensCamera
+from structgstream.data.timeline import Clock
+from structgstream.errors import CaptureError, ConfigError
+from structgstream.preparation.synchronization.audio import SPEED_OF_SOUND, audio_ties, sound_of
+from structgstream.preparation.synchronization.changes import Changes, picture_changes
+from structgstream.preparation.synchronization.correlation import demand_scipy
+from structgstream.preparation.synchronization.geometry import (
+    CalibratedGeometry,
+    Geometry,
+    StaticGeometry,
+    static_features,
+)
+from structgstream.preparation.synchronization.motion import (
+    pair_signals,
+    solve_by_motion,
+)
+from structgstream.preparation.synchronization.result import Synchronization, synchronization
+from structgstream.preparation.synchronization.solving import connected, solve_clocks
+from structgstream.preparation.synchronization.streams import StatesMetadata, Streams, period_seconds
+from structgstream.preparation.synchronization.timestamps import read_timestamps
+from structgstream.preparation.synchronization.wall_clocks import wall_clocks
+
+_log = logging.getLogger(__name__)
+
+Method = Literal["auto", "csv", "stamps", "audio", "motion", "none"]
+METHODS: tuple[Method, ...] = ("auto", "csv", "stamps", "audio", "motion", "none")
+
+AUDIO_SLACK_SECONDS = 0.02  # what drift may make of a lag before rates are known
+SOUND_SPREAD_METRES = 1.0  # standard deviation of the cameras' distances from the sound, where these are not known
+STATIC_PICTURES = 9
+
+
+def synchronize(
+    streams: Streams,
+    *,
+    method: Method = "auto",
+    timestamps: Path | None = None,
+    cameras: Mapping[str, LensCamera] | None = None,
+    sound_distances: Mapping[str, float] | None = None,
+    motion_seconds: float = 60.0,
+) -> Synchronization:
+    """The clocks of the cameras.
+
+    Args:
+        streams: the files of each camera.
+        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which the caller says share a clock), ``audio``,
+        ``motion``,
+            ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
+            else audio if all cameras have sound in which something is common, else motion.
+        timestamps: a table of times (``timestamps.py``).
+        cameras: the calibration, if it is known; motion is exact with it and coarse without.
+        sound_distances: camera to its distance in metres from where the sound was made (a clap), if it is known.
+        motion_seconds: how much of the beginning of each take motion is looked for in.
+
+    Raises:
+        CaptureError: the cameras cannot be synchronised so; says which camera and why.
+        ConfigError: ``method`` is unknown, or csv without a table.
+        MissingExtraError: scipy or cv2 is not installed.
+    """
+    if method not in METHODS:
+        raise ConfigError(f"The method of synchronisation must be one of {', '.join(METHODS)}, got {method!r}.")
+    if method == "csv" and timestamps is None:
+        raise ConfigError(
+            "Synchronisation by csv needs timestamps.csv with the columns camera,frame,seconds; give its path."
+        )
+    stamps = {name: np.asarray(streams.stamps(name), np.float64) for name in streams.cameras}
+    for name, own in stamps.items():
+        if not len(own):
+            raise CaptureError(f"Camera {name!r} has no frames; add them or remove the camera.")
+    if timestamps is not None and method in ("auto", "csv"):
+        return _by_csv(timestamps, stamps)
+    if method == "none":
+        return _unchanged(stamps)
+    if method == "stamps":
+        return _by_stamps(streams, stamps)
+    demand_scipy()
+    if method == "motion":
+        return _by_motion(streams, stamps, cameras, motion_seconds, "motion was asked for")
+    if method == "audio":
+        return _by_audio(streams, stamps, sound_distances, "audio was asked for")
+    return _automatic(streams, stamps, cameras, sound_distances, motion_seconds)
+
+
+def _automatic(
+    streams: Streams,
+    stamps: Mapping[str, NDArray[np.float64]],
+    cameras: Mapping[str, LensCamera] | None,
+    distances: Mapping[str, float] | None,
+    motion_seconds: float,
+) -> Synchronization:
+    try:
+        return _by_audio(streams, stamps, distances, "all cameras have sound")
+    except CaptureError as problem:
+        reason = f"sound cannot be used ({str(problem).split('; ')[0].split('. ')[0].rstrip('.')})"
+    _log.info("synchronised by motion: %s", reason)
+    try:
+        return _by_motion(streams, stamps, cameras, motion_seconds, reason)
+    except CaptureError as problem:
+        raise CaptureError(f"{problem} Nor can sound be used: {reason.split('(', 1)[1].rstrip(')')}.") from None
+
+
+def _by_csv(file: Path, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
+    stated = read_timestamps(file, stamps)
+    return synchronization(
+        stamps,
+        {name: own.clock for name, own in stated.items()},
+        {name: own.spread_seconds for name, own in stated.items()},
+        method="csv",
+        reason=f"{file.name} states times",
+    )
+
+
+def _unchanged(stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
+    clocks, exact = dict.fromkeys(stamps, Clock()), dict.fromkeys(stamps, 0.0)
+    return synchronization(stamps, clocks, exact, method="none", reason="the cameras are said to be synchronous")
+
+
+def _by_stamps(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
+    stated = {name: streams.metadata(name) for name in stamps} if isinstance(streams, StatesMetadata) else {}
+    found = wall_clocks(stamps, stated)
+    return synchronization(
+        stamps,
+        {name: own.clock for name, own in found.items()},
+        {name: own.sigma_seconds for name, own in found.items()},
+        method="stamps",
+        reason=f"stamps of the files ({next(iter(found.values())).kind}) are said to share a clock",
+    )
+
+
+def _by_audio(
+    streams: Streams, stamps: Mapping[str, NDArray[np.float64]], distances: Mapping[str, float] | None, reason: str
+) -> Synchronization:
+    recorded = {name: streams.audio(name) for name in stamps}
+    mute = next((name for name, sound in recorded.items() if sound is None), None)
+    if mute is not None:
+        raise CaptureError(f"Camera {mute!r} has no sound; synchronise by motion or timestamps.csv.")
+    sounds = {name: sound_of(name, sound) for name, sound in recorded.items() if sound is not None}
+    ties = audio_ties(sounds, distances=distances)
+    takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
+    groups = connected(list(takes), ties)
+    if len(groups) > 1:
+        apart = ", ".join(repr(name) for group in groups[1:] for name in group)
+        raise CaptureError(
+            f"The sound of {apart} has nothing in common with that of {groups[0][0]!r}: no lag stands out, or the "
+            "videos are shorter "
+            "than the time between their starts; film a clap that all hear, or synchronise by motion or timestamps.csv."
+        )
+    solution = solve_clocks(takes, ties, drift=True, slack_seconds=AUDIO_SLACK_SECONDS)
+    way = 0.0 if distances else SOUND_SPREAD_METRES / SPEED_OF_SOUND
+    warnings = () if distances else (
+        f"Sound takes {1e3 / SPEED_OF_SOUND:.1f} ms a metre, and the distances of the cameras from it are not known: "
+        "clap in the middle of the cameras.",
+    )  # fmt: skip
+    return synchronization(
+        stamps,
+        {name: Clock(solution.offsets[name], solution.rates[name]) for name in stamps},
+        {name: float(np.hypot(solution.sigmas[name], way)) for name in stamps},
+        method="audio",
+        reason=reason,
+        warnings=warnings,
+    )
+
+
+def _by_motion(
+    streams: Streams,
+    stamps: Mapping[str, NDArray[np.float64]],
+    cameras: Mapping[str, LensCamera] | None,
+    seconds: float,
+    reason: str,
+) -> Synchronization:
+    if len(stamps) < 2:
+        return _unchanged(stamps)
+    used = {name: own[own <= own[0] + seconds] for name, own in stamps.items()}
+    changes = {name: picture_changes(_pictures(streams, name, len(own)), own) for name, own in used.items()}
+    demand_motion(changes)
+    geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(streams, used)
+    period = max(period_seconds(own) for own in stamps.values())
+    takes = {name: (float(own[0]), float(own[-1])) for name, own in used.items()}
+    solution = solve_by_motion(takes, pair_signals(changes, geometry), slack_seconds=period / 2, drift=True)
+    return synchronization(
+        stamps,
+        {name: Clock(solution.offsets[name], solution.rates[name]) for name in stamps},
+        solution.sigmas,
+        method="motion",
+        reason=reason,
+        warnings=() if cameras else ("Motion was compared without calibration: synchronise again when it is known.",),
+    )
+
+
+def demand_motion(changes: Mapping[str, Changes]) -> None:
+    """
+    Raises:
+        CaptureError: in a camera hardly anything moves.
+    """
+    still = [name for name, change in changes.items() if not change.moving]
+    if still:
+        raise CaptureError(
+            f"Too little moves in the pictures of {', '.join(repr(name) for name in still)} to synchronise by "
+            "motion; film people "
+            "who move, a clap for audio, or give timestamps.csv."
+        )
+
+
+def _pictures(streams: Streams, name: str, count: int) -> Iterator[NDArray[np.uint8]]:
+    return streams.pictures(name, np.arange(count))
+
+
+def _static_geometry(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> StaticGeometry:
+    features = {}
+    for name, own in stamps.items():
+        indices = np.unique(np.linspace(0, len(own) - 1, STATIC_PICTURES).round().astype(int))
+        features[name] = static_features(list(streams.pictures(name, indices)))
+    return StaticGeometry(features, {name: streams.size(name) for name in stamps})

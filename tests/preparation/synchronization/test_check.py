@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The check of captures that are said to be synchronous."""
+
+import pytest
+
+from structgstream.cameras import CameraRig
+from structgstream.data.clip import bundled_clip
+from structgstream.preparation.synchronization import check_synchronization
+from takes import MadeSource, ring
+
+RIG = CameraRig(ring(4))
+
+
+def test_a_synchronous_capture() -> None:
+    check = check_synchronization(MadeSource(RIG, {}))
+    assert check.conclusive
+    assert not check.off
+    assert not check.undecided
+    assert max(abs(late) for late in check.late_seconds.values()) < 0.15 / 30
+    assert check.message.startswith("The cameras are synchronous within")
+
+
+@pytest.mark.parametrize("frames", [1.0, -2.0, 0.5])
+def test_the_camera_that_is_off_is_named(frames: float) -> None:
+    check = check_synchronization(MadeSource(RIG, {"cam2": frames / 30}))
+    assert check.off == ("cam2",)
+    assert check.late_seconds["cam2"] == pytest.approx(frames / 30, abs=0.2 / 30)
+    assert abs(check.late_seconds["cam2"] - frames / 30) < 3 * check.uncertainty_seconds["cam2"]
+    assert f"Camera 'cam2' is {abs(check.late_seconds['cam2']) * 1e3:.1f} ms" in check.message
+    assert ("late" if frames > 0 else "early") in check.message
+
+
+def test_without_motion_it_cannot_be_told() -> None:
+    check = check_synchronization(MadeSource(RIG, {}, still=True))
+    assert not check.conclusive
+    assert check.undecided == tuple(RIG)
+    assert "cannot be told" in check.message
+
+
+def test_the_bundled_clip_is_synchronous() -> None:
+    check = check_synchronization(bundled_clip())
+    assert check.conclusive
+    assert not check.off

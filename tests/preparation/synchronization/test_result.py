@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What remains after choosing nearest frames, and what is warned of."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from properties import examples
+from structgstream.data.timeline import Clock
+from structgstream.errors import CaptureError
+from structgstream.preparation.synchronization.result import Synchronization, frame_residuals, synchronization
+
+STAMPS = np.arange(120) / 30
+
+
+def result(*offsets: float, sigma: float = 1e-4) -> Synchronization:
+    names = [f"cam{index}" for index in range(len(offsets))]
+    clocks = {name: Clock(offset) for name, offset in zip(names, offsets)}
+    stamps = dict.fromkeys(names, STAMPS)
+    return synchronization(stamps, clocks, dict.fromkeys(names, sigma), method="audio", reason="a test")
+
+
+@given(offsets=st.lists(st.floats(-1, 1), min_size=2, max_size=6))
+@examples(60)
+def test_nearest_frames_are_within_half_a_period(offsets: list[float]) -> None:
+    left = [estimate.residual_seconds for estimate in result(*offsets).clocks.values()]
+    assert np.abs(left).max() <= 1 / 60 + 1e-9
+    # Differences between cameras remain, up to whole frames.
+    rest = (left[1] - left[0] - (offsets[1] - offsets[0])) * 30
+    assert rest == pytest.approx(round(rest), abs=1e-6)
+
+
+def test_whole_frames_leave_nothing() -> None:
+    found = result(0.0, 5 / 30, -12 / 30)
+    assert all(abs(estimate.residual_seconds) < 1e-9 for estimate in found.clocks.values())
+    assert not found.warnings
+
+
+def test_half_a_frame_is_warned_of() -> None:
+    found = result(0.0, 0.0, 5.5 / 30)
+    assert any("cam2" in warning and "ms off the common instants" in warning for warning in found.warnings)
+    assert max(abs(estimate.residual_seconds) for estimate in found.clocks.values()) > 5e-3
+
+
+def test_a_vague_clock_is_warned_of() -> None:
+    assert any("may be wrong by one" in warning for warning in result(0.0, 0.1, sigma=0.02).warnings)
+
+
+def test_drift_and_other_rates_count() -> None:
+    common = {"a": STAMPS, "b": np.arange(240) / 60 + 2e-3, "c": STAMPS * (1 + 1e-3)}
+    left = frame_residuals(common)
+    assert abs(left["b"] - left["a"]) == pytest.approx(2e-3, abs=5e-3)
+    assert max(abs(left["a"]), abs(left["c"])) > 1.5e-3
+
+
+def test_an_absent_frame_is_not_late() -> None:
+    left = frame_residuals({"a": STAMPS, "b": np.delete(STAMPS, [40, 41, 42])})
+    assert left["b"] == pytest.approx(0, abs=1e-9)
+
+
+def test_videos_shorter_than_the_offset() -> None:
+    message = r"'cam0' \(3.97 s\) and 'cam1' \(3.97 s\) have no instant in common: .* 9.00 s apart"
+    with pytest.raises(CaptureError, match=message):
+        result(0.0, 9.0)

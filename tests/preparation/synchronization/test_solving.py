@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks from ties with errors, wrong ties and drift."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from structgstream.data.timeline import Clock
+from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
+
+TRUTH = {"a": Clock(0.0), "b": Clock(1.25), "c": Clock(-0.5), "d": Clock(3.0)}
+TAKES = dict.fromkeys(TRUTH, (0.0, 60.0))
+
+
+def ties_of(
+    clocks: Mapping[str, Clock], *, sigma: float, wrong: float = 0.0, each: int = 4, seed: int = 0
+) -> list[Tie]:
+    """``each`` ties of every pair, with normal errors; a share is wrong by up to ten seconds."""
+    generator = np.random.default_rng(seed)
+    names, ties = list(clocks), []
+    for i, first in enumerate(names):
+        for second in names[i + 1 :]:
+            for instant in np.linspace(5, 55, each):
+                stamps = [(instant - clocks[name].offset_seconds) / clocks[name].rate for name in (first, second)]
+                error = generator.uniform(-10, 10) if generator.random() < wrong else generator.normal(0, sigma)
+                ties.append(Tie(first, second, stamps[0], stamps[1] + error, sigma))
+    return ties
+
+
+def errors(solution: Solution, truth: Mapping[str, Clock], at: float) -> np.ndarray:
+    """Errors of common times at a stamp, relative to their mean."""
+    found = np.array([solution.offsets[name] + solution.rates[name] * at for name in truth])
+    first, clocks = next(iter(truth.values())), truth.values()
+    right = np.array([(clock.offset_seconds + clock.rate * at - first.offset_seconds) / first.rate for clock in clocks])
+    return (found - right) - (found - right).mean()
+
+
+def test_exact_ties_give_the_clocks() -> None:
+    solution = solve_clocks(TAKES, ties_of(TRUTH, sigma=1e-9), drift=True, slack_seconds=0.01)
+    assert np.abs(errors(solution, TRUTH, 0.0)).max() < 1e-8
+    assert set(solution.rates.values()) == {1.0}
+    assert solution.offsets["a"] == 0
+
+
+@pytest.mark.parametrize("wrong", [0.1, 0.3])
+def test_wrong_ties_do_not_move_the_clocks(wrong: float) -> None:
+    ties = ties_of(TRUTH, sigma=1e-3, wrong=wrong)
+    solution = solve_clocks(TAKES, ties, drift=False, slack_seconds=0.01)
+    assert np.abs(errors(solution, TRUTH, 0.0)).max() < 2e-3
+    off = np.abs(solution.residuals)
+    assert not any(agrees for agrees, residual in zip(solution.agreeing, off) if residual > 0.1)
+
+
+def test_uncertainties_hold() -> None:
+    """Errors over stated standard errors are standard normal over many trials: their mean square is near 1."""
+    scores = []
+    for seed in range(40):
+        solution = solve_clocks(TAKES, ties_of(TRUTH, sigma=1e-3, seed=seed), drift=False, slack_seconds=0.01)
+        scores.append(errors(solution, TRUTH, 0.0) / np.array(list(solution.sigmas.values())))
+    assert 0.5 < np.mean(np.square(scores)) < 1.5
+    assert np.mean(np.abs(scores) < 3) > 0.98
+
+
+def test_stated_errors_that_are_too_small_are_corrected_by_the_spread() -> None:
+    scores = []
+    for seed in range(40):
+        ties = [replace(tie, sigma_seconds=1e-5) for tie in ties_of(TRUTH, sigma=1e-3, seed=seed)]
+        solution = solve_clocks(TAKES, ties, drift=False, slack_seconds=0.01)
+        scores.append(errors(solution, TRUTH, 0.0) / np.array(list(solution.sigmas.values())))
+    assert 0.5 < np.mean(np.square(scores)) < 1.7
+    assert np.mean(np.abs(scores) < 3) > 0.95
+
+
+def test_drift_is_found_where_it_matters() -> None:
+    truth = {**TRUTH, "c": Clock(-0.5, 1 + 60e-6)}
+    solution = solve_clocks(TAKES, ties_of(truth, sigma=2e-4), drift=True, slack_seconds=0.01)
+    assert solution.rates["c"] - 1 == pytest.approx(60e-6, abs=10e-6)
+    assert {solution.rates[name] for name in "abd"} == {1.0}
+    for at in (0.0, 60.0):
+        assert np.abs(errors(solution, truth, at)).max() < 5e-4
+
+
+def test_drift_of_two_cameras() -> None:
+    truth = {"a": Clock(0.0), "b": Clock(2.0, 1 - 50e-6)}
+    takes = {name: TAKES[name] for name in truth}
+    solution = solve_clocks(takes, ties_of(truth, sigma=1e-4, each=10), drift=True, slack_seconds=0.01)
+    assert solution.rates["b"] - 1 == pytest.approx(-50e-6, abs=10e-6)
+
+
+def test_drift_within_the_noise_is_no_drift() -> None:
+    truth = {**TRUTH, "c": Clock(-0.5, 1 + 5e-6)}
+    solution = solve_clocks(TAKES, ties_of(truth, sigma=1e-3), drift=True, slack_seconds=0.01)
+    assert set(solution.rates.values()) == {1.0}
+
+
+def test_groups_of_connected_cameras() -> None:
+    ties = [Tie("a", "b", 0, 0, 1), Tie("d", "c", 0, 0, 1), Tie("b", "e", 0, 0, 1)]
+    assert connected("abcdef", ties) == (("a", "b", "e"), ("c", "d"), ("f",))

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The choice of the method, and what each says when it cannot work."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from structgstream.data.timeline import Clock
+from structgstream.errors import CaptureError, ConfigError
+from structgstream.preparation.synchronization import synchronize
+from takes import MadeStreams, heard, lenses, ring
+
+VIEWS = ring(3, degrees=60)
+CLOCKS = {"cam0": Clock(0.0), "cam1": Clock(0.4), "cam2": Clock(0.15)}
+STAMPS = {name: np.arange(75) / 30 for name in VIEWS}
+MOVING = MadeStreams(STAMPS, VIEWS, CLOCKS)
+
+
+def heard_streams(**how: object) -> MadeStreams:
+    sounds = heard(CLOCKS, seconds=6.0, **how)  # type: ignore[arg-type]
+    return MadeStreams({name: np.arange(180) / 30 for name in VIEWS}, VIEWS, CLOCKS, sounds)
+
+
+def test_a_table_comes_first(tmp_path: Path) -> None:
+    file = tmp_path / "timestamps.csv"
+    file.write_text("camera,frame,seconds\ncam0,0,5\ncam1,0,5.5\ncam2,3,5.1\n")
+    found = synchronize(heard_streams(), timestamps=file)
+    assert (found.method, found.reason) == ("csv", "timestamps.csv states times")
+    assert found.clocks["cam1"].clock == Clock(5.5)
+
+
+def test_sound_comes_before_motion() -> None:
+    found = synchronize(heard_streams())
+    assert found.method == "audio"
+    for name, clock in CLOCKS.items():
+        assert found.clocks[name].clock.offset_seconds == pytest.approx(clock.offset_seconds, abs=1e-4)
+        assert 2e-3 < found.clocks[name].uncertainty_seconds < 4e-3  # of a metre that the sound may need longer
+    assert any("ms a metre" in warning for warning in found.warnings)
+
+
+def test_known_distances_make_sound_exact() -> None:
+    found = synchronize(heard_streams(), sound_distances=dict.fromkeys(VIEWS, 2.0))
+    assert max(estimate.uncertainty_seconds for estimate in found.clocks.values()) < 2e-4
+    assert not any("ms a metre" in warning for warning in found.warnings)
+
+
+def test_without_sound_motion_decides_and_says_why() -> None:
+    found = synchronize(MOVING, cameras=lenses(VIEWS))
+    assert found.method == "motion"
+    assert "Camera 'cam0' has no sound" in found.reason
+    errors = np.array([found.clocks[name].clock.offset_seconds - CLOCKS[name].offset_seconds for name in VIEWS])
+    assert np.abs(errors - errors.mean()).max() < 0.2 / 30
+    # cam2 is 4.5 frames from cam0, which choosing frames cannot mend.
+    assert found.clocks["cam2"].residual_seconds - found.clocks["cam0"].residual_seconds == pytest.approx(
+        1 / 60, abs=0.01
+    ) or any("off the common instants" in warning for warning in found.warnings)
+
+
+def test_stamps_only_when_asked_for() -> None:
+    texts = {name: {"timecode": f"10:00:0{index}:00"} for index, name in enumerate(VIEWS)}
+    streams = MadeStreams({name: np.arange(150) / 30 for name in VIEWS}, texts=texts)
+    found = synchronize(streams, method="stamps")
+    assert found.clocks["cam2"].clock.offset_seconds == pytest.approx(2)
+    with pytest.raises(CaptureError, match="share no clock"):
+        synchronize(MadeStreams(STAMPS), method="stamps")
+
+
+def test_cameras_that_one_signal_started() -> None:
+    found = synchronize(MadeStreams(STAMPS), method="none")
+    assert all(estimate.clock == Clock() for estimate in found.clocks.values())
+
+
+def test_problems_are_one_sentence_with_the_camera() -> None:
+    still = MadeStreams(STAMPS, VIEWS, CLOCKS, still=frozenset({"cam1"}))
+    with pytest.raises(CaptureError, match=r"^Too little moves in the pictures of 'cam1'"):
+        synchronize(still, method="motion", cameras=lenses(VIEWS))
+    with pytest.raises(CaptureError, match=r"Too little moves .* Nor can sound be used: Camera 'cam0' has no sound"):
+        synchronize(still, cameras=lenses(VIEWS))
+    mute = heard_streams()
+    mute = MadeStreams(mute.own_stamps, VIEWS, CLOCKS, {name: mute.sounds[name] for name in ("cam0", "cam2")})
+    with pytest.raises(CaptureError, match=r"^Camera 'cam1' has no sound; synchronise by motion or timestamps.csv"):
+        synchronize(mute, method="audio")
+    other = heard({"cam1": Clock()}, seconds=6.0, seed=8)
+    strange = MadeStreams(mute.own_stamps, VIEWS, CLOCKS, {**mute.sounds, **other})
+    with pytest.raises(CaptureError, match=r"^The sound of 'cam1' has nothing in common with that of 'cam0'"):
+        synchronize(strange, method="audio")
+    with pytest.raises(CaptureError, match=r"^Camera 'cam1' has no frames"):
+        synchronize(MadeStreams({**STAMPS, "cam1": np.zeros(0)}))
+
+
+def test_options_that_cannot_be() -> None:
+    with pytest.raises(ConfigError, match="must be one of auto, csv"):
+        synchronize(MOVING, method="guess")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"needs timestamps.csv"):
+        synchronize(MOVING, method="csv")
