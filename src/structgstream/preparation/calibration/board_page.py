@@ -57,7 +57,7 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
     figure.text(
         (MARGIN_MM + BAR_MM + 6) / width,
         MARGIN_MM / height,
-        f"Print at 100 %, without fitting to the page: the bar is {BAR_MM:g} mm long. Glue to something flat and stiff.",
+        f"Print at 100 %, without fitting to the page: the bar is {BAR_MM:g} mm long. Glue it to something flat.",
         fontsize=6.5,
         va="bottom",
     )
