@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
+from structgstream.preparation.calibration.board import Board
 
 Floats = NDArray[np.float64]
 
@@ -100,10 +101,51 @@ def ring(
     return found
 
 
-def board_texture(board: object, *, pixels_a_square: int = 60) -> NDArray[np.uint8]:
-    """The board of :class:`structgstream.preparation.calibration.board.Board` as a picture without margin."""
-    from structgstream.preparation.calibration.board import Board
+def board_plane(board: Board, pose: Floats, *, pixels_a_square: int = 40) -> Plane:
+    """``board`` with a white margin of half a square; ``pose [4, 4]`` is that of the board's top-left corner."""
+    margin = pixels_a_square // 2
+    size = (board.columns + 1) * pixels_a_square, (board.rows + 1) * pixels_a_square
+    texture = board.opencv_board().generateImage(size, marginSize=margin)
+    moved = pose.copy()
+    moved[:3, 3] -= pose[:3, :2].sum(1) * board.square_metres / 2
+    width, height = (side + board.square_metres for side in board.size_metres)
+    return Plane(np.asarray(texture, np.uint8), moved, (width, height))
 
-    assert isinstance(board, Board)
-    size = board.columns * pixels_a_square, board.rows * pixels_a_square
-    return np.asarray(board.opencv_board().generateImage(size, marginSize=0), np.uint8)
+
+def noise_texture(seed: int, *, size: int = 768) -> NDArray[np.uint8]:
+    """Blobs of many sizes in colour, ``[size, size, 3]``."""
+    generator = np.random.default_rng(seed)
+    total = np.zeros((size, size, 3), np.float32)
+    for cells in (12, 24, 48, 96, 160):
+        coarse = generator.normal(size=(cells, cells, 3)).astype(np.float32)
+        total += cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC)
+    total -= total.min()
+    return np.asarray(255 * total / total.max(), np.uint8)
+
+
+def room(seed: int = 0) -> list[Plane]:
+    """A floor, a back wall and standing boards around the origin, each with a texture of its own; y points down."""
+    sheets = [
+        ((-2.0, 0.8, -2.0), (90.0, 0.0), (4.0, 4.0)),  # floor
+        ((-2.2, -1.6, 1.8), (0.0, 0.0), (4.4, 2.4)),  # back wall
+        ((-1.0, -0.6, 0.5), (0.0, 25.0), (0.9, 1.3)),
+        ((0.2, -0.5, 0.2), (0.0, -30.0), (0.9, 1.2)),
+        ((-0.4, 0.0, -0.5), (0.0, 5.0), (0.8, 0.7)),
+    ]
+    planes = []
+    for index, (corner, (pitch, yaw), size) in enumerate(sheets):
+        pose = np.eye(4)
+        pose[:3, :3] = turned(yaw, axis=1) @ turned(pitch, axis=0)
+        pose[:3, 3] = corner
+        planes.append(Plane(noise_texture(100 * seed + index), pose, size))
+    return planes
+
+
+def turned(degrees: float, *, axis: int) -> Floats:
+    """The rotation ``[3, 3]`` about a coordinate axis."""
+    one, two = [index for index in range(3) if index != axis]
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    found = np.eye(3)
+    found[one, one] = found[two, two] = cosine
+    found[one, two], found[two, one] = (-sine, sine) if axis != 1 else (sine, -sine)
+    return found
