@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model from a view graph: incremental mapping, global mapping and bundle adjustment by COLMAP."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +24,7 @@ class Freedom:
 
     Args:
         focal: focal lengths.
-        center: principal points; in the last adjustment only, because they trade off with rotations.
+        center: principal points, in :func:`adjust` only and held near the pictures' centres (Note [Principal points]).
         lens: distortion.
     """
 
@@ -120,7 +121,47 @@ def adjust(
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = 1e-9
     options.ceres.solver_options.max_num_iterations = 200
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    with _held_centers(model, config, hold=freedom.center and not constant_points):
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+@contextmanager
+def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
+    """Holds the principal points of a model near the centres of their pictures while it is adjusted.
+
+    Note [Principal points]: cameras that surround a scene hardly tell a principal point from a rotation, so freed ones
+    wander off, and focal lengths with them. A point on the optical axis is seen in the principal point whatever focal
+    length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is seen in the
+    picture's centre: one observation more, which hundreds of others overrule where they know better.
+    """
+    if not hold:
+        yield
+        return
+    pycolmap = pycolmap_module()
+    axis = model.add_point3D(np.array([0.0, 0.0, 1.0]), pycolmap.Track(), np.zeros(3, np.uint8))
+    config.add_constant_point(axis)
+    rigs = {rig.ref_sensor_id.id: number for number, rig in model.rigs.items()}
+    image_id, frame_id = max(model.images), max(model.frames)
+    frames = []
+    for number in sorted(set(model.cameras) - set(config.constant_cam_intrinsics)):
+        camera, image_id, frame_id = model.camera(number), image_id + 1, frame_id + 1
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=rigs[number], rig_from_world=pycolmap.Rigid3d())
+        frame.add_data_id(pycolmap.data_t(camera.sensor_id, image_id))
+        model.add_frame(frame)
+        image = pycolmap.Image(name=f"center {number}", camera_id=number, image_id=image_id, frame_id=frame_id)
+        center = np.array([camera.width / 2, camera.height / 2])
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(center, axis)] * 2)  # a track has at least two
+        model.add_image(image)
+        model.register_frame(frame_id)
+        for index in range(2):
+            model.point3D(axis).track.add_element(image_id, index)
+        config.add_image(image_id)
+        config.set_constant_rig_from_world_pose(frame_id)
+        frames.append(frame_id)
+    yield
+    model.delete_point3D(axis)
+    for frame_id in frames:
+        model.deregister_frame(frame_id)
 
 
 def filtered(model: Any, *, pixels: float, degrees: float) -> int:

@@ -86,7 +86,7 @@ def solve_structure(
     lens: LensModel = "radial",
     intrinsics: Intrinsics = "own",
     field_of_view: float | Mapping[str, float] | None = None,
-    centers: bool = False,
+    centers: bool = True,
     known: Mapping[str, LensCamera] | None = None,
     masks: Masks | None = None,
     seed: int = 0,
@@ -100,8 +100,8 @@ def solve_structure(
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
         field_of_view: degrees across the longer side, for all cameras or by name, to begin with; by default some are
             tried.
-        centers: whether principal points are estimated, too, in place of being the pictures' centres. Cameras that
-            surround a scene hardly tell them from rotations, so this usually makes focal lengths worse.
+        centers: whether principal points are estimated, held near the pictures' centres (mapping.py, Note [Principal
+            points]); otherwise they are the centres.
         known: cameras whose intrinsics and lens are known and stay; their poses are not read.
         masks: camera name to a mask ``[H, W]`` per picture, True where it counts.
         seed: of the robust estimation; equal input and seed give equal output.
