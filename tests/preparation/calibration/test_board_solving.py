@@ -17,10 +17,10 @@ from structgstream.preparation.calibration.comparison import calibration_errors
 
 BOARD = Board(7, 5, 0.12)
 INSTANTS = 16
-LENSES: dict[LensModel, tuple[Lens, float]] = {
-    "pinhole": (Pinhole(), 300.0),
-    "radial": (RadialTangential(k1=-0.2, k2=0.04), 280.0),
-    "fisheye": (Fisheye(0.02, -0.005, 0.001), 360 / np.radians(130)),
+LENSES: dict[LensModel, tuple[Lens, float, tuple[int, int]]] = {
+    "pinhole": (Pinhole(), 300.0, (360, 270)),
+    "radial": (RadialTangential(k1=-0.2, k2=0.04), 280.0, (360, 270)),
+    "fisheye": (Fisheye(0.02, -0.005, 0.001), 480 / np.radians(120), (480, 360)),
 }
 Pictures = dict[str, list[NDArray[np.uint8]]]
 
@@ -28,8 +28,8 @@ Pictures = dict[str, list[NDArray[np.uint8]]]
 @cache
 def filmed(model: LensModel) -> tuple[dict[str, LensCamera], Pictures]:
     """Three cameras, and their pictures of the board near them, tilted at random."""
-    lens, focal = LENSES[model]
-    rig = ring(3, radius=1.1, arc_degrees=50, focal=focal, lens=lens, size=(360, 270))
+    lens, focal, size = LENSES[model]
+    rig = ring(3, radius=1.1, arc_degrees=50, focal=focal, lens=lens, size=size)
     generator = np.random.default_rng(3)
     reach = 0.45 if model == "fisheye" else 0.3
     planes = []
@@ -37,7 +37,7 @@ def filmed(model: LensModel) -> tuple[dict[str, LensCamera], Pictures]:
         yaw, pitch, roll = generator.uniform([-40, -35, -25], [40, 35, 25])
         pose = np.eye(4)
         pose[:3, :3] = turned(yaw, axis=1) @ turned(pitch, axis=0) @ turned(roll, axis=2)
-        middle = generator.uniform([-reach, -reach, -0.45], [reach, reach, 0.3])
+        middle = generator.uniform([-reach, -reach, -0.45], [reach, reach, 0.0 if model == "fisheye" else 0.3])
         pose[:3, 3] = middle - pose[:3, :3] @ [*(side / 2 for side in BOARD.size_metres), 0.0]
         planes.append(board_plane(BOARD, pose))
     films = {name: Film(camera) for name, camera in rig.items()}

@@ -44,7 +44,8 @@ def board_model(
         else:
             rig.add_sensor(camera.sensor_id, colmap_pose(sensors[name]))
     model.add_rig(rig)
-    corners = [model.add_point3D(xyz, pycolmap.Track(), np.zeros(3, np.uint8)) for xyz in board.corners]
+    black = np.zeros(3, np.uint8)
+    corners = {index: model.add_point3D(board.corners[index], pycolmap.Track(), black) for index in _repeated(sightings)}
     images: list[tuple[int, str, Sighting]] = []
     for instant, pose in rig_poses.items():
         frame = pycolmap.Frame(frame_id=instant + 1, rig_id=1)
@@ -61,15 +62,27 @@ def board_model(
             image_id=number,
             frame_id=sight.instant + 1,
         )
-        seen = zip(sight.pixels, sight.corners, strict=True)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel, corners[corner]) for pixel, corner in seen])
+        seen = [(pixel, corners[corner]) for pixel, corner in _of_points(sight, corners)]
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel, point) for pixel, point in seen])
         model.add_image(image)
     for instant in rig_poses:
         model.register_frame(instant + 1)
     for number, _, sight in images:
-        for index, corner in enumerate(sight.corners):
+        for index, (_, corner) in enumerate(_of_points(sight, corners)):
             model.point3D(corners[corner]).track.add_element(number, index)
     return model
+
+
+def _repeated(sightings: Sightings) -> list[int]:
+    """The corners that are seen at least twice: COLMAP adjusts no others."""
+    seen = [sight.corners for sights in sightings.values() for sight in sights]
+    corners, counts = np.unique(np.concatenate(seen), return_counts=True)
+    return [int(corner) for corner in corners[counts > 1]]
+
+
+def _of_points(sight: Sighting, points: Mapping[int, int]) -> list[tuple[Floats, int]]:
+    pairs = zip(sight.pixels, sight.corners.tolist(), strict=True)
+    return [(pixel, corner) for pixel, corner in pairs if corner in points]
 
 
 def sensor_poses(model: Any, cameras: Mapping[str, Any]) -> dict[str, Floats]:
