@@ -45,7 +45,8 @@ def board_model(
             rig.add_sensor(camera.sensor_id, colmap_pose(sensors[name]))
     model.add_rig(rig)
     black = np.zeros(3, np.uint8)
-    corners = {index: model.add_point3D(board.corners[index], pycolmap.Track(), black) for index in _repeated(sightings)}
+    places = board.corners
+    corners = {index: model.add_point3D(places[index], pycolmap.Track(), black) for index in _repeated(sightings)}
     images: list[tuple[int, str, Sighting]] = []
     for instant, pose in rig_poses.items():
         frame = pycolmap.Frame(frame_id=instant + 1, rig_id=1)

@@ -16,8 +16,8 @@ from structgstream.preparation.calibration.board import Board, dictionaries
 
 LEAST_CORNERS = 6
 LEAST_SIGHTINGS = 4
-OFF_BOARD_SHARE = 0.02
 WRONG_LAYOUT = 0.5
+MANY_MARKERS = 6
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ def board_sightings(
     """
     found: dict[str, list[Sighting]] = {name: [] for name in pictures}
     markers = {name: set[int]() for name in pictures}
+    without_corners = 0
     tasks = [(name, instant) for name, shots in pictures.items() for instant in range(len(shots))]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         sights = pool.map(lambda task: _sighted(pictures[task[0]][task[1]], board), tasks)
@@ -52,6 +53,13 @@ def board_sightings(
             markers[name] |= ids
             if len(corners) >= LEAST_CORNERS and not _collinear(corners, board):
                 found[name].append(Sighting(instant, corners, pixels))
+            elif len(ids) >= MANY_MARKERS and len(corners) == 0:
+                without_corners += 1
+    if without_corners > sum(map(len, found.values())):
+        raise CalibrationError(
+            f"{without_corners} pictures show markers of {board.dictionary}, but not where a board of {board.text} has "
+            "them; give the board's real numbers of squares and markers, as printed on its page."
+        )
     _check_markers(pictures, board, markers, found)
     _check_layout(board, found)
     few = [name for name in pictures if len(found[name]) < LEAST_SIGHTINGS]
