@@ -134,7 +134,8 @@ def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
     length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is seen in the
     picture's centre: one observation more, which hundreds of others overrule where they know better.
     """
-    if not hold:
+    free = sorted(set(model.cameras) - set(config.constant_cam_intrinsics))
+    if not hold or not free:
         yield
         return
     pycolmap = pycolmap_module()
@@ -143,7 +144,7 @@ def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
     rigs = {rig.ref_sensor_id.id: number for number, rig in model.rigs.items()}
     image_id, frame_id = max(model.images), max(model.frames)
     frames = []
-    for number in sorted(set(model.cameras) - set(config.constant_cam_intrinsics)):
+    for number in free:
         camera, image_id, frame_id = model.camera(number), image_id + 1, frame_id + 1
         frame = pycolmap.Frame(frame_id=frame_id, rig_id=rigs[number], rig_from_world=pycolmap.Rigid3d())
         frame.add_data_id(pycolmap.data_t(camera.sensor_id, image_id))

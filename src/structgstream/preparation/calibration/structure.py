@@ -251,10 +251,11 @@ def _finished(
     steady = replace(attempt.freedom, center=False)
     adjust(model, freedom=steady, fixed=attempt.fixed)
     filtered(model, pixels=limit, degrees=config.degrees)
+    full = replace(attempt.freedom, center=centers and attempt.freedom.center)
     for _ in range(2):
-        adjust(model, freedom=replace(steady, center=centers), fixed=attempt.fixed)
+        adjust(model, freedom=full, fixed=attempt.fixed)
         filtered(model, pixels=limit, degrees=config.degrees)
-    adjust(model, freedom=replace(steady, center=centers), fixed=attempt.fixed)
+    adjust(model, freedom=full, fixed=attempt.fixed)
     found = cameras_of(model)
     cameras = {name: found[name] for name in pictures if name in found}
     points, observations = observed(model, keypoints, {name: index for index, name in enumerate(cameras)})
