@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
+from structgstream.data.alignment import alignment
 from structgstream.data.posed import Calibration, PosedCamera
 
 log = logging.getLogger(__name__)
@@ -31,23 +32,19 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
             model.where, len(found),
         )  # fmt: skip
         return None
+    fitted = alignment(
+        {name: posed.viewmat for name, posed in found.items()}, {name: rig[name].viewmat.numpy() for name in found}
+    )
     theirs = np.array([posed.center for posed in found.values()])
     ours = np.array([rig[name].center.numpy() for name in found])
-    # The rotation by the cameras' axes: positions alone do not give it when cameras stand in a line.
-    turns = sum(rig[name].viewmat[:3, :3].numpy().T @ posed.viewmat[:3, :3] for name, posed in found.items())
-    u, _, vh = np.linalg.svd(turns)
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh
-    turned = (theirs - theirs.mean(0)) @ rotation.T
-    centred = ours - ours.mean(0)
-    scale = (turned * centred).sum() / max((turned**2).sum(), 1e-300)
-    off = np.linalg.norm(scale * turned - centred, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
+    off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
     if not off <= MOST_OFF:
         log.warning(
             "The cameras of %s lie up to %.0f %% of the rig's extent away from the rig's; its points are not used.",
             model.where, 100 * off,
         )  # fmt: skip
         return None
-    return (model.points - theirs.mean(0)) @ rotation.T * scale + ours.mean(0)
+    return fitted.points(model.points)
 
 
 def _common(model: Calibration, rig: CameraRig) -> dict[str, PosedCamera]:

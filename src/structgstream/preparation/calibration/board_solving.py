@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras, lenses and their poses in metres from a ChArUco board that is shown around."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.calibration import listed
+from structgstream.data.lenses import LensCamera
+from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.calibration.board_model import (
+    Floats,
+    Sightings,
+    board_model,
+    matrix,
+    rig_poses,
+    sensor_poses,
+)
+from structgstream.preparation.calibration.board_sightings import Sighting, board_sightings
+from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, filmed_camera, pycolmap_module
+from structgstream.preparation.calibration.intrinsics import guessed_camera
+from structgstream.preparation.calibration.mapping import Freedom, adjust
+from structgstream.preparation.calibration.pictures import checked_pictures
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+
+FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
+    "pinhole": (30.0, 50.0, 70.0, 90.0),
+    "radial": (30.0, 50.0, 70.0, 90.0),
+    "opencv": (30.0, 50.0, 70.0, 90.0),
+    "fisheye": (60.0, 90.0, 120.0, 150.0, 175.0),
+}
+MOST_SIGHTINGS_ALONE = 24
+POSE_PIXELS = 0.02  # of the longer side: coarse, since the lens is not known yet
+OUTLIER_PIXELS = 2.0
+
+
+def solve_board(
+    pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
+    board: Board,
+    *,
+    lens: LensModel = "opencv",
+    known: Mapping[str, LensCamera] | None = None,
+    seed: int = 0,
+) -> SolvedCalibration:
+    """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
+
+    The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
+    share, and all of them, with the board's pose at each instant, are then adjusted together.
+
+    Args:
+        pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
+        lens: which distortion is estimated.
+        known: cameras whose intrinsics and lens are known and stay; their poses are not read.
+
+    Returns:
+        the calibration in metres, in the axes of the first camera; the points are the board's corners at each instant.
+
+    Raises:
+        CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
+            the others; another board than said.
+        MissingExtraError: pycolmap or cv2 is not installed.
+    """
+    pycolmap_module()
+    checked_pictures(pictures)
+    sightings = board_sightings(pictures, board)
+    known = known or {}
+    views = {}
+    for number, (name, shots) in enumerate(pictures.items(), 1):
+        size = shots[0].shape[1], shots[0].shape[0]
+        starts = [colmap_camera(known[name], number)] if name in known else _guesses(lens, number, size)
+        views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known, seed=seed)
+    sensors = _connected_sensors(views)
+    poses = _rig_poses(views, sensors, sightings)
+    cameras = {name: view.camera for name, view in views.items()}
+    fixed = frozenset(cameras[name].camera_id for name in known)
+    free = Freedom(*[len(known) < len(pictures)] * 3)
+    kept: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
+    for _ in range(2):
+        model = board_model(board, kept, cameras, sensors, poses)
+        adjust(model, freedom=free, fixed=fixed, constant_points=True)
+        cameras = {name: model.camera(camera.camera_id) for name, camera in cameras.items()}
+        sensors, poses = sensor_poses(model, cameras), rig_poses(model)
+        solved = _solved(board, kept, cameras, sensors, poses)
+        kept = _without_outliers(kept, solved)
+    return _solved(board, kept, cameras, sensors, poses)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A camera as its own sightings give it: ``camera`` of pycolmap and board-to-camera matrices by instant."""
+
+    camera: Any
+    poses: Mapping[int, Floats]
+
+
+def _guesses(lens: LensModel, number: int, size: tuple[int, int]) -> list[Any]:
+    return [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
+
+
+def _own_view(
+    name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool, seed: int
+) -> _View:
+    """Intrinsics from the best start, and a pose for each sighting that agrees with them."""
+    chosen = sorted(sights, key=lambda sight: (-len(sight.corners), sight.instant))[: 2 * MOST_SIGHTINGS_ALONE]
+    chosen = sorted(chosen, key=lambda sight: sight.instant)
+    picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_SIGHTINGS_ALONE)).round().astype(int)
+    sample = [chosen[index] for index in picks]
+    best: tuple[float, Any] | None = None
+    for camera in starts:
+        poses = _poses(camera, sample, board, seed=seed)
+        if len(poses) < max(3, len(sample) // 2):
+            continue
+        if not fixed:
+            seen = {name: [sight for sight in sample if sight.instant in poses]}
+            model = board_model(board, seen, {name: camera}, {name: np.eye(4)}, poses)
+            adjust(model, freedom=Freedom(), constant_points=True)
+            camera = model.camera(camera.camera_id)
+            model.update_point_3d_errors()
+        error = _misfit(camera, sample, board, seed=seed)
+        if best is None or error < best[0]:
+            best = error, camera
+    if best is not None:
+        poses = _poses(best[1], sights, board, seed=seed, share=0.005)
+        if len(poses) >= 3:
+            return _View(best[1], poses)
+    raise CalibrationError(
+        f"The lens of camera {name!r} cannot be estimated from its {len(sights)} sightings of the board "
+        f"({board.text}): show the board whole, flat, and tilted in several directions, or choose the lens model that "
+        "the camera has (fisheye for very wide ones)."
+    )
+
+
+def _poses(
+    camera: Any, sights: Sequence[Sighting], board: Board, *, seed: int, share: float = POSE_PIXELS
+) -> dict[int, Floats]:
+    """Board-to-camera matrices by instant, of the sightings of which most corners agree."""
+    pycolmap = pycolmap_module()
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = max(2.0, share * max(camera.width, camera.height))
+    options.ransac.random_seed = seed
+    found = {}
+    for sight in sights:
+        result = pycolmap.estimate_and_refine_absolute_pose(sight.pixels, board.corners[sight.corners], camera, options)
+        if result is not None and result["num_inliers"] >= 0.7 * len(sight.corners):
+            found[sight.instant] = matrix(result["cam_from_world"])
+    return found
+
+
+def _misfit(camera: Any, sights: Sequence[Sighting], board: Board, *, seed: int) -> float:
+    """Median over the sightings of the median reprojection error, pixels; infinite for one without a pose."""
+    errors = []
+    poses = _poses(camera, sights, board, seed=seed)
+    for sight in sights:
+        if sight.instant not in poses:
+            errors.append(np.inf)
+            continue
+        pose = poses[sight.instant]
+        local = board.corners[sight.corners] @ pose[:3, :3].T + pose[:3, 3]
+        errors.append(float(np.median(np.linalg.norm(camera.img_from_cam(local) - sight.pixels, axis=1))))
+    return float(np.median(errors))
+
+
+def _connected_sensors(views: Mapping[str, _View]) -> dict[str, Floats]:
+    """Rig-to-camera matrices along the pairs that share most instants, from the first camera."""
+    names = list(views)
+    placed = {names[0]: np.eye(4)}
+    while len(placed) < len(names):
+        links = [
+            (len(views[new].poses.keys() & views[old].poses.keys()), old, new)
+            for old in placed
+            for new in names
+            if new not in placed
+        ]
+        shared, old, new = max(links, key=lambda link: link[0])
+        if shared == 0:
+            left = [name for name in names if name not in placed]
+            raise CalibrationError(
+                f"{listed(left)} never show the board at an instant at which {listed(placed)} show it, too: carry it "
+                "slowly through where neighbouring cameras both see it, and check that the videos are in step."
+            )
+        instants = sorted(views[new].poses.keys() & views[old].poses.keys())
+        moves = [views[new].poses[t] @ np.linalg.inv(views[old].poses[t]) for t in instants]
+        placed[new] = _middle(moves) @ placed[old]
+    return {name: placed[name] for name in names}
+
+
+def _middle(moves: Sequence[Floats]) -> Floats:
+    """The rigid motion that is closest to the others: one bad pose does not move it."""
+    size = float(np.median([np.linalg.norm(move[:3, 3]) for move in moves])) or 1.0
+    stack = np.stack(moves)
+    stack[:, :3, 3] /= size
+    apart = np.linalg.norm(stack[:, None] - stack[None], axis=(2, 3)).sum(1)
+    return moves[int(np.argmin(apart))]
+
+
+def _rig_poses(views: Mapping[str, _View], sensors: Mapping[str, Floats], sightings: Sightings) -> dict[int, Floats]:
+    """Board-to-rig matrices by instant, from the camera that sees most corners."""
+    best: dict[int, tuple[int, Floats]] = {}
+    for name, view in views.items():
+        counts = {sight.instant: len(sight.corners) for sight in sightings[name]}
+        for instant, pose in view.poses.items():
+            if counts[instant] > best.get(instant, (0, None))[0]:
+                best[instant] = counts[instant], np.linalg.inv(sensors[name]) @ pose
+    return {instant: best[instant][1] for instant in sorted(best)}
+
+
+def _solved(
+    board: Board,
+    sightings: Sightings,
+    cameras: Mapping[str, Any],
+    sensors: Mapping[str, Floats],
+    poses: Mapping[int, Floats],
+) -> SolvedCalibration:
+    pycolmap = pycolmap_module()
+    filmed = {name: filmed_camera(camera, pycolmap.Rigid3d(sensors[name][:3])) for name, camera in cameras.items()}
+    number = {instant: index for index, instant in enumerate(poses)}
+    corners = board.corners
+    points = [corners @ pose[:3, :3].T + pose[:3, 3] for pose in poses.values()]
+    rows = [
+        (number[sight.instant] * len(corners) + corner, index, sight.instant, *pixel)
+        for index, name in enumerate(cameras)
+        for sight in sightings[name]
+        for corner, pixel in zip(sight.corners, sight.pixels, strict=True)
+    ]
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    which, owner, instant = (table[:, column].astype(np.intp) for column in range(3))
+    seen, point = np.unique(which, return_inverse=True)
+    observations = Observations(point.astype(np.intp), owner, table[:, 3:], instant)
+    return SolvedCalibration(filmed, np.concatenate(points)[seen], observations, metres=True)
+
+
+def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sightings:
+    """Sightings without the corners that are far from where they should be."""
+    errors = solved.errors()
+    limit = max(OUTLIER_PIXELS, 6 * float(np.nanmedian(errors)))
+    good = iter((errors <= limit).tolist())
+    kept: dict[str, list[Sighting]] = {}
+    for name, sights in sightings.items():
+        kept[name] = []
+        for sight in sights:
+            inside = np.array([next(good) for _ in sight.corners], bool)
+            if inside.sum() >= 4:
+                kept[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
+    return kept

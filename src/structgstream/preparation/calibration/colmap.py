@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The module pycolmap, and cameras as values of it.
+
+Both count pixels from the picture's corner, with the centre of the top-left pixel at (0.5, 0.5), and both have world to
+camera poses with OpenCV axes, so nothing is converted but names and orders of parameters.
+"""
+
+from collections.abc import Sequence
+from dataclasses import astuple
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.errors import MissingExtraError
+
+LensModel = Literal["pinhole", "radial", "opencv", "fisheye"]
+"""What is estimated of a lens: nothing; k1, k2; k1, k2, p1, p2; k1 to k4 of a fisheye."""
+
+MODELS: dict[LensModel, str] = {
+    "pinhole": "PINHOLE",
+    "radial": "RADIAL",
+    "opencv": "OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+}
+QUIET = 2  # COLMAP tells every step; errors of its own are raised anyway
+
+
+def pycolmap_module() -> ModuleType:
+    """The module ``pycolmap``, from the extra ``sfm``, told to be quiet."""
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingExtraError("pycolmap", "sfm") from None
+    pycolmap.logging.minloglevel = QUIET
+    return pycolmap
+
+
+def colmap_camera(filmed: LensCamera, number: int, *, model: str | None = None) -> Any:
+    """``filmed``'s intrinsics and lens as a camera of pycolmap with the id ``number``.
+
+    Args:
+        model: a name of COLMAP's, at least as general as the lens; by default the smallest that holds it.
+    """
+    K = filmed.camera.K.numpy()
+    model = model or holding(filmed.lens)
+    if model == "RADIAL":
+        parameters = [(K[0, 0] + K[1, 1]) / 2, K[0, 2], K[1, 2], *_terms(filmed.lens, model)]
+    else:
+        parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *_terms(filmed.lens, model)]
+    return pycolmap_module().Camera(
+        camera_id=number,
+        model=model,
+        width=filmed.camera.width,
+        height=filmed.camera.height,
+        params=parameters,
+        has_prior_focal_length=True,
+    )
+
+
+def holding(lens: Lens) -> str:
+    """The name of COLMAP's smallest model that holds ``lens``."""
+    if isinstance(lens, Pinhole):
+        return "PINHOLE"
+    if isinstance(lens, Fisheye):
+        return "OPENCV_FISHEYE"
+    return "FULL_OPENCV" if lens.k3 or lens.k4 or lens.k5 or lens.k6 else "OPENCV"
+
+
+def filmed_camera(camera: Any, cam_from_world: Any) -> LensCamera:
+    """A camera of pycolmap and a pose as a :class:`LensCamera`."""
+    values = [float(value) for value in camera.params]
+    name = camera.model_name
+    if name == "RADIAL":
+        focal, across, down = [values[0]] * 2, values[1], values[2]
+        lens: Lens = RadialTangential(*values[3:])
+    else:
+        focal, across, down = values[:2], values[2], values[3]
+        lens = _lens(name, values[4:])
+    K = torch.tensor([[focal[0], 0.0, across], [0.0, focal[1], down], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.from_numpy(np.array(cam_from_world.matrix()))
+    return LensCamera(Camera(viewmat, K, camera.width, camera.height), lens)
+
+
+def colmap_pose(viewmat: NDArray[np.float64]) -> Any:
+    """A world-to-camera matrix ``[4, 4]`` as a rigid motion of pycolmap."""
+    pycolmap = pycolmap_module()
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(viewmat[:3, :3])), viewmat[:3, 3])
+
+
+def _terms(lens: Lens, model: str) -> Sequence[float]:
+    counts = {"PINHOLE": 0, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4, "FULL_OPENCV": 8}
+    return ([float(value) for value in astuple(lens)] + [0.0] * 8)[: counts[model]]
+
+
+def _lens(name: str, terms: Sequence[float]) -> Lens:
+    if name == "OPENCV_FISHEYE":
+        return Fisheye(*terms)
+    return RadialTangential(*terms) if any(terms) else Pinhole()

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keypoints of a still camera over several instants, as one list.
+
+A camera that stands still has one pose at all instants, so its pictures give one set of observations. What stands
+still is found again at every instant and is kept once; what moves adds keypoints. Each keypoint remembers at which
+instants it was seen, because keypoints of two cameras can only be of one point if they share an instant.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.images import opencv
+from structgstream.preparation.calibration.colmap import pycolmap_module
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class KeypointConfig:
+    """How keypoints are found.
+
+    Args:
+        count: most keypoints of one picture, the largest first.
+        longest_side: pictures with a longer side are reduced to it, pixels.
+        peak_threshold: least contrast of a keypoint, of the range of the picture.
+        same_pixels: keypoints of two instants are one if they lie as close as this and look alike.
+        same_similarity: least cosine of their descriptors.
+    """
+
+    count: int = 6000
+    longest_side: int = 1600
+    peak_threshold: float = 0.004
+    same_pixels: float = 1.0
+    same_similarity: float = 0.85
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Keypoints of one camera.
+
+    Args:
+        pixels: ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5).
+        descriptors: ``[S, 128]`` of unit length (RootSIFT).
+        seen: ``[S, T]``, at which instants.
+    """
+
+    pixels: Floats
+    descriptors: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def camera_keypoints(
+    pictures: Sequence[NDArray[np.uint8]],
+    masks: Sequence[NDArray[np.bool_]] | None = None,
+    *,
+    config: KeypointConfig = KeypointConfig(),
+) -> Keypoints:
+    """Covariant SIFT keypoints with domain-size pooling of a still camera's ``pictures [H, W, 3]``, merged.
+
+    Affine shapes and pooled descriptors (Mikolajczyk and Schmid, IJCV 2004; Dong and Soatto, CVPR 2015) match over
+    wider baselines than plain SIFT. ``masks [H, W]`` are True where a picture counts.
+
+    Raises:
+        MissingExtraError: cv2 or pycolmap is not installed.
+    """
+    extractor = _extractor(config)
+    pixels, descriptors = np.empty((0, 2)), np.empty((0, 128), np.float32)
+    seen = np.zeros((0, len(pictures)), bool)
+    for instant, picture in enumerate(pictures):
+        mask = None if masks is None else masks[instant]
+        found, looks = _extracted(extractor, picture, mask, longest_side=config.longest_side)
+        known = _repeated(pixels, descriptors, found, looks, config=config)
+        seen[known[known >= 0], instant] = True
+        fresh = known < 0
+        pixels = np.concatenate([pixels, found[fresh]])
+        descriptors = np.concatenate([descriptors, looks[fresh]])
+        now = np.zeros((int(fresh.sum()), len(pictures)), bool)
+        now[:, instant] = True
+        seen = np.concatenate([seen, now])
+    return Keypoints(pixels, descriptors, seen)
+
+
+def all_keypoints(
+    pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
+    masks: Mapping[str, Sequence[NDArray[np.bool_]]] | None,
+    *,
+    workers: int,
+    config: KeypointConfig = KeypointConfig(),
+) -> dict[str, Keypoints]:
+    """:func:`camera_keypoints` of every camera; ``masks`` may lack cameras."""
+
+    def one(name: str) -> Keypoints:
+        return camera_keypoints(pictures[name], None if masks is None else masks.get(name), config=config)
+
+    with ThreadPoolExecutor(workers) as pool:
+        return dict(zip(pictures, pool.map(one, pictures), strict=True))
+
+
+def _extractor(config: KeypointConfig) -> Any:
+    pycolmap = pycolmap_module()
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = 1
+    options.use_gpu = False
+    options.sift.max_num_features = config.count
+    options.sift.peak_threshold = config.peak_threshold
+    options.sift.estimate_affine_shape = True
+    options.sift.domain_size_pooling = True
+    return pycolmap.FeatureExtractor.create(options)
+
+
+def _extracted(
+    extractor: Any, picture: NDArray[np.uint8], mask: NDArray[np.bool_] | None, *, longest_side: int
+) -> tuple[Floats, NDArray[np.float32]]:
+    """Pixels of the whole picture, and unit descriptors."""
+    cv2 = opencv()
+    grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
+    height, width = grey.shape
+    share = min(1.0, longest_side / max(height, width))
+    size = (max(1, round(width * share)), max(1, round(height * share)))
+    if share < 1:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    listed, stored = extractor.extract_from_uint8_array(grey)
+    places = pycolmap_module().keypoints_to_matrix(listed)[:, :2].astype(np.float64)
+    pixels, found = places * (width / size[0], height / size[1]), np.asarray(stored.data)
+    if mask is not None:
+        column, row = np.minimum(pixels, (width - 1, height - 1)).astype(np.intp).T
+        inside = mask[row, column]
+        pixels, found = pixels[inside], found[inside]
+    descriptors = found.astype(np.float32)
+    norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return pixels, descriptors / np.maximum(norms, 1e-9)
+
+
+def _repeated(
+    pixels: Floats,
+    descriptors: NDArray[np.float32],
+    found: Floats,
+    looks: NDArray[np.float32],
+    *,
+    config: KeypointConfig,
+) -> NDArray[np.intp]:
+    """For each of the new keypoints ``found`` the known one that it repeats, or -1."""
+    from scipy.spatial import KDTree
+
+    which = np.full(len(found), -1, np.intp)
+    if len(pixels) == 0 or len(found) == 0:
+        return which
+    near = KDTree(pixels).sparse_distance_matrix(KDTree(found), config.same_pixels, output_type="coo_matrix").tocoo()
+    alike = np.einsum("sd,sd->s", descriptors[near.row], looks[near.col])
+    order = np.argsort(alike, kind="stable")
+    order = order[alike[order] > config.same_similarity]
+    which[near.col[order]] = near.row[order]  # the last write is the most alike
+    return which

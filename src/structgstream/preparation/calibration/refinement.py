@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Refinement of given poses by bundle adjustment over matched tracks."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.lenses import LensCamera
+from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
+from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
+from structgstream.preparation.calibration.posed_matches import epipolar_pixels
+from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.calibration.triangulation import (
+    PosedGraph,
+    TriangulationConfig,
+    posed_graph,
+    posed_model,
+    without,
+)
+from structgstream.preparation.calibration.view_graph import Pair, connected
+
+_log = logging.getLogger(__name__)
+
+Free = Literal["poses", "focal", "lens", "all"]
+"""What moves beside poses: nothing; focal lengths; these and distortion; these and principal points."""
+
+HELD_BACK = 5  # one in five tracks judges and is not adjusted
+ROUNDS = (1.0, 0.4, 0.2)
+LEAST_HELD_BACK = 30
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Configuration of the refinement.
+
+    Args:
+        slack_degrees: how far matches may be from the epipolar planes of the given poses, so how wrong these may be.
+        points: how matches and points are made.
+    """
+
+    slack_degrees: float = 1.5
+    points: TriangulationConfig = field(default_factory=TriangulationConfig)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """The result of a refinement.
+
+    Args:
+        solved: refined cameras, in the coordinates of the given ones; these themselves if refining did not help.
+        before_pixels: median distance of matches that were held back to the epipolar lines of the given cameras.
+        after_pixels: the same of the refined cameras.
+        held_back: number of these matches.
+        changed: whether ``solved`` has refined cameras.
+    """
+
+    solved: SolvedCalibration
+    before_pixels: float
+    after_pixels: float
+    held_back: int
+    changed: bool
+
+
+def refine(
+    pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
+    cameras: Mapping[str, LensCamera],
+    *,
+    free: Free = "focal",
+    lens: LensModel | None = None,
+    masks: Mapping[str, Sequence[NDArray[np.bool_]]] | None = None,
+    metres: bool = False,
+    seed: int = 0,
+    config: RefinementConfig = RefinementConfig(),
+) -> Refinement:
+    """Adjust ``cameras`` to pictures of the same instants.
+
+    One track in five is held back. Only if the refined cameras fit these better than the given ones do, they are
+    returned; they are moved, turned and scaled to lie as close to the given ones as they can.
+
+    Args:
+        free: what moves beside poses.
+        lens: the model of the refined lenses; by default the given one's.
+        metres: whether the given cameras are in metres.
+
+    Raises:
+        CalibrationError: too few matches agree with the given poses, or not all cameras are connected by them.
+        MissingExtraError: pycolmap or cv2 is not installed.
+    """
+    graph = posed_graph(pictures, cameras, masks=masks, seed=seed, config=_widened(config))
+    _check_connected(cameras, graph)
+    judging = _held_back(graph)
+    learning = without(graph, judging)
+    judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
+    refined, solved = dict(cameras), None
+    models = {name: MODELS[lens] if lens else holding(filmed.lens) for name, filmed in cameras.items()}
+    freedom = Freedom(focal=free != "poses", lens=free in ("lens", "all"), center=free == "all")
+    longest = max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values())
+    limit = max(1.0, config.points.pixels * longest / 1000)
+    for share in ROUNDS:
+        slack = config.slack_degrees * share
+        focal = max(float(filmed.camera.K[0, 0]) for filmed in refined.values())
+        loose = max(limit, focal * float(np.radians(slack)))
+        model = posed_model(learning, refined, pixels=loose, slack_degrees=slack, models=models)
+        adjust(model, freedom=freedom)
+        filtered(model, pixels=limit, degrees=config.points.degrees)
+        adjust(model, freedom=freedom)
+        found = cameras_of(model)
+        refined = {name: found[name] for name in cameras}
+        solved = model
+    assert solved is not None
+    points, observations = observed(solved, graph.keypoints, {name: index for index, name in enumerate(cameras)})
+    result = SolvedCalibration(refined, points, observations)
+    result = result.aligned(rig_alignment(refined, cameras), metres=metres)
+    before, after = (_judged(graph, judges, which) for which in (cameras, result.cameras))
+    count = sum(map(len, judges.values()))
+    if after < before:
+        return Refinement(result, before, after, count, True)
+    _log.warning(
+        "Refining does not help: matches that were held back are %.2f pixels off with the given cameras and %.2f with "
+        "refined ones; the given ones are kept.", before, after,
+    )  # fmt: skip
+    model = posed_model(graph, cameras, pixels=limit, slack_degrees=config.points.slack_degrees)
+    points, observations = observed(model, graph.keypoints, {name: index for index, name in enumerate(cameras)})
+    return Refinement(
+        SolvedCalibration(dict(cameras), points, observations, metres=metres), before, after, count, False
+    )
+
+
+def _widened(config: RefinementConfig) -> TriangulationConfig:
+    return replace(config.points, slack_degrees=config.slack_degrees)
+
+
+def _check_connected(cameras: Mapping[str, LensCamera], graph: PosedGraph) -> None:
+    groups = connected(cameras, graph.matches)
+    if len(groups) > 1:
+        alone = ", ".join(repr(name) for group in groups[1:] for name in group)
+        raise CalibrationError(
+            f"Too few matches agree with the given poses of {alone} to refine them with the others: the poses are off "
+            "by more than the refinement reaches, cameras are mixed up, or they see too little in common."
+        )
+
+
+def _held_back(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
+    """Which matches belong to the tracks that judge; a track is all keypoints that matches connect."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    starts = dict(zip(graph.keypoints, np.cumsum([0, *map(len, graph.keypoints.values())])))
+    total = sum(map(len, graph.keypoints.values()))
+    ends = [
+        (starts[one] + found[:, 0].astype(np.intp), starts[two] + found[:, 1].astype(np.intp))
+        for (one, two), found in graph.matches.items()
+    ]
+    first, second = (np.concatenate(side) for side in zip(*ends, strict=True))
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(total, total))
+    _, track = connected_components(links, directed=False)
+    # A track's number follows the order of its first keypoint; a shuffle spreads those that judge.
+    chosen = np.random.default_rng(0).permutation(track.max() + 1) % HELD_BACK == 0
+    judging = {pair: chosen[track[one]] for pair, (one, _) in zip(graph.matches, ends, strict=True)}
+    if sum(int(held.sum()) for held in judging.values()) < LEAST_HELD_BACK:
+        raise CalibrationError(
+            f"Only {len(first)} matches agree with the given poses, too few to refine them: take more instants, or "
+            "let neighbouring cameras see more of the same."
+        )
+    return judging
+
+
+def _judged(graph: PosedGraph, judges: Mapping[Pair, NDArray[np.uint32]], cameras: Mapping[str, LensCamera]) -> float:
+    errors = epipolar_pixels(graph.keypoints, judges, cameras)
+    return float(np.nanmedian(np.concatenate(list(errors.values()))))

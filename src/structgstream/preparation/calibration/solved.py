@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a calibration gives: cameras, points, and what was observed of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.alignment import Alignment
+from structgstream.data.lenses import LensCamera
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Where points were seen, an entry for each observation.
+
+    Args:
+        point: ``[M]``, index of the point.
+        camera: ``[M]``, index of the camera, in the order of the solved cameras.
+        pixels: ``[M, 2]``, as filmed, so with the lens' distortion.
+        instant: ``[M]``, index of the first instant at which it was seen there.
+    """
+
+    point: Indices
+    camera: Indices
+    pixels: Floats
+    instant: Indices
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+
+@dataclass(frozen=True)
+class PairError:
+    """How well two cameras agree.
+
+    Args:
+        points: number of points that both see.
+        median_pixels: median over them of the larger of the two reprojection errors; nan without points.
+    """
+
+    points: int
+    median_pixels: float
+
+
+@dataclass(frozen=True)
+class SolvedCalibration:
+    """Cameras with lenses, estimated from their pictures.
+
+    Args:
+        cameras: those that could be placed, in the order of the pictures.
+        points: ``[P, 3]``.
+        observations: where the points were seen.
+        missing: names of the cameras that could not be placed.
+        metres: whether the unit is a metre; otherwise it is arbitrary.
+    """
+
+    cameras: Mapping[str, LensCamera]
+    points: Floats
+    observations: Observations
+    missing: tuple[str, ...] = ()
+    metres: bool = False
+
+    def residuals(self) -> Floats:
+        """Reprojection error ``[M, 2]`` of each observation, pixels; NaN where a point is out of a lens' reach."""
+        seen = self.observations
+        found = np.full((len(seen), 2), np.nan)
+        for index, filmed in enumerate(self.cameras.values()):
+            own = seen.camera == index
+            found[own] = filmed.pixels(self.points[seen.point[own]]) - seen.pixels[own]
+        return found
+
+    def errors(self) -> Floats:
+        """Length ``[M]`` of :meth:`residuals`, pixels."""
+        return np.linalg.norm(self.residuals(), axis=1)
+
+    def camera_errors(self) -> dict[str, float]:
+        """Median reprojection error of each camera, pixels; nan for one without observations."""
+        errors = self.errors()
+        return {name: _median(errors[self.observations.camera == index]) for index, name in enumerate(self.cameras)}
+
+    def pair_errors(self) -> dict[tuple[str, str], PairError]:
+        """Agreement of each pair of cameras."""
+        errors = np.full((len(self.points), len(self.cameras)), np.nan)
+        errors[self.observations.point, self.observations.camera] = self.errors()
+        names = list(self.cameras)
+        found = {}
+        for one, two in combinations(range(len(names)), 2):
+            larger = np.maximum(errors[:, one], errors[:, two])
+            larger = larger[np.isfinite(larger)]
+            found[names[one], names[two]] = PairError(len(larger), _median(larger))
+        return found
+
+    def track_lengths(self) -> Indices:
+        """Number of observations ``[P]`` of each point."""
+        return np.bincount(self.observations.point, minlength=len(self.points))
+
+    def point_errors(self) -> Floats:
+        """Mean reprojection error ``[P]`` of each point, pixels; nan without observations."""
+        total = np.bincount(self.observations.point, self.errors(), len(self.points))
+        with np.errstate(invalid="ignore"):
+            return total / self.track_lengths()
+
+    def aligned(self, alignment: Alignment, *, metres: bool | None = None) -> "SolvedCalibration":
+        """The same calibration in other coordinates; pictures and errors stay what they are."""
+        return replace(
+            self,
+            cameras={name: alignment.filmed(filmed) for name, filmed in self.cameras.items()},
+            points=alignment.points(self.points),
+            metres=self.metres if metres is None else metres,
+        )
+
+
+def _median(values: Floats) -> float:
+    return float(np.median(values)) if len(values) else float("nan")

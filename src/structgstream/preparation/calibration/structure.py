@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Structure from motion: cameras of a rig from what their pictures have in common.
+
+A camera that stands still is one image with the keypoints of all its instants (``keypoints.py``), so that people who
+move about give matches where walls are bare. Keypoints and their matches are ours, the model is COLMAP's (Schönberger
+and Frahm, CVPR 2016; Pan et al., ECCV 2024 for the global one).
+"""
+
+import logging
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.calibration import listed
+from structgstream.data.lenses import LensCamera
+from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, pycolmap_module
+from structgstream.preparation.calibration.coordinates import normalized
+from structgstream.preparation.calibration.intrinsics import guessed_camera
+from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
+from structgstream.preparation.calibration.mapping import (
+    Freedom,
+    adjust,
+    cameras_of,
+    filtered,
+    mapped,
+    observed,
+    size_of,
+)
+from structgstream.preparation.calibration.pair_matches import MatchConfig, all_matches
+from structgstream.preparation.calibration.pictures import checked_pictures
+from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.calibration.view_graph import (
+    Matches,
+    Pair,
+    PairConfig,
+    connected,
+    verified_pairs,
+    write_database,
+)
+
+_log = logging.getLogger(__name__)
+
+Pictures = Mapping[str, Sequence[NDArray[np.uint8]]]
+Masks = Mapping[str, Sequence[NDArray[np.bool_]]]
+Intrinsics = Literal["own", "shared"]
+
+FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
+    "pinhole": (60.0, 40.0, 85.0),
+    "radial": (60.0, 40.0, 85.0),
+    "opencv": (60.0, 85.0, 40.0),
+    "fisheye": (120.0, 150.0, 90.0, 170.0),
+}
+"""Degrees across the longer side that are tried where none is given, until one places all cameras."""
+
+
+@dataclass(frozen=True)
+class StructureConfig:
+    """Configuration of structure from motion.
+
+    Args:
+        keypoints: what is found in a picture.
+        matching: which keypoints match.
+        pairs: which pairs of cameras are used.
+        pixels: largest reprojection error of the observations that remain, for pictures of 1000 pixels on the longer
+            side; never under 1.
+        degrees: least angle between the rays of a point.
+    """
+
+    keypoints: KeypointConfig = field(default_factory=KeypointConfig)
+    matching: MatchConfig = field(default_factory=MatchConfig)
+    pairs: PairConfig = field(default_factory=PairConfig)
+    pixels: float = 3.0
+    degrees: float = 1.5
+
+
+def solve_structure(
+    pictures: Pictures,
+    *,
+    lens: LensModel = "radial",
+    intrinsics: Intrinsics = "own",
+    field_of_view: float | Mapping[str, float] | None = None,
+    centers: bool = True,
+    known: Mapping[str, LensCamera] | None = None,
+    masks: Masks | None = None,
+    seed: int = 0,
+    config: StructureConfig = StructureConfig(),
+) -> SolvedCalibration:
+    """Poses, intrinsics and lenses of still cameras from their own pictures.
+
+    Args:
+        pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras, in order of time.
+        lens: which distortion is estimated.
+        intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
+        field_of_view: degrees across the longer side, for all cameras or by name, to begin with; by default some are
+            tried.
+        centers: whether principal points are estimated, held near the pictures' centres (mapping.py, Note [Principal
+            points]); otherwise they are the centres.
+        known: cameras whose intrinsics and lens are known and stay; their poses are not read.
+        masks: camera name to a mask ``[H, W]`` per picture, True where it counts.
+        seed: of the robust estimation; equal input and seed give equal output.
+
+    Returns:
+        the calibration in arbitrary units: the mean camera is the origin and the farthest is one unit away, as the
+        axes of the first camera. Cameras that see too little in common with the others are ``missing``.
+
+    Raises:
+        CalibrationError: fewer than three cameras, pictures that do not belong together, or too little in common.
+        MissingExtraError: pycolmap or cv2 is not installed.
+    """
+    pycolmap_module()
+    checked_pictures(pictures, masks)
+    if len(pictures) < 3:
+        raise CalibrationError(
+            f"Structure from motion needs three cameras or more, got {listed(pictures)}: two of them do not fix "
+            "their focal lengths; film a board with both (structgstream board), or add a camera."
+        )
+    workers = max(1, min(len(pictures), os.cpu_count() or 1))
+    keypoints = all_keypoints(pictures, masks, workers=workers, config=config.keypoints)
+    matches = all_matches(keypoints, workers=workers, config=config.matching)
+    best: _Attempt | None = None
+    for cameras in _starts(pictures, lens, intrinsics, field_of_view, known or {}):
+        attempt = _attempt(keypoints, matches, cameras, known or {}, seed=seed, workers=workers, config=config)
+        best = attempt if best is None or attempt.size > best.size else best
+        if best.size[0] == len(pictures):
+            break
+    assert best is not None
+    if best.model is None or best.size[0] < 3:
+        raise CalibrationError(_nothing(pictures, matches, best.pairs))
+    solved = _finished(best, keypoints, pictures, centers=centers, config=config)
+    if solved.missing:
+        _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
+    return solved
+
+
+def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pair, Any]) -> str:
+    """One sentence for each camera that could not be placed: with whom it has how many matches."""
+    told = []
+    for name in missing:
+        others = {
+            (two if name == one else one): _agreeing((one, two), matches, pairs)
+            for one, two in matches
+            if name in (one, two)
+        }
+        best = sorted(others, key=lambda other: -others[other][0])[:2]
+        most = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
+        told.append(f"{name!r} ({most} agree)")
+    return (
+        f"{listed(missing)} could not be placed: {'; '.join(told)}. Let neighbouring cameras see more of the same "
+        "from at most 30 degrees apart, take more instants, or film a board (structgstream board)."
+    )
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A model from one start, None without one, and the pairs that it is made from."""
+
+    model: Any | None
+    pairs: Mapping[Pair, Any]
+    freedom: Freedom
+    fixed: frozenset[int]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return (0, 0) if self.model is None else size_of(self.model)
+
+
+def _starts(
+    pictures: Pictures,
+    lens: LensModel,
+    intrinsics: Intrinsics,
+    field_of_view: float | Mapping[str, float] | None,
+    known: Mapping[str, LensCamera],
+) -> list[dict[str, Any]]:
+    """Cameras of pycolmap to begin with, for each field of view that is tried."""
+    sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
+    if intrinsics == "shared" and (len(set(sizes.values())) > 1 or known):
+        raise CalibrationError(
+            f"Shared intrinsics need pictures of one size and no known ones, got "
+            f"{', '.join(sorted({f'{w}x{h}' for w, h in sizes.values()}))}"
+            f"{' and known intrinsics' if known else ''}; use own intrinsics."
+        )
+    if field_of_view is None:
+        tried: tuple[float | Mapping[str, float], ...] = FIELDS_OF_VIEW[lens] if len(known) < len(pictures) else (60.0,)
+    else:
+        tried = (field_of_view,)
+    starts = []
+    for degrees in tried:
+        cameras = {}
+        for number, (name, size) in enumerate(sizes.items(), 1):
+            number = 1 if intrinsics == "shared" else number
+            if name in known:
+                cameras[name] = colmap_camera(known[name], number)
+                continue
+            angle = degrees.get(name, FIELDS_OF_VIEW[lens][0]) if isinstance(degrees, Mapping) else degrees
+            cameras[name] = guessed_camera(lens, number, size, angle)
+        starts.append(cameras)
+    return starts
+
+
+def _attempt(
+    keypoints: Mapping[str, Keypoints],
+    matches: Matches,
+    cameras: Mapping[str, Any],
+    known: Mapping[str, LensCamera],
+    *,
+    seed: int,
+    workers: int,
+    config: StructureConfig,
+) -> _Attempt:
+    """The incremental model, or the global one if that places more cameras."""
+    pairs = verified_pairs(keypoints, matches, cameras, seed=seed, workers=workers, config=config.pairs)
+    fixed = frozenset(cameras[name].camera_id for name in known)
+    every = len(known) == len(keypoints)
+    freedom = Freedom(focal=not every, center=not every, lens=not every)
+    attempt = _Attempt(None, pairs, freedom, fixed)
+    if not pairs:
+        return attempt
+    with tempfile.TemporaryDirectory(prefix="structgstream-sfm-") as folder:
+        database = Path(folder) / "database.db"
+        write_database(database, keypoints, cameras, pairs)
+        reachable = len(connected(keypoints, pairs)[0])
+        for mapper in ("incremental", "global"):
+            found = mapped(database, mapper=mapper, freedom=freedom, fixed=fixed, seed=seed)
+            if found is not None and size_of(found) > attempt.size:
+                attempt = replace(attempt, model=found)
+            if attempt.size[0] == reachable:
+                break
+    return attempt
+
+
+def _finished(
+    attempt: _Attempt,
+    keypoints: Mapping[str, Keypoints],
+    pictures: Pictures,
+    *,
+    centers: bool,
+    config: StructureConfig,
+) -> SolvedCalibration:
+    """The model with all intrinsics adjusted, without outliers, in normalised coordinates."""
+    model = attempt.model
+    assert model is not None
+    longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
+    limit = max(1.0, config.pixels * longest / 1000)
+    steady = replace(attempt.freedom, center=False)
+    adjust(model, freedom=steady, fixed=attempt.fixed)
+    filtered(model, pixels=limit, degrees=config.degrees)
+    full = replace(attempt.freedom, center=centers and attempt.freedom.center)
+    for _ in range(2):
+        adjust(model, freedom=full, fixed=attempt.fixed)
+        filtered(model, pixels=limit, degrees=config.degrees)
+    adjust(model, freedom=full, fixed=attempt.fixed)
+    found = cameras_of(model)
+    cameras = {name: found[name] for name in pictures if name in found}
+    points, observations = observed(model, keypoints, {name: index for index, name in enumerate(cameras)})
+    missing = tuple(name for name in pictures if name not in found)
+    return normalized(SolvedCalibration(cameras, points, observations, missing))
+
+
+def _agreeing(pair: Pair, matches: Matches, pairs: Mapping[Pair, Any]) -> tuple[int, int]:
+    return (len(pairs[pair].inlier_matches) if pair in pairs else 0), len(matches[pair])
+
+
+def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:
+    alone = [name for name in pictures if not any(name in pair for pair in pairs)]
+    if not alone:
+        groups = connected(pictures, pairs)
+        return (
+            f"The pictures of {len(pictures)} cameras give no model: {len(pairs)} of {len(matches)} pairs have matches "
+            f"that agree, in {len(groups)} groups ({'; '.join(', '.join(group) for group in groups[:4])}). Let "
+            "neighbouring cameras see more of the same, take more instants, or film a board (structgstream board)."
+        )
+    return (
+        f"Too few cameras see anything in common: {listed(alone)} have no pair with enough matches that agree "
+        f"({len(pairs)} of {len(matches)} pairs have). Let neighbouring cameras see more of the same, take more "
+        "instants, or film a board (structgstream board)."
+    )

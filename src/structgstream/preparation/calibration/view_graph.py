@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of cameras whose matches agree with one geometry, and the database from which COLMAP builds a model."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.preparation.calibration.colmap import pycolmap_module
+from structgstream.preparation.calibration.keypoints import Keypoints
+
+Pair = tuple[str, str]
+Matches = Mapping[Pair, NDArray[np.uint32]]
+
+
+@dataclass(frozen=True)
+class PairConfig:
+    """When two cameras count as seeing the same.
+
+    Args:
+        pixels: largest epipolar distance of a match, for pictures of 1000 pixels on the longer side; never under 1.
+        least: fewest matches that agree.
+        least_share: least share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have
+            some matches that agree by chance; among those of 0.3 and more nearly all were right.
+        trials: most samples of the robust estimation.
+    """
+
+    pixels: float = 3.0
+    least: int = 20
+    least_share: float = 0.3
+    trials: int = 2000
+
+
+def verified_pairs(
+    keypoints: Mapping[str, Keypoints],
+    matches: Matches,
+    cameras: Mapping[str, Any],
+    *,
+    seed: int,
+    workers: int,
+    config: PairConfig = PairConfig(),
+) -> dict[Pair, Any]:
+    """Two-view geometries of the pairs that pass, with the matches that agree.
+
+    Args:
+        cameras: of pycolmap, with the focal lengths to begin with.
+    """
+    found = pair_geometries(keypoints, matches, cameras, seed=seed, workers=workers, config=config)
+    return {
+        pair: geometry
+        for pair, geometry in found.items()
+        if len(geometry.inlier_matches) >= max(config.least, config.least_share * len(matches[pair]))
+    }
+
+
+def pair_geometries(
+    keypoints: Mapping[str, Keypoints],
+    matches: Matches,
+    cameras: Mapping[str, Any],
+    *,
+    seed: int,
+    workers: int,
+    config: PairConfig = PairConfig(),
+) -> dict[Pair, Any]:
+    """Robust two-view geometries of all pairs with at least ``config.least`` matches."""
+    pycolmap = pycolmap_module()
+
+    def estimate(pair: Pair) -> Any:
+        one, two = (cameras[name] for name in pair)
+        options = pycolmap.TwoViewGeometryOptions()
+        options.min_num_inliers = config.least
+        options.detect_watermark = False
+        options.compute_relative_pose = True
+        options.ransac.random_seed = seed
+        options.ransac.max_num_trials = config.trials
+        options.ransac.max_error = max(1.0, config.pixels * max(one.width, one.height, two.width, two.height) / 1000)
+        return pycolmap.estimate_two_view_geometry(
+            one, keypoints[pair[0]].pixels, two, keypoints[pair[1]].pixels, matches[pair], options
+        )
+
+    pairs = [pair for pair, found in matches.items() if len(found) >= config.least]
+    with ThreadPoolExecutor(workers) as pool:
+        return dict(zip(pairs, pool.map(estimate, pairs), strict=True))
+
+
+def write_database(
+    path: Path, keypoints: Mapping[str, Keypoints], cameras: Mapping[str, Any], geometries: Mapping[Pair, Any]
+) -> dict[str, int]:
+    """A database of COLMAP's with an image per camera; returns the ids of the images.
+
+    Cameras of one id are one camera with shared intrinsics.
+    """
+    pycolmap = pycolmap_module()
+    number = {name: index for index, name in enumerate(keypoints, 1)}
+    with pycolmap.Database.open(path) as database:
+        for camera in {camera.camera_id: camera for camera in cameras.values()}.values():
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=camera.camera_id)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for name, index in number.items():
+            image = pycolmap.Image(name=name, camera_id=cameras[name].camera_id, image_id=index)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=index, rig_id=cameras[name].camera_id)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(index, keypoints[name].pixels.astype(np.float32))
+        for (one, two), geometry in geometries.items():
+            database.write_matches(number[one], number[two], geometry.inlier_matches)
+            database.write_two_view_geometry(number[one], number[two], geometry)
+    return number
+
+
+def connected(names: Mapping[str, object], pairs: Mapping[Pair, object]) -> list[tuple[str, ...]]:
+    """Groups of cameras that pairs connect, the largest first; each in the order of ``names``."""
+    group = {name: index for index, name in enumerate(names)}
+    for one, two in pairs:
+        old, new = max(group[one], group[two]), min(group[one], group[two])
+        group = {name: new if index == old else index for name, index in group.items()}
+    members: dict[int, list[str]] = {}
+    for name, index in group.items():
+        members.setdefault(index, []).append(name)
+    return sorted((tuple(found) for found in members.values()), key=lambda found: -len(found))

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board that is carried through a rig whose truth is known."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from filmed import Film, board_plane, ring, turned
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.calibration.board_solving import solve_board
+from structgstream.preparation.calibration.colmap import LensModel
+from structgstream.preparation.calibration.comparison import calibration_errors
+
+BOARD = Board(7, 5, 0.12)
+INSTANTS = 16
+LENSES: dict[LensModel, tuple[Lens, float, tuple[int, int]]] = {
+    "pinhole": (Pinhole(), 300.0, (360, 270)),
+    "radial": (RadialTangential(k1=-0.2, k2=0.04), 280.0, (360, 270)),
+    "fisheye": (Fisheye(0.02, -0.005, 0.001), 480 / np.radians(120), (480, 360)),
+}
+Pictures = dict[str, list[NDArray[np.uint8]]]
+
+
+@cache
+def filmed(model: LensModel) -> tuple[dict[str, LensCamera], Pictures]:
+    """Three cameras, and their pictures of the board near them, tilted at random."""
+    lens, focal, size = LENSES[model]
+    rig = ring(3, radius=1.1, arc_degrees=50, focal=focal, lens=lens, size=size)
+    generator = np.random.default_rng(3)
+    reach = 0.45 if model == "fisheye" else 0.3
+    planes = []
+    for _ in range(INSTANTS):
+        yaw, pitch, roll = generator.uniform([-40, -35, -25], [40, 35, 25])
+        pose = np.eye(4)
+        pose[:3, :3] = turned(yaw, axis=1) @ turned(pitch, axis=0) @ turned(roll, axis=2)
+        middle = generator.uniform([-reach, -reach, -0.45], [reach, reach, 0.0 if model == "fisheye" else 0.3])
+        pose[:3, 3] = middle - pose[:3, :3] @ [*(side / 2 for side in BOARD.size_metres), 0.0]
+        planes.append(board_plane(BOARD, pose))
+    films = {name: Film(camera) for name, camera in rig.items()}
+    return rig, {
+        name: [film.picture([plane], noise=1.5, seed=index) for index, plane in enumerate(planes)]
+        for name, film in films.items()
+    }
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_rig_is_found_in_metres(model: LensModel) -> None:
+    rig, pictures = filmed(model)
+    found = solve_board(pictures, BOARD, lens=model)
+    assert list(found.cameras) == list(rig)
+    assert found.metres
+    assert found.missing == ()
+    for error in calibration_errors(found.cameras, rig).values():
+        # Noise of a corner is 0.1 pixels, of 16 sightings with 24; a principal point is worth a rotation.
+        assert error.rotation_degrees < (0.25 if model == "fisheye" else 0.15)
+        assert error.position_percent < 0.7
+        assert abs(error.focal_percent) < 1
+    apart = [
+        float((cameras["cam00"].camera.center - cameras["cam02"].camera.center).norm())
+        for cameras in (found.cameras, rig)
+    ]
+    assert apart[0] == pytest.approx(apart[1], rel=0.006)
+    assert np.median(found.errors()) < 0.15
+    np.testing.assert_array_equal(found.cameras["cam00"].camera.viewmat, np.eye(4))
+
+
+def test_known_lenses_stay_and_make_poses_exact() -> None:
+    rig, pictures = filmed("radial")
+    found = solve_board(pictures, BOARD, lens="radial", known=rig)
+    for name, error in calibration_errors(found.cameras, rig).items():
+        assert error.rotation_degrees < 0.05
+        assert error.position_percent < 0.2
+        np.testing.assert_allclose(found.cameras[name].camera.K, rig[name].camera.K)
+        assert found.cameras[name].lens == rig[name].lens
+
+
+def test_the_same_pictures_give_the_same_numbers() -> None:
+    _, pictures = filmed("pinhole")
+    one, two = (solve_board(pictures, BOARD, lens="pinhole") for _ in range(2))
+    for name in one.cameras:
+        np.testing.assert_array_equal(one.cameras[name].camera.viewmat, two.cameras[name].camera.viewmat)
+        np.testing.assert_array_equal(one.cameras[name].camera.K, two.cameras[name].camera.K)
+
+
+def test_a_camera_that_never_sees_the_board_is_named() -> None:
+    _, pictures = filmed("pinhole")
+    blind = pictures | {"cam01": [np.full_like(shot, 90) for shot in pictures["cam01"]]}
+    with pytest.raises(CalibrationError, match=r"by camera 'cam01' too rarely \('cam01' in 0 of 16 pictures; 4 with"):
+        solve_board(blind, BOARD, lens="pinhole")
+
+
+def test_a_camera_that_sees_it_at_other_instants_only_is_named() -> None:
+    _, pictures = filmed("pinhole")
+    nothing = np.full_like(pictures["cam00"][0], 90)
+    half = INSTANTS // 2
+    apart = {
+        "cam00": pictures["cam00"][:half] + [nothing] * half,
+        "cam01": pictures["cam01"][:half] + [nothing] * half,
+        "cam02": [nothing] * half + pictures["cam02"][half:],
+    }
+    with pytest.raises(CalibrationError, match="camera 'cam02' never show the board at an instant at which"):
+        solve_board(apart, BOARD, lens="pinhole")
+
+
+def test_a_board_of_another_dictionary_is_told_by_its_name() -> None:
+    _, pictures = filmed("pinhole")
+    with pytest.raises(CalibrationError, match="said to be of DICT_6X6_100, but the pictures show markers of DICT_5X5"):
+        solve_board(pictures, Board(7, 5, 0.12, dictionary="DICT_6X6_100"), lens="pinhole")
+
+
+@pytest.mark.parametrize("said", [Board(5, 4, 0.12), Board(9, 5, 0.12), Board(5, 7, 0.12)])
+def test_a_board_of_another_size_than_said_is_refused(said: Board) -> None:
+    _, pictures = filmed("pinhole")
+    with pytest.raises(CalibrationError, match="give the board's real numbers"):
+        solve_board(pictures, said, lens="pinhole")

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filmed import ring
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
+from structgstream.errors import MissingExtraError
+from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, filmed_camera, pycolmap_module
+
+FILMED = ring(2, radius=2.0, arc_degrees=40)["cam01"]
+LENSES = [
+    Pinhole(),
+    RadialTangential(k1=-0.2, k2=0.05),
+    RadialTangential(-0.2, 0.05, 0.001, -0.002),
+    RadialTangential(-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.001),
+    Fisheye(0.05, -0.01, 0.002, -0.001),
+]
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_camera_comes_back_as_it_went(lens: Lens) -> None:
+    filmed = replace(FILMED, lens=lens)
+    found = filmed_camera(colmap_camera(filmed, 7), colmap_pose(filmed.camera.viewmat.numpy()))
+    assert found.lens == lens
+    np.testing.assert_allclose(found.camera.K, filmed.camera.K)
+    np.testing.assert_allclose(found.camera.viewmat, filmed.camera.viewmat, atol=1e-12)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_both_put_points_in_the_same_pixels(lens: Lens) -> None:
+    """Which holds the order of the parameters, and where pixels are counted from."""
+    filmed = replace(FILMED, lens=lens)
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (30, 3))
+    local = points @ filmed.camera.viewmat[:3, :3].numpy().T + filmed.camera.viewmat[:3, 3].numpy()
+    theirs = colmap_camera(filmed, 1).img_from_cam(local)
+    np.testing.assert_allclose(filmed.pixels(points), theirs, atol=1e-8)
+
+
+def test_a_radial_model_has_one_focal_length() -> None:
+    filmed = replace(FILMED, lens=RadialTangential(k1=-0.1))
+    found = filmed_camera(colmap_camera(filmed, 1, model="RADIAL"), colmap_pose(np.eye(4)))
+    assert found.lens == filmed.lens
+    np.testing.assert_allclose(found.camera.K, filmed.camera.K)
+
+
+def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(MissingExtraError, match=r"structgstream\[sfm\]"):
+        pycolmap_module()

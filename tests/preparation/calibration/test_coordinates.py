@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from filmed import ring
+from structgstream.data.alignment import Alignment
+from structgstream.data.posed import rotation_matrix
+from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.coordinates import normalized, upright, with_distance
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+
+POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (12, 3))
+TURN = Alignment(0.7, rotation_matrix(np.array([0.5, 1.0, -2.0])), np.array([4.0, 5.0, 6.0]))
+
+
+def solved(*, off: float = 0.0) -> SolvedCalibration:
+    """Three cameras that see all points; the last sees them ``off`` pixels to the right, and the first two of six."""
+    rig = ring(3, radius=2.0, arc_degrees=60)
+    seen = [filmed.pixels(POINTS) for filmed in rig.values()]
+    seen[2] = seen[2] + (off, 0)
+    point = np.concatenate([np.arange(6), np.arange(12), np.arange(12)])
+    camera = np.repeat([0, 1, 2], [6, 12, 12])
+    pixels = np.concatenate([seen[0][:6], seen[1], seen[2]])
+    return SolvedCalibration(rig, POINTS, Observations(point, camera, pixels, np.zeros(30, np.intp)))
+
+
+def test_errors_are_told_by_camera_pair_and_point() -> None:
+    found = solved(off=0.5)
+    assert found.camera_errors() == pytest.approx({"cam00": 0, "cam01": 0, "cam02": 0.5}, abs=1e-9)
+    pairs = found.pair_errors()
+    assert pairs["cam00", "cam01"].points == 6
+    assert pairs["cam01", "cam02"].points == 12
+    assert pairs["cam01", "cam02"].median_pixels == pytest.approx(0.5)
+    assert found.track_lengths().tolist() == [3] * 6 + [2] * 6
+    np.testing.assert_allclose(found.point_errors(), [0.5 / 3] * 6 + [0.25] * 6, atol=1e-9)
+    np.testing.assert_allclose(found.residuals()[-1], [-0.5, 0], atol=1e-9)
+
+
+def test_other_coordinates_change_no_error() -> None:
+    for moved in (solved(off=0.5).aligned(TURN), normalized(solved(off=0.5)), upright(solved(off=0.5))):
+        np.testing.assert_allclose(moved.errors(), solved(off=0.5).errors(), atol=1e-9)
+
+
+def test_normalised_is_about_the_cameras_and_in_the_axes_of_the_first() -> None:
+    found = normalized(solved().aligned(TURN))
+    centers = np.stack([filmed.camera.center.numpy() for filmed in found.cameras.values()])
+    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-9)
+    assert np.linalg.norm(centers, axis=1).max() == pytest.approx(1)
+    np.testing.assert_allclose(found.cameras["cam00"].camera.viewmat[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_a_distance_gives_metres() -> None:
+    found = with_distance(solved().aligned(TURN), "cam00", "cam02", metres=2.0)
+    assert found.metres
+    apart = found.cameras["cam00"].camera.center - found.cameras["cam02"].camera.center
+    assert float(apart.norm()) == pytest.approx(2)
+    with pytest.raises(CalibrationError, match="'cam09', which is not among the placed ones"):
+        with_distance(solved(), "cam00", "cam09", metres=2.0)
+    with pytest.raises(CalibrationError, match="gives no scale"):
+        with_distance(solved(), "cam00", "cam01", metres=-1.0)
+
+
+def test_upright_puts_up_along_minus_y() -> None:
+    """The ring's cameras have no roll in the world whose y points down."""
+    found = upright(solved().aligned(TURN))
+    for filmed in found.cameras.values():
+        assert abs(float(filmed.camera.viewmat[0, 1])) < 1e-9  # x axes are level
+        assert float(filmed.camera.viewmat[1, 1]) > 0.9  # and pictures are not upside down

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+
+from filmed import noise_texture
+from structgstream.preparation.calibration.keypoints import Keypoints, camera_keypoints
+from structgstream.preparation.calibration.pair_matches import mutual_matches
+
+
+def scene(shift: int) -> np.ndarray:
+    """A still background with a patch that has moved by ``shift`` pixels."""
+    picture = noise_texture(1, size=200).copy()
+    picture[60:140, 20 + shift : 100 + shift] = noise_texture(2, size=80)
+    return picture
+
+
+def test_what_stands_still_is_kept_once_and_what_moves_adds() -> None:
+    pictures = [scene(0), scene(0), scene(60)]
+    alone = camera_keypoints(pictures[:1])
+    still = camera_keypoints(pictures[:2])
+    assert len(still) == len(alone)
+    assert still.seen.all()
+    moved = camera_keypoints(pictures)
+    assert len(alone) + 20 < len(moved) < 2 * len(alone)
+    beyond = moved.pixels[:, 1] > 160  # rows that the patch never covers
+    assert moved.seen[beyond].mean() > 0.9
+    on_patch = (np.abs(moved.pixels - (120, 100)) < 30).all(1) & moved.seen[:, 2]
+    assert on_patch.sum() > 10
+    assert moved.seen[on_patch, 0].mean() < 0.2  # what hardly changes in so small a patch
+
+
+def test_a_masked_part_gives_none() -> None:
+    mask = np.ones((200, 200), bool)
+    mask[:, :100] = False
+    found = camera_keypoints([scene(0)], [mask])
+    assert len(found) > 20
+    assert (found.pixels[:, 0] >= 100).all()
+
+
+def test_reduced_pictures_give_pixels_of_the_whole_one() -> None:
+    from structgstream.preparation.calibration.keypoints import KeypointConfig
+
+    large = np.repeat(np.repeat(scene(0), 4, 0), 4, 1)
+    found = camera_keypoints([large], config=KeypointConfig(longest_side=200)).pixels
+    small = camera_keypoints([scene(0)]).pixels
+    assert len(found) == len(small)
+    np.testing.assert_allclose(found, 4 * small, atol=0.1)
+
+
+def test_bare_pictures_give_none() -> None:
+    assert len(camera_keypoints([np.full((60, 80, 3), 90, np.uint8)] * 2)) == 0
+
+
+def made(looks: list[int], seen: list[list[int]]) -> Keypoints:
+    descriptors = np.zeros((len(looks), 128), np.float32)
+    descriptors[np.arange(len(looks)), looks] = 1
+    return Keypoints(np.zeros((len(looks), 2)), descriptors, np.array(seen, bool))
+
+
+def test_keypoints_match_only_within_an_instant() -> None:
+    first = made([0, 1, 2], [[1, 0], [1, 1], [0, 1]])
+    second = made([0, 1, 2], [[0, 1], [0, 1], [0, 1]])
+    assert mutual_matches(first, second).tolist() == [[1, 1], [2, 2]]
+
+
+def test_a_rival_at_another_instant_does_not_count() -> None:
+    first = made([0, 5], [[1, 0], [1, 0]])
+    assert mutual_matches(first, made([0, 0, 7], [[1, 0], [0, 1], [1, 1]])).tolist() == [[0, 0]]
+    assert mutual_matches(first, made([0, 0, 7], [[1, 0], [1, 1], [1, 1]])).tolist() == []

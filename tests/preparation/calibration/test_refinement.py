@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from filmed import Film, noise_texture, ring, room
+from structgstream.data.lenses import LensCamera, RadialTangential
+from structgstream.data.posed import rotation_matrix
+from structgstream.errors import CalibrationError, CaptureError
+from structgstream.preparation.calibration.comparison import calibration_errors
+from structgstream.preparation.calibration.refinement import refine
+from structgstream.preparation.calibration.triangulation import triangulated
+
+LENS = RadialTangential(k1=-0.12, k2=0.02)
+Pictures = dict[str, list[NDArray[np.uint8]]]
+
+
+@cache
+def filmed() -> tuple[dict[str, LensCamera], Pictures]:
+    rig = ring(5, radius=2.6, arc_degrees=60, focal=290, lens=LENS, size=(320, 240))
+    return rig, {
+        name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
+    }
+
+
+def perturbed(rig: dict[str, LensCamera], *, degrees: float, percent: float) -> dict[str, LensCamera]:
+    """Every camera turned by ``degrees``, moved by ``percent`` of the radius and zoomed by ``percent``, at random."""
+    generator = np.random.default_rng(5)
+    found = {}
+    for name, one in rig.items():
+        viewmat, K = one.camera.viewmat.clone(), one.camera.K.clone()
+        axis, step = generator.normal(size=(2, 3))
+        turn = torch.from_numpy(rotation_matrix(axis / np.linalg.norm(axis) * np.radians(degrees)))
+        viewmat[:3] = turn @ viewmat[:3]
+        viewmat[:3, 3] += torch.from_numpy(step / np.linalg.norm(step) * percent / 100 * 2.6)
+        K[[0, 1], [0, 1]] *= 1 + percent / 100 * generator.choice([-1, 1])
+        found[name] = replace(one, camera=replace(one.camera, viewmat=viewmat, K=K))
+    return found
+
+
+def test_perturbed_poses_come_back_where_they_were() -> None:
+    rig, pictures = filmed()
+    given = perturbed(rig, degrees=0.3, percent=1.0)
+    found = refine(pictures, given)
+    assert found.changed
+    assert found.before_pixels > 0.8
+    assert found.after_pixels < 0.3
+    assert found.held_back > 100
+    errors = {
+        key: calibration_errors(cameras, rig) for key, cameras in (("given", given), ("ours", found.solved.cameras))
+    }
+    for name in rig:
+        assert errors["given"][name].rotation_degrees > 0.15
+        assert errors["ours"][name].rotation_degrees < 0.12
+        assert errors["ours"][name].position_percent < 0.8
+    # The gauge is the given cameras', so the mean of the positions stays, and the scale within what they are off.
+    means = [
+        np.mean([c.camera.center.numpy() for c in cameras.values()], 0) for cameras in (found.solved.cameras, given)
+    ]
+    np.testing.assert_allclose(*means, atol=1e-6)
+    assert np.median(found.solved.errors()) < 0.3
+
+
+def test_a_lens_that_was_not_known_is_found() -> None:
+    rig, pictures = filmed()
+    given = {name: replace(one, lens=RadialTangential(k1=-0.06)) for name, one in rig.items()}
+    found = refine(pictures, given, free="lens", lens="radial")
+    assert found.changed
+    before, after = calibration_errors(given, rig), calibration_errors(found.solved.cameras, rig)
+    for name in rig:
+        assert after[name].lens_pixels < 0.5 * before[name].lens_pixels
+
+
+def test_intrinsics_that_are_not_free_stay() -> None:
+    rig, pictures = filmed()
+    found = refine(pictures, perturbed(rig, degrees=0.2, percent=0.0), free="poses")
+    for name, one in found.solved.cameras.items():
+        np.testing.assert_allclose(one.camera.K, rig[name].camera.K)
+        assert one.lens == rig[name].lens
+
+
+def test_what_refining_makes_worse_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adjustment that goes wrong is noticed by the matches that it did not see."""
+    from structgstream.preparation.calibration import refinement
+
+    rig, pictures = filmed()
+    wrong = perturbed(rig, degrees=0.5, percent=1.0)
+    monkeypatch.setattr(refinement, "cameras_of", lambda model: wrong)
+    found = refine(pictures, rig, metres=True)
+    assert not found.changed
+    assert found.after_pixels > found.before_pixels
+    assert found.solved.metres
+    for name, one in found.solved.cameras.items():
+        assert one is rig[name]
+    assert len(found.solved.points) > 200
+
+
+def test_a_camera_that_is_far_off_is_named() -> None:
+    rig, pictures = filmed()
+    away = perturbed(rig, degrees=25.0, percent=0.0)["cam03"]
+    with pytest.raises(CalibrationError, match="agree with the given poses of 'cam03' to refine them"):
+        refine(pictures, rig | {"cam03": away})
+
+
+def test_points_lie_on_the_room_and_cameras_stay() -> None:
+    rig, pictures = filmed()
+    found = triangulated(pictures, rig, metres=True)
+    assert len(found.points) > 300
+    assert np.median(found.errors()) < 0.3
+    depths = []
+    for plane in room():
+        local = (found.points - plane.pose[:3, 3]) @ plane.pose[:3, :3]
+        beside = (np.maximum(0, np.maximum(-local[:, :2], local[:, :2] - plane.size))).max(1)
+        depths.append(np.hypot(local[:, 2], beside))
+    assert np.median(np.min(depths, axis=0)) < 0.01  # of a room four units wide
+    assert found.metres
+    assert all(found.cameras[name] is rig[name] for name in rig)
+
+
+def test_a_calibration_of_other_pictures_is_refused() -> None:
+    rig, pictures = filmed()
+    others = {name: [noise_texture(index, size=320)[:240]] for index, name in enumerate(rig)}
+    with pytest.raises(CalibrationError, match="No point agrees with the poses of the 5 cameras"):
+        triangulated(others, rig)
+    with pytest.raises(CaptureError, match="no pictures of camera 'more'"):
+        triangulated(pictures, rig | {"more": rig["cam00"]})
+    with pytest.raises(CalibrationError, match="have 160x240 pixels, its calibration is for 320x240"):
+        triangulated(pictures | {"cam01": [pictures["cam01"][0][:, :160]]}, rig)

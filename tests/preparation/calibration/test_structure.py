@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Structure from motion of a room whose truth is known."""
+
+import logging
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from filmed import Film, noise_texture, ring, room
+from structgstream.data.lenses import LensCamera, RadialTangential
+from structgstream.errors import CalibrationError, CaptureError
+from structgstream.preparation.calibration.comparison import calibration_errors
+from structgstream.preparation.calibration.structure import solve_structure
+
+Pictures = dict[str, list[NDArray[np.uint8]]]
+
+
+@cache
+def filmed() -> tuple[dict[str, LensCamera], Pictures]:
+    """Five cameras with mild lenses, principal points in the middle, one instant."""
+    lens = RadialTangential(k1=-0.12, k2=0.02)
+    rig = ring(5, radius=2.6, arc_degrees=60, focal=290, lens=lens, size=(320, 240))
+    for camera in rig.values():
+        camera.camera.K[0, 2], camera.camera.K[1, 2] = 160, 120
+    return rig, {
+        name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
+    }
+
+
+def noise(seed: int) -> NDArray[np.uint8]:
+    return noise_texture(seed, size=320)[:240]
+
+
+def test_a_rig_is_found_from_its_pictures() -> None:
+    rig, pictures = filmed()
+    found = solve_structure(pictures, lens="radial")
+    assert found.missing == ()
+    assert list(found.cameras) == list(rig)
+    assert not found.metres
+    assert len(found.points) > 300
+    assert np.median(found.errors()) < 0.3
+    # At 320 x 240 and with 20 keypoints to a hundred pixels; half a percent of the focal length is a pixel at the edge.
+    for error in calibration_errors(found.cameras, rig).values():
+        assert error.rotation_degrees < 0.2
+        assert error.position_percent < 1
+        assert abs(error.focal_percent) < 1.5
+        assert error.lens_pixels < 1.5
+
+
+def test_known_intrinsics_stay() -> None:
+    rig, pictures = filmed()
+    found = solve_structure(pictures, known=rig)
+    for name, error in calibration_errors(found.cameras, rig).items():
+        assert error.rotation_degrees < 0.1
+        assert error.position_percent < 0.5
+        np.testing.assert_allclose(found.cameras[name].camera.K, rig[name].camera.K)
+        assert found.cameras[name].lens == rig[name].lens
+
+
+def test_shared_intrinsics_are_one() -> None:
+    rig, pictures = filmed()
+    found = solve_structure(pictures, lens="radial", intrinsics="shared", field_of_view=55.0)
+    first = found.cameras["cam00"]
+    for name, error in calibration_errors(found.cameras, rig).items():
+        assert error.rotation_degrees < 0.15
+        assert found.cameras[name].lens == first.lens
+        np.testing.assert_array_equal(found.cameras[name].camera.K, first.camera.K)
+
+
+def test_the_same_pictures_give_the_same_numbers() -> None:
+    _, pictures = filmed()
+    one, two = (solve_structure(pictures, lens="radial", field_of_view=60.0) for _ in range(2))
+    np.testing.assert_array_equal(one.points, two.points)
+    for name in one.cameras:
+        np.testing.assert_array_equal(one.cameras[name].camera.viewmat, two.cameras[name].camera.viewmat)
+
+
+def test_a_camera_that_looks_elsewhere_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    _, pictures = filmed()
+    with caplog.at_level(logging.WARNING):
+        found = solve_structure(pictures | {"alone": [noise(99)]}, lens="radial", field_of_view=60.0)
+    assert found.missing == ("alone",)
+    assert "alone" not in found.cameras
+    assert "camera 'alone' could not be placed: 'alone' (0 of " in caplog.text
+    assert "film a board" in caplog.text
+
+
+def test_cameras_that_see_nothing_in_common_are_refused() -> None:
+    with pytest.raises(CalibrationError, match="anything in common: cameras 'cam0', 'cam1', 'cam2' have no pair"):
+        solve_structure({f"cam{index}": [noise(index)] for index in range(3)})
+
+
+def test_two_cameras_are_refused() -> None:
+    _, pictures = filmed()
+    with pytest.raises(CalibrationError, match="three cameras or more, got cameras 'cam00', 'cam01'"):
+        solve_structure({name: pictures[name] for name in ("cam00", "cam01")})
+
+
+def test_pictures_that_do_not_belong_together_are_refused() -> None:
+    _, pictures = filmed()
+    with pytest.raises(CaptureError, match=r"pictures of the same instants; got: 'cam00' 1, .*'cam04' 2"):
+        solve_structure(pictures | {"cam04": pictures["cam04"] * 2})
+    twice = {name: shots * 2 for name, shots in pictures.items()}
+    with pytest.raises(CalibrationError, match="camera 'cam04' have 320x240 and 80x60 pixels"):
+        solve_structure(twice | {"cam04": [*pictures["cam04"], noise(0)[:60, :80]]})
+    with pytest.raises(CaptureError, match="masks of camera 'cam01' do not fit"):
+        solve_structure(pictures, masks={"cam01": [np.ones((3, 3), bool)]})
+    smaller = pictures | {"cam04": [np.ascontiguousarray(pictures["cam04"][0][::2, ::2])]}
+    with pytest.raises(CalibrationError, match="Shared intrinsics need pictures of one size"):
+        solve_structure(smaller, intrinsics="shared", field_of_view=60.0)
+
+
+def test_masked_keypoints_are_not_used() -> None:
+    rig, pictures = filmed()
+    left = np.zeros((240, 320), bool)
+    left[:, :200] = True
+    found = solve_structure(pictures, known=rig, masks={"cam02": [left]})
+    own = found.observations.camera == list(found.cameras).index("cam02")
+    assert own.any()
+    assert found.observations.pixels[own, 0].max() < 201
+
+
+def test_observations_are_of_the_pictures_as_filmed() -> None:
+    rig, pictures = filmed()
+    found = solve_structure(pictures, known=rig)
+    straight = {name: replace(one, lens=RadialTangential()) for name, one in found.cameras.items()}
+    assert np.nanmedian(replace(found, cameras=straight).errors()) > 2 * np.nanmedian(found.errors())
