@@ -32,6 +32,11 @@ def test_options_of_a_capture_choose_its_part() -> None:
     assert (camera.width, camera.height, camera.near) == (80, 60, 0.5)
 
 
+def test_the_camera_best_surrounded_is_held_out_on_request() -> None:
+    options = parse_options(CaptureOptions, "reconstruct", arguments=["--held-out", "auto"])
+    assert open_selected_capture(Path(bundled_clip_path()), options).rig.testing == ("cam00",)
+
+
 def test_what_is_no_option_of_the_command_is_left_over() -> None:
     options, rest = parse_known_options(
         CaptureOptions, "reconstruct", arguments=["--online.iterations", "50", "--start", "2", "--codec", "raw"]

@@ -28,7 +28,8 @@ class CaptureOptions:
     held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
         None
     )
-    """Cameras to keep from training. Default: those that the capture's layout holds out."""
+    """Cameras to keep from training; auto: the one best surrounded by others. Default: those that the layout holds
+    out."""
     scale: float = 1.0
     """Size of the pictures relative to the stored ones, in (0, 1]."""
     start: int = 0

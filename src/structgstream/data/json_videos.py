@@ -39,16 +39,7 @@ def open_json_videos(path: Path) -> VideoSource:
         CalibrationError: broken numbers.
     """
     file = path / FILE
-    try:
-        content: dict[str, Any] = json.loads(file.read_text())
-        rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
-        fps = float(content["fps"]) if "fps" in content else None
-        stated_frames = int(content.get("frames", 1))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CaptureError(
-            f"{file} cannot be read ({type(error).__name__}: {error}); expected width, height and cameras "
-            "with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
-        ) from None
+    rig, fps, stated_frames = read_cameras(file)
     videos = {video.stem: video for video in path.glob("*.mp4")}
     check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
     source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
@@ -58,6 +49,24 @@ def open_json_videos(path: Path) -> VideoSource:
             "copy the capture again or correct the number."
         )
     return source
+
+
+def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
+    """The rig of a ``cameras.json``, its frames a second (None where it does not say) and the number of frames.
+
+    Raises:
+        CaptureError: the file cannot be read.
+        CalibrationError: broken numbers.
+    """
+    try:
+        content: dict[str, Any] = json.loads(file.read_text())
+        rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
+        return rig, float(content["fps"]) if "fps" in content else None, int(content.get("frames", 1))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CaptureError(
+            f"{file} cannot be read ({type(error).__name__}: {error}); expected width, height and cameras "
+            "with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
+        ) from None
 
 
 def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:

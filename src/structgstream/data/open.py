@@ -2,21 +2,26 @@
 """Opens a capture from a folder of any supported layout."""
 
 from pathlib import Path
+from typing import Literal
 
+from structgstream.cameras import CameraRig
 from structgstream.data.calibrated_capture import open_calibrated, recognizes_calibrated
 from structgstream.data.calibration import with_near
 from structgstream.data.colmap_capture import open_colmap, recognizes_colmap
+from structgstream.data.held_out import best_surrounded
 from structgstream.data.immersive import open_immersive, recognizes_immersive
 from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
 from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
+from structgstream.data.prepared import open_prepared, recognizes_prepared
 from structgstream.data.source import FrameSource
 from structgstream.data.transforms_capture import open_transforms, recognizes_transforms
-from structgstream.data.wrappers import WithRig, resized, section
+from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError
 
 LAYOUTS = """Supported layouts:
+  prepared         capture.json, as structgstream prepare writes it: make one from videos without calibration
   PanopticSports   train_meta.json, test_meta.json, ims/CAMERA/FRAME.jpg
   videos + JSON    cameras.json, CAMERA.mp4
   Neural 3D Video  poses_bounds.npy, camXX.mp4 (Meet Room: cam_X.mp4), with or without a COLMAP model
@@ -27,7 +32,10 @@ LAYOUTS = """Supported layouts:
   other tools      calibration of aniposelib, EasyMocap, multical, Kalibr, CMU Panoptic, Qualisys, ZJU-MoCap or
                    OpenCV, with pictures or videos as COLMAP"""
 
+AUTO = "auto"
+
 FORMATS = (
+    (recognizes_prepared, open_prepared),
     (recognizes_panoptic, open_panoptic),
     (recognizes_json_videos, open_json_videos),
     (recognizes_n3dv, open_n3dv),
@@ -41,7 +49,7 @@ FORMATS = (
 def open_capture(
     path: Path | str,
     *,
-    held_out: tuple[str, ...] | None = None,
+    held_out: tuple[str, ...] | Literal["auto"] | None = None,
     scale: float = 1.0,
     start: int = 0,
     frames: int | None = None,
@@ -51,7 +59,8 @@ def open_capture(
 
     Args:
         path: the folder.
-        held_out: names of the cameras to keep from training; None for those that the layout holds out.
+        held_out: names of the cameras to keep from training; None for those that the layout holds out; "auto" for the
+            one best surrounded by others (:func:`~structgstream.data.held_out.best_surrounded`).
         scale: size of the pictures relative to the stored ones, in (0, 1].
         start: first frame to use.
         frames: number of frames, None for all.
@@ -64,7 +73,7 @@ def open_capture(
     source = _recognized(Path(path))
     rig = source.rig
     if held_out is not None:
-        rig = rig.with_held_out(frozenset(held_out))
+        rig = rig.with_held_out(_chosen(held_out, rig))
     if near is not None:
         if not near > 0:
             raise ConfigError(f"The near plane must be positive, got {near:g}.")
@@ -74,7 +83,18 @@ def open_capture(
         sizes = {name: (sized.rig[name].width, sized.rig[name].height) for name in rig}
         rig = rig.mapped({name: rig[name].resized(*sizes[name]) for name in rig})
         sized = WithRig(sized, rig)
+    if recognizes_prepared(Path(path)) and not rig.held_out <= source.rig.held_out:
+        sized = WithoutPoints(sized)  # its points come from pictures of a camera that is held out now
     return section(sized, start=start, frames=frames)
+
+
+def _chosen(held_out: tuple[str, ...] | Literal["auto"], rig: CameraRig) -> frozenset[str]:
+    """The cameras of a choice; the command line's ``--held-out auto`` is a tuple, unless a camera has that name."""
+    if held_out == AUTO or (held_out == (AUTO,) and AUTO not in rig.cameras):
+        return frozenset({best_surrounded(rig)})
+    if isinstance(held_out, str):
+        raise ConfigError(f"held_out takes names of cameras, as ({held_out!r},), or 'auto'; got {held_out!r}.")
+    return frozenset(held_out)
 
 
 def _recognized(path: Path) -> FrameSource:

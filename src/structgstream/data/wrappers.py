@@ -58,6 +58,15 @@ class WithRig(SourceWrapper):
 
 
 @dataclass(frozen=True)
+class WithoutPoints(SourceWrapper):
+    """The same frames, whose initial points are estimated from training cameras when they are needed."""
+
+    @property
+    def points(self) -> NDArray[np.float64] | None:
+        return None
+
+
+@dataclass(frozen=True)
 class Resized(WithRig):
     """Every picture resampled by area to the size that ``other`` states."""
 

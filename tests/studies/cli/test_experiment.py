@@ -12,12 +12,12 @@ from rich.console import Console
 from backends import QUICKEST
 from small_presets import few_points
 from structgstream.cli import main
-from structgstream.cli.options import resolve_config
+from structgstream.cli.options import CaptureOptions, resolve_config
 from structgstream.data.clip import bundled_clip, bundled_clip_path
 from structgstream.data.wrappers import WithRig
 from structgstream.kernels.backend import select_backend
 from structgstream.presets import PRESETS, StreamConfig
-from structgstream_studies.cli.experiment import Display, print_sheet
+from structgstream_studies.cli.experiment import Display, ExperimentOptions, capture_part, print_sheet
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import read_results
 from structgstream_studies.experiments.sheets import Sheet
@@ -136,6 +136,12 @@ def test_wrong_options_are_told_before_anything_is_written(
     error = error_of([command, CLIP, "-o", str(out), "--device", QUICKEST, *extra], capsys, status=status)
     assert words in error
     assert not out.exists()
+
+
+def test_the_camera_best_surrounded_is_held_out_by_name(tmp_path: Path) -> None:
+    asked = ExperimentOptions(tmp_path, capture=CaptureOptions(held_out=("auto",), frames=1))
+    part, frames = capture_part(Path(CLIP), asked)
+    assert (part.held_out, frames) == (("cam00",), 1)
 
 
 def test_a_capture_that_holds_out_no_camera_cannot_be_scored(

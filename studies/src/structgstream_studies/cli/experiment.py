@@ -2,7 +2,7 @@
 """What ``ablate`` and ``compare`` share: a sweep with a display, and its tables."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,7 +68,8 @@ def capture_part(scene: Folder, asked: ExperimentOptions) -> tuple["CapturePart"
         raise UsageError(f"{source.name} holds out no camera to score; name one with --held-out.")
     if unknown := [name for name in asked.scored or () if name not in source.rig.testing]:
         raise UsageError(f"camera {unknown[0]!r} is not held out; held out are {', '.join(source.rig.testing)}.")
-    return part, len(source)
+    # By name, so that results are found again whatever chose the camera.
+    return (part if part.held_out is None else replace(part, held_out=source.rig.testing)), len(source)
 
 
 def run_sweep(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
