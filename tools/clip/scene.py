@@ -23,7 +23,8 @@ from rig import FIELD_OF_VIEW_DEGREES, FPS, FRAMES, HEIGHT, RIGS, WIDTH, View  #
 from table.stage import TABLE  # noqa: E402
 from throw.stage import THROW  # noqa: E402
 
-EXPOSURE = 0.95
+from tone import developed  # noqa: E402
+
 STAGES = {"table": TABLE, "throw": THROW}
 
 
@@ -58,15 +59,6 @@ def rendered(scene: Any, camera: Any, *, samples: int, guide_samples: int, seed:
     albedo, normal = np.clip(guide[..., -6:-3], 0, 1), guide[..., -3:]
     parts = [np.ascontiguousarray(part, np.float32) for part in (color, albedo, normal)]
     return np.array(mitsuba_oidn.denoise(*parts, hdr=True))
-
-
-def developed(linear: np.ndarray) -> np.ndarray:
-    """8-bit sRGB: exposure, a soft shoulder above 0.6 in place of clipping, and the sRGB curve."""
-    x = np.clip(linear * EXPOSURE, 0, None)
-    knee = 0.6
-    x = np.where(x > knee, knee + (1 - knee) * (1 - np.exp(-(x - knee) / (1 - knee))), x)
-    x = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-8) ** (1 / 2.4) - 0.055)
-    return (np.clip(x, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def main() -> None:

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``structgstream prepare`` recovers of rigs with known truth (``tools/rigs``).
+
+``python -m benchmarks.preparation build/rigs [RIG ...] --work build/prepared --json results/preparation.json``
+prepares every rig, holds cameras and clocks against the truth, and makes two short streams with the same settings, one
+from the prepared capture and one from the same videos with the true calibration; their held-out PSNR is compared.
+``python -m benchmarks.preparation table FILE`` prints a result as Markdown.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tools.rigs.truth import Truth, read_truth
+
+from benchmarks.recovery import camera_errors, plain, summary
+from structgstream.data.lenses import LensCamera
+from structgstream.data.points import initial_points
+from structgstream.data.prepared import PreparedCapture, open_prepared, read_prepared, write_prepared
+from structgstream.data.timeline import Clock
+from structgstream.data.undistortion import rectilinear
+from structgstream.errors import StructGStreamError
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.prepare import prepare_capture
+from structgstream.presets import FAST, StreamConfig
+
+FIELD_OF_VIEW_DEGREES, SIZE = 50.0, (320, 240)  # of both captures, so that their held-out pictures show the same
+SEED_POINTS = "points.npy"
+
+SHORT: StreamConfig = replace(
+    FAST,
+    initial=replace(
+        FAST.initial,
+        iterations=500,
+        schedule_iterations=500,
+        coarse_iterations=350,
+        growth=replace(FAST.initial.growth, collect_from=40, start=80, stop=400, room_until=300),
+    ),
+    online=replace(FAST.online, iterations=40, patching=replace(FAST.online.patching, iteration=20)),
+)
+"""As the preset ``fast`` with less than half of its iterations."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One preparation.
+
+    Args:
+        rig: whose videos.
+        how: in a few words, for tables.
+        options: what is asked for, beside size, field of view and the held-out camera.
+    """
+
+    rig: str
+    how: str
+    options: PrepareOptions = PrepareOptions()
+
+
+OPTIONS: Mapping[str, Mapping[str, PrepareOptions]] = {
+    "mild": {"sfm": PrepareOptions(), "sfm, shared": PrepareOptions(intrinsics="shared")},
+    "phone": {"sfm": PrepareOptions(), "sfm, opencv": PrepareOptions(lens="opencv")},
+    "fisheye": {"sfm, fisheye": PrepareOptions(lens="fisheye")},
+}
+"""What is asked for beside size, field of view and the held-out camera, by rig and in a few words."""
+
+
+def runs(folder: Path, rigs: list[str]) -> list[Run]:
+    """The preparations of these rigs, each as a user of that rig would ask for it."""
+    found = []
+    for rig in rigs:
+        truth, here = read_truth(folder / rig), folder / rig
+        if truth.given is not None:
+            given = PrepareOptions(calibration=here / "calibration.json")
+            asked = {"its calibration": given, "its calibration, refined": replace(given, refine=True)}
+        elif truth.board is not None:
+            videos = here / "board" if truth.held_out is not None else None
+            options = PrepareOptions(calibration="board", board=Board(**truth.board), board_videos=videos)
+            asked = {"board": options}
+        else:
+            asked = OPTIONS.get(rig, {"sfm": PrepareOptions()})
+        how = synchronization(truth)
+        found += [Run(rig, name, replace(options, synchronize=how)) for name, options in asked.items()]
+    return found
+
+
+def synchronization(truth: Truth) -> str:
+    """What the owner of a rig would ask for: nothing where one signal starts all cameras."""
+    return "none" if set(true_clocks(truth).values()) == {Clock()} else "auto"
+
+
+def measured(run: Run, folder: Path, work: Path, *, frames: int, streams: bool) -> dict[str, Any]:
+    """One preparation against the truth, as plain JSON values; what fails is told in its ``error``."""
+    truth = read_truth(folder / run.rig)
+    videos = folder / run.rig / ("videos" if truth.held_out is not None else "board")
+    name = f"{run.rig}-{run.how}".replace(",", "").replace(" ", "-")
+    capture = work / name
+    shutil.rmtree(capture, ignore_errors=True)
+    options = replace(run.options, field_of_view=FIELD_OF_VIEW_DEGREES, size=SIZE)
+    if truth.held_out is not None:
+        options = replace(options, held_out=(truth.held_out,))
+    found: dict[str, Any] = {"rig": run.rig, "what": truth.what, "how": run.how}
+    begun, processor = time.perf_counter(), time.process_time()
+    try:
+        made = prepare_capture(videos, capture, options=options)
+    except StructGStreamError as error:
+        return found | {"error": str(error)}
+    found |= {
+        "seconds": time.perf_counter() - begun,
+        "processor_seconds": time.process_time() - processor,
+        "steps": dict(made.steps),
+        "findings": [{"severity": f.severity, "sentence": f.sentence} for f in made.findings],
+    }
+    content = read_prepared(capture)
+    found |= recovered(content, truth, find_footage(videos))
+    if streams and truth.held_out is not None:
+        exact = with_truth(content, truth, capture, work / f"{name}-exact")
+        found["psnr"] = {
+            "prepared": held_out_psnr(capture, work / f"{name}.sgs", frames=frames, held_out=truth.held_out),
+            "exact": held_out_psnr(exact, work / f"{name}-exact.sgs", frames=frames, held_out=truth.held_out),
+        }
+    return found
+
+
+def recovered(content: PreparedCapture, truth: Truth, footage: Footage) -> dict[str, Any]:
+    """Errors of the cameras of a prepared capture."""
+    estimate = {name: camera.filmed for name, camera in content.cameras.items()}
+    clocks = {name: camera.clock for name, camera in content.cameras.items()}
+    takes = {name: (float(footage.stamps(name)[0]), float(footage.stamps(name)[-1])) for name in estimate}
+    errors = camera_errors(estimate, true_cameras(truth), clocks=clocks, true_clocks=true_clocks(truth), takes=takes)
+    return {
+        "errors": summary(errors),
+        "cameras": plain(errors),
+        "missing": sorted(set(truth.cameras) - set(estimate)),
+    }
+
+
+def true_cameras(truth: Truth) -> dict[str, LensCamera]:
+    """The cameras of a rig, as they stood at first."""
+    return {name: camera.filmed for name, camera in truth.cameras.items()}
+
+
+def true_clocks(truth: Truth) -> dict[str, Clock]:
+    """The clocks of a rig."""
+    return {name: Clock(camera.offset_seconds, camera.rate) for name, camera in truth.cameras.items()}
+
+
+def with_truth(content: PreparedCapture, truth: Truth, capture: Path, folder: Path) -> Path:
+    """The prepared capture with the true calibration, in the coordinates and the common time of the prepared one.
+
+    Pictures, near plane and the way in which initial points are found are the same.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    cameras = true_cameras(truth)
+    both = {name: cameras[name] for name in content.cameras}
+    moved = rig_alignment(both, {name: camera.filmed for name, camera in content.cameras.items()})
+    clocks = common(true_clocks(truth), {name: camera.clock for name, camera in content.cameras.items()})
+    exact = {}
+    for name, camera in content.cameras.items():
+        filmed = moved.filmed(both[name])
+        pinhole = rectilinear(filmed, degrees=FIELD_OF_VIEW_DEGREES, size=SIZE)
+        exact[name] = replace(camera, filmed=filmed, pinhole=pinhole, clock=clocks[name])
+        target = folder / camera.files
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.link(capture / camera.files, target)
+    written = replace(content, cameras=exact, points=None)
+    write_prepared(folder, written)
+    source = open_prepared(folder)
+    np.save(folder / SEED_POINTS, initial_points(next(source.frames(0)), source.rig).positions)
+    write_prepared(folder, replace(written, points=SEED_POINTS))
+    return folder
+
+
+def common(truth: Mapping[str, Clock], estimate: Mapping[str, Clock]) -> dict[str, Clock]:
+    """The true clocks, with the zero of the estimated common time."""
+    shift = float(np.median([clock.offset_seconds - truth[name].offset_seconds for name, clock in estimate.items()]))
+    return {name: replace(truth[name], offset_seconds=truth[name].offset_seconds + shift) for name in estimate}
+
+
+def held_out_psnr(capture: Path, path: Path, *, frames: int, held_out: str) -> float:
+    """Mean over a short stream's frames of the held-out camera's PSNR, dB."""
+    from structgstream.api import evaluate, reconstruct
+
+    reconstruct(capture, path, preset=SHORT, frames=frames, held_out=(held_out,), overwrite=True)
+    return float(evaluate(path, capture, metrics="basic").mean.psnr)
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """A result as Markdown."""
+    machine = result["machine"]
+    lines = [
+        f"`{result['command']}`",
+        "",
+        f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, commit {machine['commit']}; "
+        f"streams of {result['frames']} frames of {SIZE[0]}x{SIZE[1]}, {SHORT.initial.iterations} iterations of "
+        "frame 0. Errors are medians over the cameras, in brackets the largest.",
+        "",
+        "| rig | by | rotation, degrees | position, % of the rig's radius | focal length, % | lens, pixels | time, ms "
+        "| held-out PSNR, exact | difference | found |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [_row(run) for run in result["runs"]]
+    return "\n".join(lines)
+
+
+def _row(run: Mapping[str, Any]) -> str:
+    if "error" in run:
+        return f"| {run['what']} | {run['how']} | {run['error']} |" + " |" * 7
+    errors = run["errors"]
+    digits = {"rotation_degrees": 3, "position_percent": 2, "focal_percent": 2, "lens_pixels": 2, "milliseconds": 1}
+    cells = [_median_and_largest(errors[key], places) for key, places in digits.items()]
+    psnr = run.get("psnr")
+    cells += [f"{psnr['exact']:.2f} dB", f"{psnr['prepared'] - psnr['exact']:+.2f} dB"] if psnr else ["", ""]
+    told = " ".join(finding["sentence"] for finding in run["findings"]).replace("|", "\\|")
+    return f"| {run['what']} | {run['how']} | " + " | ".join(cells) + f" | {told} |"
+
+
+def _median_and_largest(error: Mapping[str, float | None], places: int) -> str:
+    if error["median"] is None:
+        return ""
+    return f"{error['median']:.{places}f} ({error['largest']:.{places}f})"
+
+
+def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.preparation",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, help="what tools/rigs/film.py made")
+    parser.add_argument("rigs", nargs="*", help="all when none is named")
+    parser.add_argument("--work", type=Path, required=True, help="folder for captures and streams")
+    parser.add_argument("--json", type=Path, help="file to write; runs of other rigs that it has are kept")
+    parser.add_argument("--frames", type=int, default=4, help="of each stream")
+    parser.add_argument("--streams", action=argparse.BooleanOptionalAction, default=True, help="compare PSNR")
+    return parser.parse_args(arguments)
+
+
+def main() -> None:
+    """Measures, or prints a result as Markdown."""
+    if sys.argv[1:2] == ["table"]:
+        for path in sys.argv[2:]:
+            print(table(json.loads(Path(path).read_text())))
+        return
+    from benchmarks.machine import machine
+
+    options = parsed()
+    rigs = options.rigs or sorted(path.parent.name for path in options.folder.glob("*/truth.json"))
+    options.work.mkdir(parents=True, exist_ok=True)
+    command = " ".join(["python -m benchmarks.preparation", *sys.argv[1:]])
+    result: dict[str, Any] = {"command": command, "frames": options.frames, "machine": machine(), "runs": []}
+    if options.json and options.json.is_file():
+        result["runs"] = [run for run in json.loads(options.json.read_text())["runs"] if run["rig"] not in rigs]
+    for run in runs(options.folder, rigs):
+        result["runs"].append(
+            measured(run, options.folder, options.work, frames=options.frames, streams=options.streams)
+        )
+        print(_row(result["runs"][-1]), flush=True)
+        if options.json:
+            options.json.parent.mkdir(parents=True, exist_ok=True)
+            options.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
