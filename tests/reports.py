@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a session tells of a frame, for tests of those who listen."""
+"""What a session tells of a frame, for tests of those who listen, and scores of frames that have some."""
 
 from typing import Any
 
 from structgstream.codec.packets import PacketKind
+from structgstream.evaluation.report import FrameScores, Scores
 from structgstream.session import FrameReport
 
 
@@ -23,3 +24,9 @@ def frame_report(index: int, **known: Any) -> FrameReport:
         "seconds": {"total": 1.0},
     }
     return FrameReport(index=index, **{**usual, **known})
+
+
+def mean_of(frame: FrameScores) -> Scores:
+    """The mean scores of a frame of which a scored camera has a picture."""
+    assert frame.mean is not None
+    return frame.mean

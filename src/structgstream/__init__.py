@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free-viewpoint video streams from synchronised cameras, reconstructed frame by frame.
 
-:func:`reconstruct` makes a stream from a capture, :func:`open_stream` opens it for rendering, :func:`evaluate` scores
-it and :func:`export` writes it in other formats. Cameras and points are in the units of the capture, except in a
-:class:`Scene`, which is normalised (``docs/conventions.md``).
+:func:`prepare` makes a capture from videos and :func:`check` looks at one; :func:`reconstruct` makes a stream from a
+capture, :func:`open_stream` opens it for rendering, :func:`evaluate` scores it and :func:`export` writes it in other
+formats. Cameras and points are in the units of the capture, except in a :class:`Scene`, which is normalised
+(``docs/conventions.md``).
 
 Names are imported on first use, so that ``import structgstream`` is fast and needs no optional package.
 """
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING
 from structgstream.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from structgstream.api import evaluate, export, reconstruct
+    from structgstream.api import check, evaluate, export, prepare, reconstruct
     from structgstream.cameras import Camera, CameraRig
     from structgstream.codec.packets import Packet, PacketKind, StreamHeader
     from structgstream.codec.reader import PacketInfo, StreamReader, open_stream
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
     from structgstream.pipeline import Pipeline
+    from structgstream.preparation.checking.findings import CheckReport, Finding
+    from structgstream.preparation.options import PrepareOptions
+    from structgstream.preparation.prepare import Preparation
     from structgstream.presets import PRESETS, StreamConfig
     from structgstream.scene.render import Rendering, render
     from structgstream.scene.scene import Scene
@@ -39,7 +43,9 @@ _HOMES = {
     "Backend": "kernels.backend",
     "Camera": "cameras",
     "CameraRig": "cameras",
+    "CheckReport": "preparation.checking.findings",
     "FileSink": "codec.sinks",
+    "Finding": "preparation.checking.findings",
     "FrameReport": "frame_report",
     "FrameScores": "evaluation.report",
     "FrameSource": "data.source",
@@ -51,6 +57,8 @@ _HOMES = {
     "PacketKind": "codec.packets",
     "PeakKind": "memory",
     "Pipeline": "pipeline",
+    "Preparation": "preparation.prepare",
+    "PrepareOptions": "preparation.options",
     "Rendering": "scene.render",
     "Report": "evaluation.report",
     "Scene": "scene.scene",
@@ -61,10 +69,12 @@ _HOMES = {
     "StreamHeader": "codec.packets",
     "StreamReader": "codec.reader",
     "StructGStreamError": "errors",
+    "check": "api",
     "evaluate": "api",
     "export": "api",
     "open_capture": "data.open",
     "open_stream": "codec.reader",
+    "prepare": "api",
     "reconstruct": "api",
     "render": "scene.render",
     "select_backend": "kernels.backend",
@@ -76,7 +86,9 @@ __all__ = [
     "Backend",
     "Camera",
     "CameraRig",
+    "CheckReport",
     "FileSink",
+    "Finding",
     "FrameReport",
     "FrameScores",
     "FrameSource",
@@ -87,6 +99,8 @@ __all__ = [
     "PacketKind",
     "PeakKind",
     "Pipeline",
+    "Preparation",
+    "PrepareOptions",
     "Rendering",
     "Report",
     "Scene",
@@ -97,10 +111,12 @@ __all__ = [
     "StreamHeader",
     "StreamReader",
     "StructGStreamError",
+    "check",
     "evaluate",
     "export",
     "open_capture",
     "open_stream",
+    "prepare",
     "reconstruct",
     "render",
     "select_backend",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The functions of ``import structgstream``: reconstruct a capture, evaluate a stream, export a stream.
+"""The functions of ``import structgstream``: prepare and reconstruct a capture, evaluate a stream, export a stream.
 
 Each does what the command of the same name does by default, without output to the terminal. Cameras and points are in
 the units of the capture.
@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from structgstream.codec.reader import open_stream
 from structgstream.data.open import open_capture
@@ -26,9 +27,62 @@ from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.player.stream_file import StreamFile
 from structgstream.player.write import write_page, write_site
+from structgstream.preparation.checking.findings import CheckReport
+from structgstream.preparation.checking.folder import check_folder
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.prepare import Preparation, prepare_capture
+from structgstream.preparation.steps import Listener
 from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.recorder import check_output, record
 from structgstream.struct_gstream import stream_pipeline
+
+
+def prepare(
+    videos: Path | str,
+    capture: Path | str,
+    *,
+    options: PrepareOptions | None = None,
+    listener: Listener | None = None,
+) -> Preparation:
+    """Turns videos of still cameras into a calibrated capture, and checks it.
+
+    The call can be repeated: steps whose inputs and options are the same are not done again, so that it goes on after
+    an interruption.
+
+    Args:
+        videos: the folder of the cameras' videos or pictures.
+        capture: the folder to make; nothing that was made by others is written into.
+        options: how; None for the defaults of the command.
+        listener: is told of steps and progress.
+
+    Returns:
+        the capture's folder, what the check found, and the page of its report.
+
+    Raises:
+        CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` holds something else.
+        ConfigError: options that these cameras do not allow.
+        StorageError: the capture cannot be written.
+        MissingExtraError: a package is missing that a step needs.
+    """
+    return prepare_capture(Path(videos), Path(capture), options=options, listener=listener)
+
+
+def check(capture: Path | str, *, report: Path | str | None = None) -> CheckReport:
+    """Checks a capture of any layout against its pictures: poses, names, units, overlap, colours, times.
+
+    Args:
+        capture: its folder.
+        report: folder for a page with pictures and numbers; None for none.
+
+    Returns:
+        all numbers, and findings: errors, which spoil a stream, first.
+
+    Raises:
+        CaptureError: the capture cannot be opened or read.
+        StorageError: the report cannot be written.
+        MissingExtraError: a package is missing.
+    """
+    return check_folder(Path(capture), report=None if report is None else Path(report)).report
 
 
 def reconstruct(
@@ -39,7 +93,7 @@ def reconstruct(
     quality: float | None = None,
     mbits: float | None = None,
     seed: int | None = None,
-    held_out: tuple[str, ...] | None = None,
+    held_out: tuple[str, ...] | Literal["auto"] | None = None,
     scale: float = 1.0,
     start: int = 0,
     frames: int | None = None,
@@ -62,7 +116,8 @@ def reconstruct(
         quality: of compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.
         mbits: of compact streams: target rate in Mbit/s; None for constant quality.
         seed: random seed; None for the preset's.
-        held_out: names of the cameras to keep from training; None for those that the capture's layout holds out.
+        held_out: names of the cameras to keep from training; None for those that the capture's layout holds out; "auto"
+            for the one best surrounded by others.
         scale: size of the pictures relative to the stored ones, in (0, 1].
         start: first frame to use.
         frames: number of frames; None for all.

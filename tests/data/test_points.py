@@ -142,7 +142,7 @@ def test_absent_cameras_and_masked_pixels_give_no_points() -> None:
     frame = next(iter(CLIP.frames()))
     masks = {name: np.ones(image.shape[:2], bool) for name, image in frame.images.items()}
     for mask in masks.values():
-        mask[:, mask.shape[1] // 2 :] = False
+        mask[:, len(mask[0]) // 2 :] = False
     absent = CLIP.rig.training[2]
     images = {name: image for name, image in frame.images.items() if name != absent}
     config = PointsConfig(max_points=20_000, sweep_levels=COARSE)

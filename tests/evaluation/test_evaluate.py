@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from memory_captures import MemoryCapture
+from reports import mean_of
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
@@ -129,15 +130,15 @@ def test_a_perfect_stream_scores_as_equal(world: World) -> None:
 
 def test_a_stream_that_stands_still_loses_the_changed_pixels(world: World) -> None:
     report = run(in_the_stream(world, similarity=Similarity(), follow=False), MemoryCapture(world.rig, world.frames))
-    psnrs = [frame.mean.psnr for frame in report.frames]
+    psnrs = [mean_of(frame).psnr for frame in report.frames]
     assert psnrs == sorted(psnrs, reverse=True)
     assert report.stream["drift_db_per_frame"] < -1
     assert report.stream["drop_from_first_db"] == pytest.approx(psnrs[0] - psnrs[-1])
-    last = report.frames[-1].mean
+    last = mean_of(report.frames[-1])
     assert last.psnr_changed is not None
     assert last.psnr_still is not None
     assert last.psnr_changed < last.psnr < last.psnr_still
-    assert report.frames[0].mean.psnr_changed is None
+    assert mean_of(report.frames[0]).psnr_changed is None
     assert [frame.kind for frame in report.frames] == ["key", "delta", "delta", "delta"]
 
 
@@ -187,13 +188,13 @@ def exposed(frames: list[MultiViewFrame], *, gains: list[float]) -> list[MultiVi
 def test_a_cameras_exposure_is_set_aside_once_and_then_held(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     report = run(reader, MemoryCapture(world.rig, exposed(world.frames, gains=[0.7, 0.7, 0.7, 0.5])))
-    held = [value for frame in report.frames if (value := frame.mean.psnr_camera_color) is not None]
+    held = [value for frame in report.frames if (value := mean_of(frame).psnr_camera_color) is not None]
     assert len(held) == 4
     assert min(held[:3]) > 50
-    assert all(frame.mean.psnr < 30 for frame in report.frames)
+    assert all(mean_of(frame).psnr < 30 for frame in report.frames)
     # The last frame is darker still: the fit of frame 0 does not follow it, a fit of its own does.
     assert held[3] < 30
-    assert report.frames[3].mean.psnr_affine > 50
+    assert mean_of(report.frames[3]).psnr_affine > 50
     assert report.stream["camera_colors"]["cam00"]["gains"] == pytest.approx([0.7] * 3, abs=0.01)
     assert as_json(report)["cameras"]["cam00"]["psnr_camera_color"] == pytest.approx(np.mean(held))
 
@@ -302,7 +303,7 @@ def test_every_score_over_time_is_wired(world: World) -> None:
     assert stays.mean.e_warp is not None
     assert stays.mean.flicker == 0.0
     assert follows.mean.flicker == follows.mean.truth_flicker == stays.mean.truth_flicker
-    first = stays.frames[0].mean
+    first = mean_of(stays.frames[0])
     assert {first.e_warp, first.temporal_flip, first.flicker, first.truth_flicker} == {None}
     assert first.flip == 0.0
     missing = follows.stream["not_available"]

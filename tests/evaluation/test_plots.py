@@ -10,6 +10,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from reports import mean_of
 from structgstream.evaluation import plots
 from structgstream.evaluation.report import FrameScores, Report, Scores, mean_scores
 
@@ -37,7 +38,7 @@ def panels(frames: list[FrameScores], monkeypatch: pytest.MonkeyPatch) -> dict[s
     monkeypatch.setattr(plots, "save_figure", lambda figure, path: figures.append(figure))
     names = [*frames[0].cameras]
     by_camera = {name: mean_scores(one.cameras[name] for one in frames) for name in names}
-    report = Report(frames, by_camera, mean_scores(one.mean for one in frames), {}, {})
+    report = Report(frames, by_camera, mean_scores(mean_of(one) for one in frames), {}, {})
     plots.write_plots(Path("unused.png"), report, title="a result")
     return {axis.get_ylabel(): axis for axis in figures[0].axes}
 
@@ -92,7 +93,7 @@ def test_no_two_stages_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_score_that_hardly_changes_lies_within_its_panel(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [frame(index, {"left": 30.0}) for index in range(3)]
     frames = [
-        replace(one, mean=replace(one.mean, flip=value))
+        replace(one, mean=replace(mean_of(one), flip=value))
         for one, value in zip(frames, (0.1389, 0.1391, 0.1391), strict=True)
     ]
     bottom, top = panels(frames, monkeypatch)["distance"].get_ylim()

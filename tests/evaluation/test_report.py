@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from drawn import pixels_of
+from reports import mean_of
 from structgstream.errors import StorageError
 from structgstream.evaluation.plots import write_plots
 from structgstream.evaluation.report import (
@@ -121,7 +122,7 @@ def test_plots_have_a_panel_more_with_a_log(tmp_path: Path) -> None:
         replace(report, frames=[replace(frame, log={}) for frame in report.frames]),
         title="a result",
     )
-    scored = [replace(frame, mean=replace(frame.mean, flip=0.1, flicker=0.5)) for frame in report.frames]
+    scored = [replace(frame, mean=replace(mean_of(frame), flip=0.1, flicker=0.5)) for frame in report.frames]
     write_plots(tmp_path / "scored.png", replace(report, frames=scored), title="a result")
     heights = [pixels_of(tmp_path / f"{name}.png").shape[0] for name in ("with", "without", "scored")]
     assert heights[2] > heights[0] > heights[1] > 500

@@ -6,6 +6,7 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
 from structgstream.training.motion_start import MotionStartConfig
+from structgstream.training.picture_change import PictureChange
 from structgstream.training.pictures import FramePictures, pictures_of
 from worlds import moving_world
 
@@ -20,13 +21,21 @@ def pictures(*, motion: MotionConfig = MOTION, start: MotionStartConfig = START,
     return pictures_of(WORLD.frames[1], WORLD.rig, before=before, motion=motion, start=start, backend=backend)
 
 
+def known(found: FramePictures) -> list[PictureChange]:
+    """The changes of all views, each of which was there before."""
+    assert found.changes is not None
+    changes = [change for change in found.changes if change is not None]
+    assert len(changes) == len(found.views)
+    return changes
+
+
 def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
     found = pictures()
-    assert found.changes is not None
-    assert len(found.changes) == len(found.views) == len(WORLD.rig.training)
-    views_with_flow = [view.index for view, change in zip(found.views, found.changes) if change.flow is not None]
+    changes = known(found)
+    assert len(changes) == len(found.views) == len(WORLD.rig.training)
+    views_with_flow = [view.index for view, change in zip(found.views, changes) if change.flow is not None]
     assert 2 <= len(views_with_flow) <= 3
-    for view, change in zip(found.views, found.changes):
+    for view, change in zip(found.views, changes):
         assert change.changed.shape == view.image.shape[:2]
         assert 0.0 < float(change.changed.float().mean()) < 0.9
         assert not change.identical
@@ -41,9 +50,9 @@ def test_equal_pictures_are_the_same() -> None:
     backend = reference_backend()
     frozen = replace(WORLD.frames[0], index=1)
     found = pictures_of(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
-    assert found.changes is not None
-    assert all(change.identical and not change.changed.any() for change in found.changes)
-    assert all(change.flow is None or not change.flow[..., :3].any() for change in found.changes)
+    changes = known(found)
+    assert all(change.identical and not change.changed.any() for change in changes)
+    assert all(change.flow is None or not change.flow[..., :3].any() for change in changes)
 
 
 def test_everything_may_move_without_a_frame_before_without_a_gate_and_in_full_frames() -> None:
@@ -55,6 +64,6 @@ def test_everything_may_move_without_a_frame_before_without_a_gate_and_in_full_f
 
 def test_without_a_motion_start_nobody_looks_for_flow() -> None:
     found = pictures(start=replace(START, enabled=False))
-    assert found.changes is not None
-    assert all(change.flow is None for change in found.changes)
-    assert all(torch.equal(a.changed, b.changed) for a, b in zip(found.changes, pictures().changes or [], strict=True))
+    changes = known(found)
+    assert all(change.flow is None for change in changes)
+    assert all(torch.equal(a.changed, b.changed) for a, b in zip(changes, known(pictures()), strict=True))

@@ -17,6 +17,8 @@ from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
     "demo": "reconstruct, evaluate and export the bundled clip",
+    "prepare": "turn videos of your own cameras into a calibrated capture, and check it",
+    "board": "write a calibration board to print",
     "reconstruct": "turn a capture into a stream, frame by frame",
     "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
@@ -123,6 +125,7 @@ options:
 
 examples:
   structgstream demo
+  structgstream prepare videos -o capture
   structgstream reconstruct basketball -o ball.sgs --held-out 0 10 15 30
   structgstream play ball.sgs --capture basketball
   structgstream evaluate ball.sgs basketball --report ball-report

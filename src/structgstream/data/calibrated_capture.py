@@ -52,8 +52,32 @@ def open_calibrated(path: Path) -> FrameSource:
         converter, files = found
         return open_posed(path, converter.read(files))
     pickles = _pickles(path)
-    raise CalibrationError(
-        f"{pickles[0] if pickles else path} is a pickle, and opening it could run any program; it is refused. "
+    raise _refused(pickles[0] if pickles else path)
+
+
+def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
+    """The cameras of the calibration file in the folder ``path``; None when there is none.
+
+    Args:
+        path: the folder.
+        file: the only file to consider; None for any.
+
+    Raises:
+        CalibrationError: a broken file, or one that only running it could read.
+    """
+    for converter in CONVERTERS:
+        files = converter.find(path)
+        if files and (file is None or file in files):
+            return converter.read(files)
+    pickles = [pickle for pickle in _pickles(path) if file in (None, pickle)]
+    if pickles:
+        raise _refused(pickles[0])
+    return None
+
+
+def _refused(pickle: Path) -> CalibrationError:
+    return CalibrationError(
+        f"{pickle} is a pickle, and opening it could run any program; it is refused. "
         "Convert it, with a program that you trust, to one of the formats of docs/captures.md."
     )
 

@@ -5,7 +5,6 @@ import os
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -50,11 +49,11 @@ class ImageSource:
         Raises:
             CaptureError: a picture has gone, cannot be decoded, or has another size than its intrinsics.
         """
-        cv2 = opencv()
+        opencv()  # missing, it is told once
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
-                pictures = pool.map(partial(_picture, cv2), paths.values(), [self.rig[name] for name in paths])
+                pictures = pool.map(_picture, paths.values(), [self.rig[name] for name in paths])
                 yield MultiViewFrame(index, index / self.fps, dict(zip(paths, pictures, strict=True)))
 
 
@@ -102,8 +101,13 @@ def common_pictures(
     )
 
 
-def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """One picture as ``[H, W, 3]`` sRGB, checked against the size of its camera."""
+def read_picture(path: Path) -> NDArray[np.uint8]:
+    """One picture as ``[H, W, 3]`` sRGB, as its pixels are stored.
+
+    Raises:
+        CaptureError: it cannot be read or decoded.
+    """
+    cv2 = opencv()
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -121,13 +125,19 @@ def _picture(cv2: ModuleType, path: Path, camera: Camera) -> NDArray[np.uint8]:
             f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it, or delete "
             "it: its camera then is absent from that frame."
         )
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def _picture(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """One picture, checked against the size of its camera."""
+    picture = read_picture(path)
     height, width = picture.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise CalibrationError(
             f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
             f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
         )
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return picture
 
 
 def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -7,9 +7,7 @@ without the poses, and are inliers of some epipolar geometry, are tested against
 """
 
 import logging
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,19 +16,17 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.matching import (
-    Features,
     Floats,
     angles,
     epipolar_errors,
     fundamental_matrix,
-    load_cv2,
     neighbor_views,
     rays,
-    sift_features,
     triangulate,
     unique_pairs,
     viewing_distance,
 )
+from structgstream.data.pair_matches import MatchConfig, PairMatcher
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 
@@ -42,12 +38,8 @@ class PoseCheckConfig:
     """Thresholds of the pose check.
 
     Args:
-        features: SIFT keypoints per picture.
+        matches: how matches are found.
         pairs: most pairs of neighbours tested.
-        ratio: largest ratio of the best to the second-best descriptor distance.
-        inlier_pixels: largest epipolar distance of inliers of a pair's own epipolar geometry.
-        min_inliers: least number of inliers of a pair that is used.
-        min_inlier_share: least share of inliers among the matches of a pair that is used.
         violation_share: distance to the epipolar line of the poses, as a share of the picture's width, above which a
             match violates them; a match triangulated behind a camera violates them too.
         min_parallax_degrees: smallest angle between the rays at which a point behind a camera counts.
@@ -55,12 +47,8 @@ class PoseCheckConfig:
         min_matches: least number of good matches for a verdict.
     """
 
-    features: int = 1500
+    matches: MatchConfig = MatchConfig()
     pairs: int = 12
-    ratio: float = 0.75
-    inlier_pixels: float = 1.5
-    min_inliers: int = 20
-    min_inlier_share: float = 0.5
     violation_share: float = 0.01
     min_parallax_degrees: float = 0.3
     max_share: float = 0.6
@@ -94,12 +82,12 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
         MissingExtraError: cv2 is not installed.
     """
     given = {name: rig[name] for name in frame.present(rig.training)}
-    matcher = _Matcher(frame, config)
+    matcher = PairMatcher(frame.images, config.matches, masks=frame.masks)
     check = _judge(given, matcher.matches(_pairs(given, config)), config)
     if check.conclusive and check.share_violating <= config.max_share:
         return check
     # Pairs chosen by wrong poses hardly match, so pairs chosen after undoing each common mistake are tested too.
-    readings = {name: _reinterpret(given, change) for name, change in _MISTAKES.items()}
+    readings = {name: reinterpreted(given, change) for name, change in MISTAKES.items()}
     pairs = dict.fromkeys(pair for cameras in (given, *readings.values()) for pair in _pairs(cameras, config))
     matches = matcher.matches(list(pairs))
     check = _judge(given, matches, config)
@@ -132,7 +120,7 @@ def _flipped(viewmat: Tensor) -> Tensor:
     return torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=viewmat.dtype)) @ viewmat
 
 
-_MISTAKES: Mapping[str, Callable[[Tensor], Tensor]] = {
+MISTAKES: Mapping[str, Callable[[Tensor], Tensor]] = {
     "every pose is inverted: they look like camera-to-world matrices given as world-to-camera; invert them": _inverted,
     "the y and z axes of every camera are flipped: they look like OpenGL axes; expected OpenCV ones": _flipped,
     "every pose is inverted and its y and z axes flipped: they look like camera-to-world matrices with "
@@ -140,7 +128,8 @@ _MISTAKES: Mapping[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def _reinterpret(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -> dict[str, Camera]:
+def reinterpreted(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tensor]) -> dict[str, Camera]:
+    """The cameras with their view matrices changed."""
     return {name: replace(camera, viewmat=change(camera.viewmat)) for name, camera in cameras.items()}
 
 
@@ -149,49 +138,6 @@ def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[tuple
     pairs = unique_pairs(neighbor_views(cameras, count=2, distance=viewing_distance(cameras)))
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), config.pairs)).round().astype(int)
     return [pairs[index] for index in chosen]
-
-
-class _Matcher:
-    """Good matches of pairs of pictures, independent of the poses; results per picture and pair are cached."""
-
-    def __init__(self, frame: MultiViewFrame, config: PoseCheckConfig) -> None:
-        self._frame = frame
-        self._config = config
-        self._features: dict[str, Features] = {}
-        self._matches: dict[tuple[str, str], tuple[Floats, Floats]] = {}
-
-    def matches(self, pairs: list[tuple[str, str]]) -> dict[tuple[str, str], tuple[Floats, Floats]]:
-        """Pixels ``[S, 2]`` in the first and in the second picture of each pair."""
-        names = sorted({name for pair in pairs for name in pair} - set(self._features))
-        missing = [pair for pair in pairs if pair not in self._matches]
-        with ThreadPoolExecutor(max(1, min(len(names) + 1, os.cpu_count() or 1))) as pool:
-            self._features |= zip(names, pool.map(self._extract, names), strict=True)
-            self._matches |= zip(missing, pool.map(self._match, missing), strict=True)
-        return {pair: self._matches[pair] for pair in pairs}
-
-    def _extract(self, name: str) -> Features:
-        return sift_features(self._frame.images[name], count=self._config.features, mask=self._frame.masks.get(name))
-
-    def _match(self, pair: tuple[str, str]) -> tuple[Floats, Floats]:
-        config, empty = self._config, (np.empty((0, 2)), np.empty((0, 2)))
-        first, second = (self._features[name] for name in pair)
-        if min(len(first.pixels), len(second.pixels)) < config.min_inliers:
-            return empty
-        similarity = first.descriptors @ second.descriptors.T
-        best = similarity.argmax(1)
-        two = np.partition(similarity, -2, axis=1)[:, -2:]
-        distances = np.sqrt(np.maximum(2 - 2 * two, 0))
-        mutual = similarity.argmax(0)[best] == np.arange(len(best))
-        kept = np.flatnonzero(mutual & (distances[:, 1] < config.ratio * distances[:, 0]))
-        pixels1, pixels2 = first.pixels[kept], second.pixels[best[kept]]
-        if len(kept) < config.min_inliers:
-            return empty
-        cv2 = load_cv2()
-        _, mask = cv2.findFundamentalMat(pixels1, pixels2, cv2.FM_RANSAC, config.inlier_pixels, 0.999, 2000)
-        agree = np.zeros(len(kept), bool) if mask is None else mask.ravel().astype(bool)
-        if agree.sum() < config.min_inliers or agree.mean() < config.min_inlier_share:
-            return empty
-        return pixels1[agree], pixels2[agree]
 
 
 def _judge(

@@ -274,3 +274,19 @@ def _sized(name: str, posed: PosedCamera, size: tuple[int, int], where: Path) ->
 def _rig(filmed: Mapping[str, LensCamera], calibration: Calibration, path: Path) -> CameraRig:
     held_out = [name for name in calibration.held_out if name in filmed]
     return calibrated_rig({name: own.camera for name, own in filmed.items()}, held_out, where=path)
+
+
+def filmed_by(calibration: Calibration, sizes: Sizes, *, root: Path) -> dict[str, LensCamera]:
+    """The cameras of a calibration with their lenses, at the size of their pictures.
+
+    Args:
+        calibration: of at least these cameras.
+        sizes: name of a camera to the width and height of its pictures, pixels.
+        root: where the pictures lie, for messages.
+
+    Raises:
+        CalibrationError: it is of other cameras, of one that moves, or for pictures of other proportions.
+    """
+    poses = _poses(calibration, sizes)
+    _check(poses, sizes, calibration=calibration, root=root)
+    return _filmed(poses, sizes, calibration)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The index of a video file: when each frame is shown, and how the picture lies.
 
-Only this module and ``video_pictures`` open videos.
+Videos are opened by :func:`open_video` alone.
 """
 
 import os

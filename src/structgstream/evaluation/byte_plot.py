@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.evaluation.byte_count import REST, Parts, Row
-from structgstream.evaluation.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
+from structgstream.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

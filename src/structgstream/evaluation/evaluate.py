@@ -128,10 +128,11 @@ def evaluate(
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames if name in frame.cameras) for name in seen}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
     facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames if frame.mean])
-    facts |= comparison_facts(frames, names, comparison.left_out)
+    left_out = comparison_facts(frames, names, comparison.left_out)
+    facts |= left_out
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
     facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
-    facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, facts["masked_share"])}
+    facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, left_out["masked_share"])}
     facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
     peaks.end(EVALUATION)
     machine = environment() | {"backend": backend.name} | _evaluation_memory(peaks)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from structgstream.evaluation.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.evaluation.report import FrameScores, Report
+from structgstream.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ import pytest
 
 from drawn import coloured, pixels_of
 from outcomes import outcome
-from structgstream.evaluation.figure import COLORS
+from structgstream.figure import COLORS
 from structgstream_studies.experiments.figures import most_varied_crop, write_comparison, write_curves, write_details
 from structgstream_studies.experiments.results import Result
 

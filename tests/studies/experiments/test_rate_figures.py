@@ -7,7 +7,7 @@ import numpy as np
 
 from drawn import coloured, pixels_of
 from outcomes import outcome
-from structgstream.evaluation.figure import COLORS, INK
+from structgstream.figure import COLORS, INK
 from structgstream_studies.experiments.rate_figures import write_rates
 from structgstream_studies.experiments.results import Result
 

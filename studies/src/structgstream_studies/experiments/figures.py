@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.evaluation.figure import COLORS, INK, figure_of, save_figure, without_frame
+from structgstream.figure import COLORS, INK, figure_of, save_figure, without_frame
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES
 from structgstream_studies.experiments.summary import Summary, summaries

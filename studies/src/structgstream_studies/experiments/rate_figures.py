@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from structgstream.evaluation.figure import COLORS, INK, figure_of, save_figure, without_frame
+from structgstream.figure import COLORS, INK, figure_of, save_figure, without_frame
 from structgstream_studies.experiments.rate_distortion import JUDGED, OTHERS, QUALITIES, quality_key
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES

@@ -8,7 +8,7 @@ import pytest
 
 from drawn import pixels_of
 from structgstream.errors import MissingExtraError, StorageError
-from structgstream.evaluation.figure import COLORS, figure_of, save_figure, without_frame
+from structgstream.figure import COLORS, figure_of, save_figure, without_frame
 
 
 def test_a_figure_has_its_size_and_makes_its_folder(tmp_path: Path) -> None:

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream prepare``."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.step_display import step_display
+
+if TYPE_CHECKING:
+    from structgstream.preparation.checking.findings import Finding
+    from structgstream.preparation.options import PrepareOptions
+
+HIDDEN = tyro.conf.arg(help_behavior_hint="")
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Turns videos of still cameras into a calibrated capture, and checks it.
+
+    VIDEOS holds CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg. The cameras are put in step and
+    calibrated (structure from motion, a board, or a calibration file beside the videos), and CAPTURE gets links to what
+    was filmed, the calibration, initial points and a report: CAPTURE/report/index.html. Nothing is re-encoded; lenses
+    are undistorted when frames are read. After Ctrl-C, or with other options, the same command does what is missing.
+
+    With --check, checks a capture of any layout, writes its report, and exits with status 1 and one sentence when
+    something is wrong. See docs/captures.md.
+
+    Example: structgstream prepare videos -o capture --held-out auto
+
+    Example: structgstream prepare videos -o capture --calibration board --board-videos board-takes
+
+    Example: structgstream prepare --check capture
+    """
+
+    videos: tyro.conf.Positional[Folder]
+    """The folder of the cameras' videos or pictures; with --check, the capture."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CAPTURE", help_behavior_hint="")] = None
+    """The folder to make."""
+    check: bool = False
+    """Only check a capture."""
+    calibration: Annotated[str, tyro.conf.arg(metavar="auto|sfm|board|PATH", help_behavior_hint="")] = "auto"
+    """Structure from motion, a board, or the calibration of another tool (file or folder). Default: such a file beside
+    the videos, else sfm."""
+    lens: Annotated[Literal["pinhole", "radial", "opencv", "fisheye"] | None, tyro.conf.arg(help_behavior_hint="")] = (
+        None
+    )
+    """Distortion to estimate. Default: radial by sfm, opencv by board."""
+    intrinsics: Literal["own", "shared"] = "own"
+    """Whether cameras share focal length and lens (sfm)."""
+    refine: bool = False
+    """Adjust the calibration to the pictures; kept only if matches that were set aside fit better."""
+    board: Annotated[str | None, tyro.conf.arg(metavar="BOARD", help_behavior_hint="")] = None
+    """The board, as structgstream board named it: COLUMNSxROWS:SQUARE, such as 7x5:50mm. Default: that."""
+    board_videos: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """Videos in which the board is shown to the cameras. Default: VIDEOS themselves."""
+    distance: Annotated[tuple[str, str, str] | None, tyro.conf.arg(metavar="A B LENGTH", help_behavior_hint="")] = None
+    """Measured distance between the lenses of two cameras, such as 3.2m: the capture then is in metres."""
+    synchronize: Annotated[
+        Literal["auto", "csv", "stamps", "audio", "motion", "none"], tyro.conf.arg(help_behavior_hint="")
+    ] = "auto"
+    """How clocks are found: by timestamps.csv beside the videos, the files' own times, sound, motion, or not at all
+    (one signal starts all cameras). Default: csv if it is there, else sound, else motion."""
+    field_of_view: Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")] = None
+    """Across the undistorted pictures. Default: the largest without black borders, up to 110."""
+    size: Annotated[str | None, tyro.conf.arg(metavar="WxH", help_behavior_hint="")] = None
+    """Size of the undistorted pictures. Default: that of the videos."""
+    held_out: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="auto|none|CAMERA [CAMERA ...]", help_behavior_hint="")
+    ] = ("none",)
+    """Cameras to keep from training, for scores; auto takes the one best surrounded by others. Default: none."""
+    near: Annotated[float | None, HIDDEN] = None
+    """Distance of the near plane, in units of the capture. Default: half of the depth of the nearest points."""
+    fps: Annotated[float | None, HIDDEN] = None
+    """Frames a second of folders of pictures. Default: 30."""
+    without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = ()
+    """Cameras to leave out."""
+    tone: bool = False
+    """Estimate a tone curve for each camera, where makes or picture profiles differ."""
+    link: Literal["hard", "symlink", "copy"] = "hard"
+    """How videos get into the capture; hard links need no room, and become copies on another file system."""
+    report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """With --check: folder of the report. Default: VIDEOS/report."""
+
+
+def main(arguments: list[str]) -> None:
+    """Prepares or checks, with a display of the steps."""
+    options = parse_options(Prepare, "prepare", arguments=arguments)
+    if options.check == (options.output is not None):
+        raise UsageError(
+            "--check looks at a capture that is there, so it takes no --output."
+            if options.check
+            else "prepare needs the folder to make: -o CAPTURE (or --check to look at a capture)."
+        )
+    console = Console()
+    findings = _check(options, console) if options.check else _prepare(options, console)
+    _conclude(findings, console)
+
+
+def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
+    assert options.output is not None, "checked before"
+    from structgstream.preparation.prepare import prepare_capture
+
+    with usage_errors():
+        chosen = _chosen(options)
+    try:
+        with step_display(console) as display:
+            made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
+    except KeyboardInterrupt:
+        raise Interrupted("Steps that are done are kept; continue with the same command.") from None
+    console.print(f"Capture: {made.path}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"Report: {made.report}", highlight=False, markup=False, soft_wrap=True)
+    return made.findings
+
+
+def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
+    from structgstream.preparation.checking.folder import check_folder
+
+    folder = options.videos / "report" if options.report is None else options.report
+    with step_display(console) as display:
+        checked = check_folder(options.videos, report=folder, listener=display)
+    console.print(f"Report: {folder / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
+    return checked.report.findings
+
+
+def _chosen(options: Prepare) -> "PrepareOptions":
+    from structgstream.preparation.calibration.board import Board
+    from structgstream.preparation.options import METHODS, PrepareOptions, parse_board, parse_distance, parse_size
+
+    return PrepareOptions(
+        calibration=options.calibration if options.calibration in METHODS else Path(options.calibration),
+        lens=options.lens,
+        intrinsics=options.intrinsics,
+        refine=options.refine,
+        board=Board() if options.board is None else parse_board(options.board),
+        board_videos=options.board_videos,
+        distance=None if options.distance is None else parse_distance(*options.distance),
+        synchronize=options.synchronize,
+        field_of_view=options.field_of_view,
+        size=None if options.size is None else parse_size(options.size),
+        held_out=() if options.held_out == ("none",) else options.held_out,
+        near=options.near,
+        fps=options.fps,
+        without=options.without,
+        link=options.link,
+        tone=options.tone,
+    )
+
+
+def _conclude(findings: "Sequence[Finding]", console: Console) -> None:
+    """Prints what is wrong; the worst is an error.
+
+    Raises:
+        CaptureError: a stream made from this capture would be spoiled.
+    """
+    from structgstream.errors import CaptureError
+
+    errors = [finding for finding in findings if finding.severity == "error"]
+    for finding in findings:
+        if finding is not (errors[0] if errors else None):
+            console.print(f"{finding.severity}: {finding.sentence}", highlight=False, markup=False, soft_wrap=True)
+    if errors:
+        raise CaptureError(errors[0].sentence)
+    console.print("The check found nothing that would spoil a stream.", highlight=False, markup=False, soft_wrap=True)

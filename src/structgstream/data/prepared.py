@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prepared captures: ``capture.json`` beside the videos or pictures as they were filmed (docs/captures.md).
+
+Nothing is stored undistorted or in step: lenses and clocks are applied as frames are read, so that a capture can be
+calibrated again without touching what was filmed.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.calibration import calibrated_camera, calibrated_rig
+from structgstream.data.calibration_files.reading import BROKEN, readable
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.data.picture_size import picture_size
+from structgstream.data.source import FrameSource
+from structgstream.data.timeline import Clock, natural
+from structgstream.data.tone import ToneCurve, toned
+from structgstream.data.undistortion import UndistortedSource
+from structgstream.data.video import synchronised
+from structgstream.data.video_index import scan_videos
+from structgstream.errors import CalibrationError, CaptureError, StorageError
+
+FILE = "capture.json"
+FORMAT, VERSION = "structgstream-capture", 1
+EXPECTED = "a capture that structgstream prepare wrote (docs/captures.md)"
+LENSES: Mapping[str, type[Lens]] = {"pinhole": Pinhole, "opencv": RadialTangential, "fisheye": Fisheye}
+
+Unit = Literal["metres", "arbitrary"]
+
+
+@dataclass(frozen=True)
+class PreparedCamera:
+    """A camera of a prepared capture.
+
+    Args:
+        files: its video, or the folder of its pictures, relative to the capture.
+        filmed: pose, intrinsics, size and lens of the pictures as they are stored.
+        pinhole: what they are undistorted to; its pose is that of ``filmed``.
+        clock: from the stamps of the file to the time that all cameras share.
+        tone: undoes what makes its colours another camera's; None for nothing.
+    """
+
+    files: str
+    filmed: LensCamera
+    pinhole: Camera
+    clock: Clock = Clock()
+    tone: ToneCurve | None = None
+
+
+@dataclass(frozen=True)
+class PreparedCapture:
+    """The content of ``capture.json``.
+
+    Args:
+        cameras: by name.
+        fps: frames a second of the common timeline.
+        near: near plane, in the capture's units.
+        unit: of poses and points; ``arbitrary`` where no length was given.
+        held_out: names of the cameras that are kept from training.
+        points: file of points ``[P, 3]`` (``.npy``) relative to the capture, or None.
+    """
+
+    cameras: Mapping[str, PreparedCamera]
+    fps: float
+    near: float
+    unit: Unit = "arbitrary"
+    held_out: frozenset[str] = field(default_factory=frozenset)
+    points: str | None = None
+
+
+def recognizes_prepared(path: Path) -> bool:
+    """Whether the folder is a prepared capture."""
+    return (path / FILE).is_file()
+
+
+def write_prepared(path: Path, capture: PreparedCapture) -> None:
+    """Writes ``capture.json`` into the folder ``path``, whole or not at all.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    content = prepared_entries(capture)
+    part = path / f"{FILE}.part"
+    try:
+        part.write_text(json.dumps(content, indent=1) + "\n")
+        os.replace(part, path / FILE)
+    except OSError as error:
+        raise StorageError(f"{path / FILE} cannot be written ({error.strerror}).") from None
+
+
+def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
+    """What ``capture.json`` holds."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "fps": capture.fps,
+        "unit": capture.unit,
+        "near": capture.near,
+        "held_out": sorted(capture.held_out, key=natural),
+        "points": capture.points,
+        "cameras": {name: _camera_entry(camera) for name, camera in capture.cameras.items()},
+    }
+
+
+def read_prepared(path: Path) -> PreparedCapture:
+    """The content of ``capture.json`` in the folder ``path``.
+
+    Raises:
+        CalibrationError: the file is broken, or of a later version, naming the camera where it is one's.
+    """
+    file = path / FILE
+    with readable(file, EXPECTED):
+        content: dict[str, Any] = json.loads(file.read_text())
+        if content["format"] != FORMAT or content["version"] != VERSION:
+            raise CalibrationError(
+                f"{file} has format {content['format']!r}, version {content['version']}; this program reads "
+                f"{FORMAT!r}, version {VERSION}: prepare the capture again, or update structgstream."
+            )
+        entries = dict(content["cameras"])
+        if content["unit"] not in ("metres", "arbitrary"):
+            raise ValueError(f"unit {content['unit']!r}")
+        return PreparedCapture(
+            cameras={name: _read_camera(name, entry, file) for name, entry in entries.items()},
+            fps=float(content["fps"]),
+            near=float(content["near"]),
+            unit=cast(Unit, content["unit"]),
+            held_out=frozenset(content["held_out"]),
+            points=content["points"],
+        )
+
+
+def open_prepared(path: Path) -> FrameSource:
+    """The capture at ``path``: in step by its clocks, undistorted to its pinholes.
+
+    Raises:
+        CaptureError: a file is missing, cannot be read or has changed.
+        CalibrationError: ``capture.json`` is broken, or of pictures of another size.
+    """
+    capture = read_prepared(path)
+    filmed = {name: camera.filmed for name, camera in capture.cameras.items()}
+    rig = _rig({name: own.camera for name, own in filmed.items()}, capture, path)
+    files = {name: path / camera.files for name, camera in capture.cameras.items()}
+    if missing := [f"{file} of camera {name!r}" for name, file in files.items() if not file.exists()]:
+        raise CaptureError(f"{missing[0]} is missing; restore it, or prepare the capture again.")
+    points = _read_points(path, capture)
+    source: FrameSource
+    if all(file.is_dir() for file in files.values()):
+        source = _of_folders(path, files, rig, capture, points)
+    else:
+        clocks = {name: camera.clock for name, camera in capture.cameras.items()}
+        source = synchronised(scan_videos(files), rig, where=path, fps=capture.fps, points=points, clocks=clocks)
+    curves = {name: camera.tone for name, camera in capture.cameras.items() if camera.tone is not None}
+    source = toned(source, curves)
+    pinholes = _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, path)
+    undistorted = UndistortedSource(source, pinholes, filmed)
+    return source if all(undistorted.is_unchanged(name) for name in rig) else undistorted
+
+
+def lens_model(lens: Lens) -> str:
+    """The name of a lens model in files."""
+    return next(model for model, kind in LENSES.items() if isinstance(lens, kind))
+
+
+def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
+    """A camera from plain numbers.
+
+    Raises:
+        CalibrationError: invalid values.
+        ValueError: values of other shapes.
+    """
+    width, height = (int(side) for side in size)
+    pose = torch.from_numpy(np.array(viewmat, np.float64).reshape(4, 4))
+    return Camera(pose, torch.from_numpy(np.array(K, np.float64).reshape(3, 3)), width, height)
+
+
+def pictures_of(folder: Path) -> tuple[Path, ...]:
+    """The pictures of a camera's folder, in the order of their names."""
+    files = (file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
+    return tuple(sorted(files, key=lambda file: natural(file.stem)))
+
+
+def _of_folders(
+    path: Path, files: Mapping[str, Path], rig: CameraRig, capture: PreparedCapture, points: NDArray[np.float64] | None
+) -> ImageSource:
+    """Folders of pictures at the capture's rate; clocks shift them by whole frames."""
+    found = {name: pictures_of(folder) for name, folder in files.items()}
+    if empty := [name for name, pictures in found.items() if not pictures]:
+        raise CaptureError(f"The folder {files[empty[0]]} of camera {empty[0]!r} has no pictures; restore them.")
+    shifts = {name: round(capture.cameras[name].clock.offset_seconds * capture.fps) for name in rig}
+    first = max(shifts.values())
+    last = min(shifts[name] + len(pictures) for name, pictures in found.items())
+    if first >= last:
+        raise CaptureError(
+            f"The pictures of {path} have no instant in common by their clocks; prepare the capture again."
+        )
+    cut = {name: pictures[first - shifts[name] : last - shifts[name]] for name, pictures in found.items()}
+    for name, pictures in cut.items():
+        size, own = picture_size(pictures[0]), (rig[name].width, rig[name].height)
+        if size != own:
+            raise CalibrationError(
+                f"The pictures of camera {name!r} in {files[name]} have {size[0]}x{size[1]} pixels, {path / FILE} is "
+                f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
+            )
+    return ImageSource(path.name, rig, capture.fps, cut, points)
+
+
+def _rig(cameras: Mapping[str, Camera], capture: PreparedCapture, path: Path) -> CameraRig:
+    return calibrated_rig(cameras, capture.held_out, where=path / FILE, near=capture.near)
+
+
+def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | None:
+    if capture.points is None:
+        return None
+    file = path / capture.points
+    with readable(file, "points as an array of shape [P, 3]"):
+        points = np.asarray(np.load(file, allow_pickle=False), np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"an array of shape {points.shape}")
+    return points
+
+
+def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
+    filmed, pinhole, lens = camera.filmed.camera, camera.pinhole, camera.filmed.lens
+    return {
+        "files": camera.files,
+        "size": [filmed.width, filmed.height],
+        "K": filmed.K.tolist(),
+        "lens": {"model": lens_model(lens), **asdict(lens)},
+        "viewmat": filmed.viewmat.tolist(),
+        "clock": asdict(camera.clock),
+        "tone": None if camera.tone is None else camera.tone.controls,
+        "pinhole": {"size": [pinhole.width, pinhole.height], "K": pinhole.K.tolist()},
+    }
+
+
+def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera:
+    try:
+        width, height = (int(side) for side in entry["size"])
+        filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
+        parameters = {key: float(value) for key, value in entry["lens"].items() if key != "model"}
+        lens = LENSES[entry["lens"]["model"]](**parameters)
+        # Its principal point may lie anywhere.
+        pinhole = camera_of(entry["viewmat"], entry["pinhole"]["K"], entry["pinhole"]["size"])
+        clock = Clock(**{key: float(value) for key, value in entry["clock"].items()})
+        tone = None if entry["tone"] is None else ToneCurve(entry["tone"])
+        return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock, tone)
+    except CalibrationError:
+        raise
+    except BROKEN as error:
+        raise CalibrationError(
+            f"Camera {name!r} of {file} cannot be read ({type(error).__name__}: {error}); expected {EXPECTED}."
+        ) from None

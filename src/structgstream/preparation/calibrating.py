@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The step that finds the cameras: structure from motion, a board, or the calibration of another tool."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.data.calibration import listed
+from structgstream.data.lenses import LensCamera
+from structgstream.data.posed import Calibration
+from structgstream.data.posed_capture import filmed_by
+from structgstream.data.prepared import LENSES, camera_of, lens_model
+from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.coordinates import with_distance
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.footage import Footage
+from structgstream.preparation.given import demand_calibration, find_calibration
+from structgstream.preparation.options import METHODS, PrepareOptions
+from structgstream.preparation.steps import Stored
+
+LEAST_CAMERAS = 3
+
+
+def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibration:
+    """``sfm``, ``board``, or the calibration to use.
+
+    Raises:
+        CalibrationError: the calibration that was asked for is missing or broken.
+    """
+    if str(options.calibration) not in METHODS:
+        return demand_calibration(Path(options.calibration))
+    if options.calibration != "auto":
+        return str(options.calibration)
+    if options.board_videos is not None:
+        return "board"
+    return find_calibration(footage.where) or "sfm"
+
+
+def check_enough(footage: Footage) -> None:
+    """
+    Raises:
+        CalibrationError: too few cameras for poses that can be checked.
+    """
+    if len(footage.cameras) < LEAST_CAMERAS:
+        raise CalibrationError(
+            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {LEAST_CAMERAS} or more, as two "
+            "cameras cannot confirm each other's calibration: film with more."
+        )
+
+
+def from_other_tool(calibration: Calibration, footage: Footage) -> SolvedCalibration:
+    """The cameras of a calibration that is there, for these pictures.
+
+    Raises:
+        CalibrationError: it is of other cameras, or of pictures of another size.
+    """
+    sizes = {name: footage.size(name) for name in footage.cameras}
+    filmed = filmed_by(calibration, sizes, root=footage.where)
+    points = np.empty((0, 3)) if calibration.points is None else calibration.points
+    none = np.empty(0, np.intp)
+    return SolvedCalibration(filmed, points, Observations(none, none, np.empty((0, 2)), none))
+
+
+def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibration:
+    """The calibration itself.
+
+    Raises:
+        CalibrationError: cameras could not be placed.
+    """
+    missing = [name for name in footage.cameras if name not in solved.cameras]
+    if missing:
+        raise CalibrationError(
+            f"{listed(missing)} of {footage.where} could not be placed among the other {len(solved.cameras)}: their "
+            "pictures have too little in common; move them closer to the others or show a board to all (structgstream "
+            f"board), or go on without: --without {' '.join(missing)}."
+        )
+    return solved
+
+
+def packed(solved: SolvedCalibration) -> Stored:
+    """The calibration as plain values."""
+    cameras: dict[str, Any] = {}
+    for name, filmed in solved.cameras.items():
+        camera = filmed.camera
+        cameras[name] = {
+            "size": [camera.width, camera.height],
+            "K": camera.K.tolist(),
+            "viewmat": camera.viewmat.tolist(),
+            "lens": {"model": lens_model(filmed.lens), **asdict(filmed.lens)},
+        }
+    seen = solved.observations
+    arrays = {
+        "points": solved.points, "point": seen.point, "camera": seen.camera, "pixels": seen.pixels,
+        "instant": seen.instant,
+    }  # fmt: skip
+    return Stored({"cameras": cameras, "missing": list(solved.missing), "metres": solved.metres}, arrays)
+
+
+def unpacked(stored: Stored) -> SolvedCalibration:
+    """The reverse of :func:`packed`."""
+    cameras = {}
+    for name, entry in stored.values["cameras"].items():
+        lens = dict(entry["lens"])
+        kind = LENSES[lens.pop("model")]
+        cameras[name] = LensCamera(camera_of(entry["viewmat"], entry["K"], entry["size"]), kind(**lens))
+    arrays = stored.arrays
+    seen = Observations(arrays["point"], arrays["camera"], arrays["pixels"], arrays["instant"])
+    missing = tuple(stored.values["missing"])
+    return SolvedCalibration(cameras, arrays["points"], seen, missing, bool(stored.values["metres"]))
+
+
+def summary(solved: SolvedCalibration) -> str:
+    """A calibration in one line."""
+    lenses = sorted({lens_model(filmed.lens) for filmed in solved.cameras.values()})
+    told = f"{len(solved.cameras)} cameras, lenses {', '.join(lenses)}"
+    if len(solved.observations):
+        errors = solved.errors()
+        errors = errors[np.isfinite(errors)]
+        told += f", {len(solved.points)} points, median reprojection error {np.median(errors):.2f} px"
+    return told
+
+
+def scaled(solved: SolvedCalibration, options: PrepareOptions) -> SolvedCalibration:
+    """The calibration in metres when a distance was measured.
+
+    Raises:
+        CalibrationError: the distance is of cameras that are not there, or that stand in one place.
+    """
+    distance = options.distance
+    if distance is None:
+        return solved
+    return with_distance(solved, distance.first, distance.second, metres=distance.metres)

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps that find the cameras: what they filmed, their clocks, poses and lenses, the unit of length."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+
+from structgstream.data.calibration import listed
+from structgstream.data.posed import Calibration
+from structgstream.data.timeline import Clock
+from structgstream.data.tone import ToneCurve
+from structgstream.errors import ConfigError
+from structgstream.preparation.calibrating import (
+    check_complete,
+    check_enough,
+    from_other_tool,
+    packed,
+    scaled,
+    summary,
+    unpacked,
+)
+from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.claiming import claim
+from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.job import Job
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.solvers import (
+    TIMESTAMPS,
+    Clocks,
+    moments_of,
+    refined,
+    solved_by,
+    synchronized,
+    tone_curves,
+)
+from structgstream.preparation.steps import Stored, fingerprint
+
+
+class CameraSteps:
+    """The steps of one preparation up to a calibration in a unit.
+
+    Args:
+        job: what is prepared, and how.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.videos, self.capture, self.options = job.videos, job.capture, job.options
+        self.steps, self.listener = job.steps, job.listener
+
+    def find(self) -> Footage:
+        self.listener.begin("find", skipped=False)
+        footage = find_footage(self.videos, picture_fps=self.options.fps)
+        if unknown := [name for name in self.options.without if name not in footage.cameras]:
+            raise ConfigError(
+                f"{self.videos} has no {listed(unknown)} to leave out; its cameras are {', '.join(footage.cameras)}."
+            )
+        footage = footage.only([name for name in footage.cameras if name not in self.options.without])
+        check_enough(footage)
+        claim(self.capture, self.videos)
+        self.listener.end("find", _described(footage))
+        return footage
+
+    def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
+        cameras = None if isinstance(method, str) else from_other_tool(method, footage).cameras
+        inputs = {
+            "files": fingerprint(footage.files),
+            "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
+            "fps": footage.fps,
+            "how": self.options.synchronize,
+            "calibration": None if isinstance(method, str) else fingerprint({"calibration": method.where}),
+        }
+        return self._clocks("synchronize", inputs, lambda: synchronized(footage, self.options, cameras=cameras))
+
+    def synchronize_again(
+        self, footage: Footage, clocks: Clocks, method: str | Calibration, solved: SolvedCalibration
+    ) -> Clocks:
+        """By motion again when the calibration is known, which makes it exact."""
+        if clocks.method != "motion" or not isinstance(method, str):
+            return clocks
+        return self._clocks(
+            "clocks",
+            {},
+            lambda: synchronized(footage, self.options, cameras=solved.cameras, method="motion"),
+            after=("scale",),
+        )
+
+    def _clocks(
+        self, step: str, inputs: Mapping[str, object], find: Callable[[], Clocks], after: tuple[str, ...] = ()
+    ) -> Clocks:
+        return self.steps.run(
+            step, inputs, find, pack=_packed_clocks, unpack=_unpacked_clocks, summary=lambda found: found.told,
+            after=after,
+        )  # fmt: skip
+
+    def calibrate(self, footage: Footage, clocks: Mapping[str, Clock], method: str | Calibration) -> SolvedCalibration:
+        options = self.options
+        name = method if isinstance(method, str) else method.where.name
+        inputs = {
+            "method": method if isinstance(method, str) else fingerprint({"calibration": method.where}),
+            "board": asdict(options.board),
+            "lens": options.lens,
+            "intrinsics": options.intrinsics,
+            "board_videos": None if options.board_videos is None else fingerprint({"board": options.board_videos}),
+            "instants": options.instants,
+        }
+        solved = self._solved(
+            "calibrate",
+            inputs,
+            lambda: (_first(method, footage, clocks, options), ""),
+            said=lambda found, told: f"{name}: {summary(found)}",
+            after="synchronize",
+        )
+        last = "calibrate"
+        if options.refine:
+            solved = self._solved(
+                last := "refine",
+                {},
+                lambda: refined(solved, footage, clocks, options),
+                said=lambda found, told: told,
+                after="calibrate",
+            )
+        return self._solved(
+            "scale",
+            {"distance": None if options.distance is None else asdict(options.distance)},
+            lambda: (scaled(solved, options), ""),
+            said=lambda found, told: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
+            after=last,
+        )
+
+    def _solved(
+        self,
+        step: str,
+        inputs: Mapping[str, object],
+        solve: Callable[[], tuple[SolvedCalibration, str]],
+        *,
+        said: Callable[[SolvedCalibration, str], str],
+        after: str,
+    ) -> SolvedCalibration:
+        def pack(found: tuple[SolvedCalibration, str]) -> Stored:
+            stored = packed(found[0])
+            return Stored({**stored.values, "told": found[1]}, stored.arrays)
+
+        found = self.steps.run(
+            step,
+            inputs,
+            solve,
+            pack=pack,
+            unpack=lambda stored: (unpacked(stored), str(stored.values["told"])),
+            summary=lambda found: said(*found),
+            after=(after,),
+        )
+        return found[0]
+
+    def tones(
+        self, footage: Footage, clocks: Mapping[str, Clock], solved: SolvedCalibration, held_out: frozenset[str]
+    ) -> dict[str, ToneCurve]:
+        curves, _ = self.steps.run(
+            "tone",
+            {"held_out": sorted(held_out)},
+            lambda: tone_curves(solved, moments_of(footage, clocks, self.options), held_out=sorted(held_out)),
+            pack=lambda found: Stored(
+                {"curves": {name: curve.controls for name, curve in found[0].items()}, "told": found[1]}
+            ),
+            unpack=lambda stored: (
+                {name: ToneCurve(curve) for name, curve in stored.values["curves"].items()},
+                str(stored.values["told"]),
+            ),
+            summary=lambda found: found[1],
+            after=("scale",),
+        )
+        return curves
+
+
+def _first(
+    method: str | Calibration, footage: Footage, clocks: Mapping[str, Clock], options: PrepareOptions
+) -> SolvedCalibration:
+    if isinstance(method, str):
+        return check_complete(solved_by(method, footage, clocks, options), footage)
+    return from_other_tool(method, footage)
+
+
+def _packed_clocks(found: Clocks) -> Stored:
+    return Stored(
+        {
+            "clocks": {name: asdict(clock) for name, clock in found.clocks.items()},
+            "method": found.method,
+            "told": found.told,
+            "late_seconds": dict(found.late_seconds),
+            "uncertainty_seconds": dict(found.uncertainty_seconds),
+        }
+    )
+
+
+def _unpacked_clocks(stored: Stored) -> Clocks:
+    values = stored.values
+    clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
+    return Clocks(clocks, values["method"], values["told"], values["late_seconds"], values["uncertainty_seconds"])
+
+
+def _described(footage: Footage) -> str:
+    sizes = sorted({footage.size(name) for name in footage.cameras})
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3])
+    lengths = [len(footage.stamps(name)) for name in footage.cameras]
+    frames = f"{min(lengths)}" if min(lengths) == max(lengths) else f"{min(lengths)} to {max(lengths)}"
+    kind = "videos" if footage.tracks else "folders of pictures"
+    return f"{len(footage.cameras)} {kind}, {shown}, {frames} frames, {footage.fps:g} a second"

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps that make the capture: its files, near plane, points, and the check."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import CameraRig
+from structgstream.data.calibration import NEAR_IN_RIG_RADII, listed
+from structgstream.data.held_out import best_surrounded
+from structgstream.data.masks import FOLDER as MASKS
+from structgstream.data.open import open_capture
+from structgstream.data.points import initial_points
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, prepared_entries, write_prepared
+from structgstream.data.source import FrameSource
+from structgstream.data.timeline import Clock
+from structgstream.data.tone import ToneCurve
+from structgstream.data.undistortion import rectilinear
+from structgstream.data.video import measured_fps
+from structgstream.errors import ConfigError, StorageError
+from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.checking.check import Examination, check_capture, examine
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.checking.scales import nearest_depth, observed_depths
+from structgstream.preparation.footage import Footage
+from structgstream.preparation.job import Job
+from structgstream.preparation.linking import bring
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.steps import FOLDER, Stored
+from structgstream.similarity import rig_radius
+
+REPORT = "report"
+POINTS = "points.npy"
+NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
+
+
+class CaptureSteps:
+    """The steps of one preparation from a calibration on.
+
+    Args:
+        job: what is prepared, and how.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.videos, self.capture, self.options = job.videos, job.capture, job.options
+        self.steps, self.listener, self.told = job.steps, job.listener, job.told
+        self.examination: Examination | None = None  # of frame 0, which two steps look at
+
+    def bring(self, footage: Footage, content: PreparedCapture) -> None:
+        self.listener.begin("bring", skipped=False)
+        for number, (name, camera) in enumerate(content.cameras.items()):
+            self.listener.progress(number, len(content.cameras), name)
+            target = self.capture / camera.files
+            source = footage.path(name)
+            bring(source, target / source.name if not footage.tracks and source.is_file() else target,
+                  link=self.options.link)  # fmt: skip
+        if (self.videos / MASKS).is_dir():
+            for entry in sorted((self.videos / MASKS).iterdir()):
+                bring(entry, self.capture / MASKS / entry.name, link=self.options.link)
+        write_prepared(self.capture, content)
+        self.listener.end("bring", f"{len(content.cameras)} cameras by {self.options.link} link or copy")
+
+    def near(self, content: PreparedCapture) -> PreparedCapture:
+        """With the near plane from the points that pictures confirm."""
+        if self.options.near is not None:
+            return content
+
+        def measure() -> float | None:
+            self.examination = _examined(open_capture(self.capture))
+            return nearest_depth(observed_depths(self.examination.tracks, self.examination.cameras))
+
+        nearest = self.steps.run(
+            "near",
+            {"content": _described(content)},
+            measure,
+            pack=lambda found: Stored({"nearest": found}),
+            unpack=lambda stored: stored.values["nearest"],
+            summary=lambda found: "too few points: 0.12 rig radii" if found is None
+            else f"{NEAR_SHARE * found:.3g}, half of the depth of the nearest points",
+            after=("synchronize",),
+        )  # fmt: skip
+        content = content if nearest is None else replace(content, near=NEAR_SHARE * nearest)
+        write_prepared(self.capture, content)
+        return content
+
+    def points(self, content: PreparedCapture) -> PreparedCapture:
+        def estimate() -> NDArray[np.float64]:
+            source = open_capture(self.capture)
+            return initial_points(next(source.frames(0)), source.rig).positions
+
+        found = self.steps.run(
+            "points",
+            {"content": _described(content)},
+            estimate,
+            pack=lambda points: Stored({}, {"points": points}),
+            unpack=lambda stored: stored.arrays["points"],
+            summary=lambda points: f"{len(points):,} points of frame 0",
+            after=("synchronize",),
+        )  # fmt: skip
+        try:
+            np.save(self.capture / POINTS, found)
+        except OSError as error:
+            raise StorageError(f"{self.capture / POINTS} cannot be written ({error.strerror}).") from None
+        content = replace(content, points=POINTS)
+        write_prepared(self.capture, content)
+        return content
+
+    def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
+        from structgstream.preparation.report.write import write_report
+
+        def look() -> tuple[Finding, ...]:
+            source = open_capture(self.capture)
+            checked = check_capture(source, unit=content.unit, listener=self.listener, examination=self.examination)
+            checked = replace(checked, report=replace(checked.report, steps=dict(self.told)))
+            write_report(self.capture / REPORT, checked, listener=self.listener)
+            return checked.report.findings
+
+        if not (self.capture / REPORT / "index.html").is_file():
+            (self.capture / FOLDER / "check.json").unlink(missing_ok=True)
+        return self.steps.run(
+            "check",
+            {"content": _described(content)},
+            look,
+            pack=lambda findings: Stored({"findings": [asdict(finding) for finding in findings]}),
+            unpack=lambda stored: tuple(
+                Finding(found["severity"], found["sentence"], tuple(found["cameras"]))
+                for found in stored.values["findings"]
+            ),
+            summary=lambda findings: f"{len(findings)} findings; {REPORT}/index.html",
+            after=("points",),
+        )
+
+
+def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
+    """The cameras to hold out.
+
+    Raises:
+        ConfigError: one that is not there.
+    """
+    if options.held_out == ("auto",):
+        return frozenset({best_surrounded(rig)})
+    if unknown := [name for name in options.held_out if name not in rig.cameras]:
+        raise ConfigError(f"{listed(unknown)} to hold out is not there; the cameras are {', '.join(rig)}.")
+    return frozenset(options.held_out)
+
+
+def assembled(
+    footage: Footage,
+    clocks: Mapping[str, Clock],
+    solved: SolvedCalibration,
+    options: PrepareOptions,
+) -> PreparedCapture:
+    """The content of ``capture.json`` with the usual near plane, without points and tone curves.
+
+    Raises:
+        ConfigError: a camera to hold out that is not there, or a field of view or size that cannot be.
+        CalibrationError: a lens that cannot be undistorted.
+    """
+    cameras = {}
+    for name in footage.cameras:
+        filmed = solved.cameras[name]
+        pinhole = rectilinear(filmed, degrees=options.field_of_view, size=options.size)
+        where = f"videos/{name}{footage.path(name).suffix.lower()}" if footage.tracks else f"pictures/{name}"
+        cameras[name] = PreparedCamera(where, filmed, pinhole, clocks.get(name, Clock()))
+    rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
+    held_out = held_out_of(options, rig)
+    near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
+    fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
+    return PreparedCapture(cameras, fps or footage.fps, near, "metres" if solved.metres else "arbitrary", held_out)
+
+
+def with_tones(content: PreparedCapture, curves: Mapping[str, ToneCurve]) -> PreparedCapture:
+    """The content with a curve for each camera that has one."""
+    cameras = {name: replace(camera, tone=curves.get(name)) for name, camera in content.cameras.items()}
+    return replace(content, cameras=cameras)
+
+
+def _described(content: PreparedCapture) -> str:
+    """All that frames depend on, but for the files themselves."""
+    return json.dumps(prepared_entries(content))
+
+
+def _examined(source: FrameSource) -> Examination:
+    return examine(next(source.frames(0)), source.rig.cameras)

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks a capture: poses, names, units, overlap, colours and times against its pictures."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from structgstream.cameras import Camera
+from structgstream.data.source import FrameSource
+from structgstream.frames import MultiViewFrame
+from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
+from structgstream.preparation.checking.evidence import Evidence, gather, pair_errors
+from structgstream.preparation.checking.explanations import explain
+from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Finding, PairCheck
+from structgstream.preparation.checking.overlap import coverage, overlap_findings, overlaps
+from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
+from structgstream.preparation.checking.stillness import stillness_findings
+from structgstream.preparation.checking.suspects import Suspects, accused, acquitted, find_suspects
+from structgstream.preparation.checking.times import measure_times, time_findings
+from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks, build_tracks
+from structgstream.preparation.steps import Listener, Silent
+from structgstream.preparation.synchronization import SynchronizationCheck
+
+
+@dataclass(frozen=True)
+class Examination:
+    """All that was found at one instant; the pictures of a report are drawn from it."""
+
+    frame: MultiViewFrame
+    cameras: Mapping[str, Camera]
+    evidence: Evidence
+    suspects: Suspects
+    tracks: Tracks
+    colors: Mapping[str, Color]
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A check: numbers and sentences, and what they came from."""
+
+    report: CheckReport
+    examination: Examination
+
+
+def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination:
+    """Matches one instant's pictures and holds them against the poses.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    seen = {name: camera for name, camera in cameras.items() if name in frame.images}
+    evidence = gather(frame, seen)
+    suspects = find_suspects(pair_errors(evidence, seen), seen)
+    tracks = build_tracks(evidence, seen, off=() if suspects.everything else suspects.off)
+    if suspects.off and not suspects.everything and (cleared := acquitted(tracks, suspects)):
+        suspects = replace(suspects, off=tuple(name for name in suspects.off if name not in cleared))
+        tracks = build_tracks(evidence, seen, off=suspects.off)
+    while not suspects.everything and (name := accused(tracks, suspects)) is not None:
+        suspects = replace(suspects, off=(*suspects.off, name))
+        tracks = build_tracks(evidence, seen, off=suspects.off)
+    return Examination(frame, seen, evidence, suspects, tracks, compare_colors(evidence))
+
+
+def check_capture(
+    source: FrameSource,
+    *,
+    unit: str | None = None,
+    listener: Listener | None = None,
+    examination: Examination | None = None,
+) -> Checked:
+    """Checks the first and the last frame of a capture; held-out cameras are looked at, too.
+
+    Args:
+        source: the opened capture.
+        unit: of length, where it is known.
+        listener: is told of the progress.
+        examination: of the first frame, where it was made already.
+
+    Raises:
+        CaptureError: a frame cannot be read.
+        MissingExtraError: cv2 or scipy is not installed.
+    """
+    cameras = source.rig.cameras
+    listener = listener or Silent()
+    listener.progress(0, 3, "first frame")
+    first = examination or examine(next(source.frames(0)), cameras)
+    findings = explain(first.evidence, first.cameras, first.suspects, first.tracks) if first.suspects.off else []
+    findings += overlap_findings(first.evidence.overlapping(), list(first.cameras))
+    depths = observed_depths(first.tracks, first.cameras, off=first.suspects.off)
+    radius = _radius(first.cameras, first.suspects)
+    if not first.suspects.everything:
+        seen = {name: cameras[name] for name in first.cameras}  # with the near plane of now
+        findings += scale_findings(depths, source.points, seen, radius=radius, unit=unit)
+    findings += color_findings(first.colors)
+    listener.progress(1, 3, "last frame")
+    if len(source) > 1:
+        last = next(source.frames(len(source) - 1))
+        findings += stillness_findings(first.frame.images, last.images, index=len(source) - 1)
+    listener.progress(2, 3, "times")
+    times = None if first.suspects.off else measure_times(source)
+    findings += time_findings(times)
+    listener.progress(3, 3, "")
+    report = CheckReport(
+        capture=source.name,
+        frame=first.frame.index,
+        cameras=_camera_checks(first, source, times),
+        pairs=_pair_checks(first),
+        coverage=coverage(_solid_points(first.tracks), first.cameras),
+        findings=tuple(sorted(findings, key=lambda finding: finding.severity)),
+        rig_radius=radius,
+        near=float(np.median([camera.near for camera in cameras.values()])),
+        nearest=nearest_depth(depths),
+        unit=unit,
+    )
+    return Checked(report, first)
+
+
+def with_findings(checked: Checked, findings: list[Finding]) -> Checked:
+    """The check with further findings."""
+    together = sorted([*checked.report.findings, *findings], key=lambda finding: finding.severity)
+    return replace(checked, report=replace(checked.report, findings=tuple(together)))
+
+
+def _radius(cameras: Mapping[str, Camera], suspects: Suspects) -> float:
+    """Largest distance of a camera that is not off to the middle of these."""
+    off = () if suspects.everything else suspects.off
+    centers = np.stack([camera.center.numpy() for name, camera in cameras.items() if name not in off])
+    return float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+
+
+def _solid_points(tracks: Tracks) -> np.ndarray:
+    """Points that at least three cameras observed, or two where that is all there is."""
+    views = tracks.views
+    solid = tracks.points[views >= LEAST_VIEWS]
+    return solid if len(solid) else tracks.points
+
+
+def _camera_checks(
+    examined: Examination, source: FrameSource, times: SynchronizationCheck | None
+) -> dict[str, CameraCheck]:
+    tracks, views = examined.tracks, examined.tracks.views
+    counts = overlaps(examined.evidence.overlapping(), list(examined.cameras))
+    found = {}
+    for name in source.rig:
+        color = examined.colors.get(name)
+        own = np.zeros(len(tracks.point), bool) if name not in tracks.names else tracks.of(name)
+        residuals = tracks.residuals[own & (views[tracks.point] >= LEAST_VIEWS)]
+        residuals = residuals[np.isfinite(residuals)]
+        found[name] = CameraCheck(
+            reprojection_pixels=float(np.median(residuals)) if len(residuals) else None,
+            reprojection_pixels_90=float(np.percentile(residuals, 90)) if len(residuals) else None,
+            points=len(residuals),
+            overlaps=counts.get(name, 0),
+            exposure_stops=color.exposure_stops if color else None,
+            red_stops=color.red_stops if color else None,
+            blue_stops=color.blue_stops if color else None,
+            offset_ms=None if times is None or name not in times.late_seconds else 1e3 * times.late_seconds[name],
+            offset_uncertainty_ms=None
+            if times is None or name not in times.late_seconds
+            else 1e3 * times.uncertainty_seconds[name],
+        )
+    return found
+
+
+def _pair_checks(examined: Examination) -> tuple[PairCheck, ...]:
+    errors = pair_errors(examined.evidence, examined.cameras)
+    return tuple(
+        PairCheck(*pair, errors[pair].matches, errors[pair].pixels, errors[pair].share)
+        if pair in errors
+        else PairCheck(*pair, 0, None, None)
+        for pair in examined.evidence.matches
+    )

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposure and white balance of cameras relative to each other, from matched pixels."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.matching import Floats, load_cv2
+from structgstream.preparation.checking.evidence import Evidence
+from structgstream.preparation.checking.findings import Finding
+
+PATCH = 7
+DARK, BRIGHT = 12.0, 243.0
+ROUNDS = 20
+LEAST_MATCHES = 15
+EXPOSURE_STOPS, BALANCE_STOPS = 0.33, 0.2
+
+
+@dataclass(frozen=True)
+class Color:
+    """A camera's colour against the median camera, as powers of two of linear light.
+
+    Args:
+        exposure_stops: of green.
+        red_stops: of red over green.
+        blue_stops: of blue over green.
+    """
+
+    exposure_stops: float
+    red_stops: float
+    blue_stops: float
+
+
+def compare_colors(evidence: Evidence) -> dict[str, Color]:
+    """Cameras whose colours could be compared.
+
+    Least absolute deviations over all matches, as highlights and occlusions make outliers.
+    """
+    cv2 = load_cv2()
+    smooth = {name: cv2.blur(image, (PATCH, PATCH)) for name, image in evidence.images.items()}
+    names = list(evidence.keypoints)
+    first, second, ratios = [], [], []
+    for pair in evidence.overlapping():
+        one, other = (_samples(smooth[name], pixels) for name, pixels in zip(pair, evidence.pixels(pair)))
+        valid = ((one > DARK) & (one < BRIGHT) & (other > DARK) & (other < BRIGHT)).all(1)
+        if valid.sum() < LEAST_MATCHES:
+            continue
+        first.append(np.full(valid.sum(), names.index(pair[0])))
+        second.append(np.full(valid.sum(), names.index(pair[1])))
+        ratios.append(np.log2(_linear(one[valid]) / _linear(other[valid])))
+    if not ratios:
+        return {}
+    one, other, values = np.concatenate(first), np.concatenate(second), np.concatenate(ratios)
+    seen = sorted({*one.tolist(), *other.tolist()})
+    gains = np.stack([_fitted(one, other, values[:, channel], len(names)) for channel in range(3)], 1)
+    gains -= np.median(gains[seen], axis=0)
+    return {
+        names[number]: Color(
+            float(gains[number, 1]),
+            float(gains[number, 0] - gains[number, 1]),
+            float(gains[number, 2] - gains[number, 1]),
+        )
+        for number in seen
+    }
+
+
+def color_findings(colors: Mapping[str, Color]) -> list[Finding]:
+    """Warnings of cameras that were not locked alike."""
+    exposed = {name: color.exposure_stops for name, color in colors.items()}
+    balance = {name: max(color.red_stops, color.blue_stops, key=abs) for name, color in colors.items()}
+    exposed = {name: stops for name, stops in exposed.items() if abs(stops) > EXPOSURE_STOPS}
+    balance = {name: stops for name, stops in balance.items() if abs(stops) > BALANCE_STOPS}
+    findings = []
+    if exposed:
+        told = (
+            f"Exposure differs from the other cameras', in stops: {_told(exposed)}; lock exposure and gain to the same "
+            "values on all cameras (reconstruction equalises what is left)."
+        )
+        findings.append(Finding("warning", told, tuple(exposed)))
+    if balance:
+        told = (
+            f"White balance differs from the other cameras', in stops of red or blue against green: {_told(balance)}; "
+            "lock it to the same value on all cameras."
+        )
+        findings.append(Finding("warning", told, tuple(balance)))
+    return findings
+
+
+def _told(stops: Mapping[str, float], most: int = 6) -> str:
+    """The largest differences, in words."""
+    worst = sorted(stops, key=lambda name: -abs(stops[name]))
+    rest = f" and {len(worst) - most} more" if len(worst) > most else ""
+    return ", ".join(f"{name!r} {stops[name]:+.2f}" for name in worst[:most]) + rest
+
+
+def _samples(picture: NDArray[np.uint8], pixels: Floats) -> Floats:
+    height, width = picture.shape[:2]
+    column, row = np.floor(pixels).astype(int).T
+    return picture[row.clip(0, height - 1), column.clip(0, width - 1)].astype(np.float64)
+
+
+def _linear(values: Floats) -> Floats:
+    """Linear light of sRGB values in [0, 255] (IEC 61966-2-1)."""
+    share = values / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float64)
+
+
+def _fitted(one: NDArray[np.intp], other: NDArray[np.intp], values: Floats, count: int) -> Floats:
+    """Gains ``[count]`` whose differences explain ``values``, by iteratively reweighted least squares."""
+    weights = np.ones(len(values))
+    gains: Floats = np.zeros(count)
+    for _ in range(ROUNDS):
+        system, right = 1e-6 * np.eye(count), np.zeros(count)
+        for rows, columns, sign in ((one, one, 1), (other, other, 1), (one, other, -1), (other, one, -1)):
+            np.add.at(system, (rows, columns), sign * weights)
+        np.add.at(right, one, weights * values)
+        np.add.at(right, other, -weights * values)
+        gains = np.asarray(np.linalg.solve(system, right), np.float64)
+        weights = 1 / np.maximum(np.abs(values - gains[one] + gains[other]), 0.02)
+    return gains

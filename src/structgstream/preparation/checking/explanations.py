@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What would explain that cameras are off: exchanged names, a pose of another convention, other units, another size."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from structgstream.cameras import Camera
+from structgstream.data.pair_matches import Pair
+from structgstream.data.pose_check import MISTAKES, reinterpreted
+from structgstream.preparation.checking.evidence import Evidence, pair_error
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.checking.suspects import Suspects
+from structgstream.preparation.checking.tracks import Tracks, moved_by
+
+EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
+LENGTHS = {
+    1000.0: "millimetres among metres",
+    100.0: "centimetres among metres",
+    0.001: "metres among millimetres",
+    0.01: "metres among centimetres",
+}
+SIZES = (0.5, 2.0, 0.25, 4.0, 2 / 3, 1.5, 0.75, 4 / 3)
+HOW = {
+    0: "inverted (camera to world in place of world to camera)",
+    1: "in OpenGL axes in place of OpenCV's (y and z flipped)",
+    2: "inverted and in OpenGL axes (camera to world in place of world to camera)",
+}
+
+Change = Callable[[Camera], Camera]
+
+
+def explain(evidence: Evidence, cameras: Mapping[str, Camera], suspects: Suspects, tracks: Tracks) -> list[Finding]:
+    """One finding for each mistake that explains cameras that are off."""
+    if suspects.everything:
+        return [_explain_all(evidence, cameras)]
+    findings, left = _exchanged(evidence, cameras, list(suspects.off))
+    good = [name for name in cameras if name not in suspects.off]
+    for name in left:
+        told = _single(evidence, cameras, name, good) or _moved(evidence, cameras, name, suspects, tracks)
+        findings.append(Finding("error", told, (name,)))
+    return findings
+
+
+def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
+    """Most pairs disagree: a convention that all poses share, else nothing single."""
+    pairs = evidence.overlapping()
+    before = _shares(evidence, cameras, pairs)
+    readings = [_shares(evidence, reinterpreted(cameras, change), pairs) for change in MISTAKES.values()]
+    best = int(np.argmin(readings))
+    names = tuple(cameras)
+    if readings[best] < min(0.5, before / 2):
+        return Finding(
+            "error",
+            f"The poses of all cameras look {HOW[best]}: {before:.0%} of the matches between pictures violate them as "
+            f"they are, {readings[best]:.0%} once that is undone; write world-to-camera matrices with OpenCV axes.",
+            names,
+        )
+    return Finding(
+        "error",
+        f"Poses and pictures do not belong together: {before:.0%} of the matches between pictures violate the poses "
+        "of most cameras; check that names, pictures and calibration are of one take and of one picture size, that "
+        "the cameras are in step, or calibrate again with structgstream prepare.",
+        names,
+    )
+
+
+def _exchanged(
+    evidence: Evidence, cameras: Mapping[str, Camera], off: Sequence[str]
+) -> tuple[list[Finding], list[str]]:
+    """Cameras among ``off`` that agree with the others under each other's calibration, and those that are left."""
+    same = [name for name in off if (cameras[name].width, cameras[name].height) == _size(cameras, off)]
+    if len(same) < 2:
+        return [], list(off)
+    from scipy.optimize import linear_sum_assignment
+
+    good = [name for name in cameras if name not in off]
+    costs = np.array([[_share_with(evidence, cameras, name, good, cameras[other]) for other in same] for name in same])
+    rows, columns = linear_sum_assignment(np.nan_to_num(costs, nan=1.0))
+    moved = [
+        (same[row], same[column])
+        for row, column in zip(rows, columns, strict=True)
+        if row != column and costs[row, column] < EXPLAINED and costs[row, row] > UNEXPLAINED
+    ]
+    names = [name for name, _ in moved]
+    if not moved or set(names) != {other for _, other in moved}:
+        return [], list(off)
+    if len(moved) == 2:
+        told = f"The names of cameras {names[0]!r} and {names[1]!r} are exchanged"
+    else:
+        told = "Names of cameras are exchanged: " + ", ".join(
+            f"the pictures of {name!r} belong to the calibration of {other!r}" for name, other in moved
+        )
+    worst = max(costs[same.index(name), same.index(other)] for name, other in moved)
+    told += f": put right, {1 - worst:.0%} of their matches or more fit; rename files or the calibration's cameras."
+    return [Finding("error", told, tuple(names))], [name for name in off if name not in names]
+
+
+def _size(cameras: Mapping[str, Camera], off: Sequence[str]) -> tuple[int, int]:
+    """The size that most of these cameras have."""
+    sizes = [(cameras[name].width, cameras[name].height) for name in off]
+    return max(sizes, key=sizes.count)
+
+
+def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: Sequence[str]) -> str | None:
+    """A mistake of one camera that explains it."""
+    own = cameras[name]
+    before = _share_with(evidence, cameras, name, good, own)
+    if not before > UNEXPLAINED:
+        return None
+    changes: dict[str, Change] = {
+        f"has its pose {HOW[number]}; write it as world to camera with OpenCV axes": _by_viewmat(change)
+        for number, change in enumerate(MISTAKES.values())
+    }
+    changes |= {
+        f"stands {factor:g} times as far from the origin as its pictures say: its position looks like {unit}; write it "
+        "in the unit of the others": _farther(1 / factor)
+        for factor, unit in LENGTHS.items()
+    }
+    changes |= {
+        f"has intrinsics of a picture of {own.width / factor:.0f}x{own.height / factor:.0f} pixels, its pictures have "
+        f"{own.width}x{own.height}; scale them by {factor:g}": _scaled(factor)
+        for factor in SIZES
+    }
+    shares = {told: _share_with(evidence, cameras, name, good, change(own)) for told, change in changes.items()}
+    told = min(shares, key=lambda told: shares[told])
+    return f"Camera {name!r} {told}." if shares[told] < EXPLAINED else None
+
+
+def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, suspects: Suspects, tracks: Tracks) -> str:
+    """How far a camera stands from where its pictures say that it does."""
+    errors = [
+        pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
+        for pair in evidence.overlapping()
+        if name in pair and not set(pair) & set(suspects.off) - {name}
+    ]
+    pixels = float(np.median([error.pixels for error in errors])) if errors else float("nan")
+    told = (
+        f"Camera {name!r} is off: its matches with {len(errors)} other cameras, which agree with each other, lie "
+        f"{pixels:.1f} pixels from the epipolar lines of its pose"
+    )
+    motion = moved_by(tracks, cameras[name], name)
+    if motion is not None:
+        told += (
+            f"; its pictures place it {motion.degrees:.2f} degrees and {motion.share_of_distance:.1%} of its distance "
+            "to the scene away"
+        )
+    return told + ". It was bumped or its calibration is another's: calibrate again, or leave it out."
+
+
+def _by_viewmat(change: Callable[[torch.Tensor], torch.Tensor]) -> Change:
+    return lambda camera: replace(camera, viewmat=change(camera.viewmat))
+
+
+def _farther(factor: float) -> Change:
+    def change(camera: Camera) -> Camera:
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] *= factor
+        return replace(camera, viewmat=viewmat)
+
+    return change
+
+
+def _scaled(factor: float) -> Change:
+    scale = torch.tensor([[factor], [factor], [1.0]], dtype=torch.float64)
+    return lambda camera: replace(camera, K=camera.K * scale)
+
+
+def _share_with(
+    evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: Sequence[str], camera: Camera
+) -> float:
+    """Share of a camera's matches with good cameras that violate its pose when that is ``camera``; NaN without any."""
+    pairs = [pair for pair in evidence.overlapping() if name in pair and (set(pair) - {name}) <= set(good)]
+    return _shares(evidence, {**cameras, name: camera}, pairs)
+
+
+def _shares(evidence: Evidence, cameras: Mapping[str, Camera], pairs: Sequence[Pair]) -> float:
+    found = [pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair)) for pair in pairs]
+    total = sum(error.matches for error in found)
+    return sum(error.share * error.matches for error in found) / total if total else float("nan")

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lengths that do not fit together: near plane and points, points and cameras, metres and millimetres."""
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from structgstream.cameras import Camera
+from structgstream.data.matching import Floats, project
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.checking.overlap import cameras_per_point
+from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
+
+NEAR_PERCENTILE = 0.5
+LEAST_POINTS = 30
+CUT_SHARE = 0.02
+PLAUSIBLE_METRES = (0.03, 60.0)  # of a rig's radius: a desk, a stadium's corner
+FACTORS = (1000.0, 0.001, 100.0, 0.01)
+UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000 times too large (millimetres among "
+         "metres)", 100.0: "100 times too small (metres among centimetres)", 0.01: "100 times too large (centimetres "
+         "among metres)"}  # fmt: skip
+FIT = 0.5
+
+
+def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Floats:
+    """Depths of points in the cameras, of those not ``off``, that observed them; of three cameras, or else of two."""
+    views = tracks.views
+    least = LEAST_VIEWS if (views >= LEAST_VIEWS).sum() >= LEAST_POINTS else 2
+    depths = []
+    for number, name in enumerate(tracks.names):
+        if name in off:
+            continue
+        rows = (tracks.camera == number) & (views[tracks.point] >= least) & np.isfinite(tracks.residuals)
+        depths.append(project(cameras[name], tracks.points[tracks.point[rows]])[1])
+    return np.concatenate(depths) if depths else np.empty(0)
+
+
+def nearest_depth(depths: Floats) -> float | None:
+    """The depth that only few points fall below; None when there are too few."""
+    depths = depths[depths > 0]
+    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) >= LEAST_POINTS else None
+
+
+def scale_findings(
+    depths: Floats,
+    points: Floats | None,
+    cameras: Mapping[str, Camera],
+    *,
+    radius: float,
+    unit: str | None,
+) -> list[Finding]:
+    """What contradicts in lengths.
+
+    Args:
+        depths: of points that the pictures confirm, see :func:`observed_depths`.
+        points: ``[P, 3]`` that came with the capture, or None.
+        cameras: of the rig.
+        radius: of the rig.
+        unit: of length, where the capture says.
+    """
+    findings = []
+    near = float(np.median([camera.near for camera in cameras.values()]))
+    depths = depths[depths > 0]
+    if len(depths) >= LEAST_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
+        typical = float(np.median(depths))
+        hint = "; poses and near plane look like different units of length" if near > 50 * typical else ""
+        findings.append(
+            Finding(
+                "error",
+                f"The near plane lies at {near:.4g}, beyond {cut:.0%} of the points, whose nearest are at "
+                f"{np.percentile(depths, NEAR_PERCENTILE):.4g} and whose median is at {typical:.4g}{hint}; set --near "
+                f"{0.5 * np.percentile(depths, NEAR_PERCENTILE):.3g}.",
+            )
+        )
+    if unit == "metres" and not PLAUSIBLE_METRES[0] <= radius <= PLAUSIBLE_METRES[1]:
+        like = "millimetres or centimetres" if radius > 1 else "kilometres"
+        findings.append(
+            Finding(
+                "error",
+                f"The cameras stand up to {radius:.4g} from their middle, and the capture says metres: the positions "
+                f"look like {like}; convert them, or give a distance between two cameras.",
+            )
+        )
+    if points is not None and len(points) >= LEAST_POINTS and (told := _foreign(points, depths, cameras)):
+        findings.append(Finding("error", told))
+    return findings
+
+
+def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
+    """A sentence when the points that came along are not of these cameras."""
+    fits = _share_seen(points, cameras)
+    if len(depths) < LEAST_POINTS:
+        return None
+    typical = float(np.median(depths))
+    if fits >= FIT and 0.02 < _typical_depth(points, cameras) / typical < 50:
+        return None
+    apart = {factor: abs(np.log(_typical_depth(points * factor, cameras) / typical)) for factor in FACTORS}
+    likely = min(FACTORS, key=lambda factor: apart[factor])
+    if apart[likely] < np.log(5):
+        return (
+            f"The points that come with the capture lie at impossible depths: they look {UNITS[likely]}; convert "
+            "points and positions of cameras to one unit, or leave the points out."
+        )
+    return (
+        f"Only {fits:.0%} of the points that come with the capture lie where two cameras see them: they are of other "
+        "cameras; leave them out, or prepare the capture again."
+    )
+
+
+def _typical_depth(points: Floats, cameras: Mapping[str, Camera]) -> float:
+    return max(float(np.median([np.abs(project(camera, points)[1]) for camera in cameras.values()])), 1e-12)
+
+
+def _share_seen(points: Floats, cameras: Mapping[str, Camera]) -> float:
+    return float((cameras_per_point(points, cameras) >= 2).mean())

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether pictures of one frame are of one moment, from what moves in them."""
+
+from structgstream.data.source import FrameSource
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.synchronization import SynchronizationCheck, check_synchronization
+
+FRAMES = 90
+LEAST_FRAMES = 8
+WARNED_SECONDS = 5e-3
+SIGMAS = 3.0
+
+
+def measure_times(source: FrameSource) -> SynchronizationCheck | None:
+    """By how much each camera is late; None for a capture too short to tell.
+
+    Raises:
+        CaptureError: the pictures cannot be read.
+        MissingExtraError: cv2 or scipy is not installed.
+    """
+    return check_synchronization(source, frames=FRAMES) if len(source) >= LEAST_FRAMES else None
+
+
+def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
+    """An error for cameras that are off by a good part of a frame, a warning above 5 ms."""
+    if measured is None or not measured.conclusive:
+        return []
+    findings = []
+    for name, late in measured.late_seconds.items():
+        if abs(late) < max(WARNED_SECONDS, SIGMAS * measured.uncertainty_seconds[name]):
+            continue
+        amount = f"{1e3 * abs(late):.1f} ms ({abs(late) / measured.period_seconds:.2f} frames)"
+        which = "late" if late > 0 else "early"
+        if abs(late) > 0.6 * measured.period_seconds:
+            told = f"Camera {name!r} is {amount} {which}; synchronise again, or correct its clock in capture.json."
+            findings.append(Finding("error", told, (name,)))
+        elif name in measured.off:
+            told = (
+                f"Camera {name!r} is {amount} {which}: less than a frame, which choosing frames cannot mend; what "
+                "moves fast will blur there. Cameras that one signal starts have no such rest."
+            )
+            findings.append(Finding("warning", told, (name,)))
+    return findings

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points that several cameras agree on, and how far each camera's keypoints lie from them."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
+from structgstream.data.matching import Floats, epipolar_errors, fundamental_matrix, load_cv2, project, rays
+from structgstream.preparation.checking.evidence import Evidence
+
+AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
+LEAST_VIEWS = 3
+LEAST_FOR_POSE = 12
+ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of points.
+
+    Args:
+        names: of the cameras; observations number them in this order.
+        points: ``[P, 3]``, triangulated from cameras that are not off.
+        point: ``[M]`` number of the point of each observation.
+        camera: ``[M]`` number of its camera.
+        pixels: ``[M, 2]`` its keypoint.
+        residuals: ``[M]`` its distance to the projected point, pixels.
+    """
+
+    names: tuple[str, ...]
+    points: Floats
+    point: NDArray[np.intp]
+    camera: NDArray[np.intp]
+    pixels: Floats
+    residuals: Floats
+
+    def of(self, name: str) -> NDArray[np.bool_]:
+        """Mask ``[M]`` of a camera's observations."""
+        return self.camera == self.names.index(name)
+
+    @property
+    def views(self) -> NDArray[np.intp]:
+        """Number ``[P]`` of cameras that observed each point."""
+        return np.bincount(self.point, minlength=len(self.points))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Observations, and which of them points are made of."""
+
+    point: NDArray[np.intp]
+    camera: NDArray[np.intp]
+    pixels: Floats
+    used: NDArray[np.bool_]
+
+    def solvable(self) -> "_Table":
+        """The observations of points with at least two used ones; points are numbered anew."""
+        if not len(self.point):
+            return self
+        views = np.bincount(self.point[self.used], minlength=int(self.point.max()) + 1)
+        kept = views[self.point] >= 2
+        _, numbered = np.unique(self.point[kept], return_inverse=True)
+        return _Table(numbered.astype(np.intp), self.camera[kept], self.pixels[kept], self.used[kept])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far a camera's pictures place it from its pose."""
+
+    degrees: float
+    share_of_distance: float
+
+
+def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
+    """Points from the matches of cameras that are not ``off``; observations of those that are are kept, too.
+
+    Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. Points lie
+    where the rays of their keypoints pass closest, in the sense of least squares.
+    """
+    names = tuple(name for name in cameras if name in evidence.keypoints)
+    limit = AGREE_PIXELS * max(max((cameras[name].width for name in names), default=0) / 1000, 1)
+    nodes, edges = _edges(evidence, cameras, names, off=off, limit=limit)
+    point, camera, keypoint = _components(nodes, edges, names, evidence)
+    pixels = np.empty((len(point), 2))
+    for number, name in enumerate(names):
+        own = camera == number
+        pixels[own] = evidence.keypoints[name][keypoint[own]]
+    good = np.array([name not in off for name in names], bool)
+    table = _Table(point, camera, pixels, good[camera] if len(camera) else np.empty(0, bool)).solvable()
+    in_order = [cameras[name] for name in names]
+    for _ in range(ROUNDS):  # once more without what disagrees
+        points = _closest(table, in_order)
+        residuals = _residuals(points, table, in_order)
+        table = replace(table, used=good[table.camera] & (residuals < 3 * limit)).solvable()
+    points = _closest(table, in_order)
+    return Tracks(names, points, table.point, table.camera, table.pixels, _residuals(points, table, in_order))
+
+
+def moved_by(tracks: Tracks, camera: Camera, name: str) -> Motion | None:
+    """How far a camera stands from where points of the others place it; None when they do not.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    own = tracks.of(name)
+    if own.sum() < LEAST_FOR_POSE:
+        return None
+    cv2 = load_cv2()
+    points = tracks.points[tracks.point[own]]
+    limit = AGREE_PIXELS * max(camera.width / 1000, 1)
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        points, tracks.pixels[own], camera.K.numpy(), None, reprojectionError=limit, iterationsCount=500
+    )
+    if not found or inliers is None or len(inliers) < max(LEAST_FOR_POSE, 0.4 * own.sum()):
+        return None
+    rotation, given = cv2.Rodrigues(turn)[0], camera.viewmat.numpy()[:3, :3]
+    cosine = (np.trace(rotation @ given.T) - 1) / 2
+    center = -rotation.T @ shift[:, 0]
+    distance = float(np.median(np.linalg.norm(points[inliers[:, 0]] - center, axis=1)))
+    moved = float(np.linalg.norm(center - camera.center.numpy()))
+    return Motion(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), moved / max(distance, 1e-12))
+
+
+def _edges(
+    evidence: Evidence, cameras: Mapping[str, Camera], names: tuple[str, ...], *, off: Collection[str], limit: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First number of each camera's keypoints, and matches ``[E, 2]`` of keypoints by such numbers.
+
+    Matches of cameras that are not off must agree with their poses.
+    """
+    counts = [len(evidence.keypoints[name]) for name in names]
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
+    start = dict(zip(names, first, strict=False))
+    edges = [np.empty((0, 2), np.intp)]
+    for pair in evidence.overlapping():
+        if set(pair) <= set(off):
+            continue
+        rows = evidence.matches[pair]
+        if not set(pair) & set(off):
+            error = epipolar_errors(fundamental_matrix(cameras[pair[0]], cameras[pair[1]]), *evidence.pixels(pair))
+            rows = rows[error < limit]
+        edges.append(rows + np.array([start[pair[0]], start[pair[1]]]))
+    return first, np.concatenate(edges)
+
+
+def _components(
+    first: NDArray[np.intp], edges: NDArray[np.intp], names: tuple[str, ...], evidence: Evidence
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Point, camera and keypoint of each observation; points have one keypoint in a picture, and two pictures."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    total = int(first[-1])
+    if not len(edges):
+        none = np.empty(0, np.intp)
+        return none, none, none
+    graph = coo_matrix((np.ones(len(edges), np.int8), edges.T), shape=(total, total))
+    _, label = connected_components(graph, directed=False)
+    node = np.unique(edges)
+    camera = np.searchsorted(first, node, side="right") - 1
+    label = label[node]
+    _, label = np.unique(label, return_inverse=True)
+    once = label * len(names) + camera
+    _, position, count = np.unique(once, return_inverse=True, return_counts=True)
+    twice = np.zeros(label.max() + 1, bool)
+    twice[label[count[position] > 1]] = True
+    kept = ~twice[label]
+    return label[kept], camera[kept], node[kept] - first[camera[kept]]
+
+
+def _closest(table: _Table, cameras: list[Camera]) -> Floats:
+    """Points ``[P, 3]`` with the least sum of squared distances to the rays of their used observations."""
+    count = int(table.point.max()) + 1 if len(table.point) else 0
+    left, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for number, own in enumerate(cameras):
+        rows = (table.camera == number) & table.used
+        directions = rays(own, table.pixels[rows])
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+        np.add.at(left, table.point[rows], across)
+        np.add.at(right, table.point[rows], across @ own.center.numpy())
+    # Nearly parallel rays meet far away; the floor keeps the system solvable.
+    return np.linalg.solve(left + 1e-9 * np.eye(3), right[..., None])[..., 0].astype(np.float64)
+
+
+def _residuals(points: Floats, table: _Table, cameras: list[Camera]) -> Floats:
+    residuals = np.full(len(table.point), np.inf)
+    for number, own in enumerate(cameras):
+        rows = table.camera == number
+        seen, depths = project(own, points[table.point[rows]])
+        residuals[rows] = np.where(depths > 0, np.linalg.norm(seen - table.pixels[rows], axis=1), np.inf)
+    return residuals

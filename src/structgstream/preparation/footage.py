@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of each camera as they were found: one video a camera, or one folder of pictures.
+
+::
+
+    VIDEOS/CAMERA.mp4             one video per camera, in the folder or in videos/ below it
+    VIDEOS/CAMERA/anything.mp4    a folder per camera with its one video, as cards are copied
+    VIDEOS/CAMERA/FRAME.jpg       a folder of pictures per camera, in the folder or in images/ below it
+    VIDEOS/CAMERA.jpg             one picture per camera
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.audio import read_audio
+from structgstream.data.images import PICTURE_SUFFIXES, read_picture
+from structgstream.data.picture_size import picture_size
+from structgstream.data.prepared import pictures_of
+from structgstream.data.timeline import natural
+from structgstream.data.video import measured_fps
+from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos
+from structgstream.data.video_pictures import pictures_at
+from structgstream.errors import CaptureError
+
+PICTURE_FPS = 30.0  # folders of pictures state no rate
+WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
+SUBFOLDERS = ("", "videos", "images")
+NO_CAMERAS = (*SUBFOLDERS, "masks", "board")
+LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What the cameras filmed.
+
+    Args:
+        where: the folder it lies in, for messages.
+        files: name of a camera to its video, folder of pictures or picture, in natural order of the names.
+        tracks: of the cameras with videos.
+        stills: of the cameras with pictures, these in order.
+        picture_fps: frames a second of pictures.
+    """
+
+    where: Path
+    files: Mapping[str, Path]
+    tracks: Mapping[str, VideoTrack]
+    stills: Mapping[str, tuple[Path, ...]]
+    picture_fps: float = PICTURE_FPS
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(self.files)
+
+    @property
+    def fps(self) -> float:
+        """Frames a second by time stamp; of pictures, what was stated."""
+        return (measured_fps(self.tracks) if self.tracks else None) or self.picture_fps
+
+    def path(self, name: str) -> Path:
+        """The camera's video or folder, for messages."""
+        return self.files[name]
+
+    def size(self, name: str) -> tuple[int, int]:
+        """Width and height of a camera's pictures, pixels.
+
+        Raises:
+            CaptureError: its first picture cannot be read.
+        """
+        if (track := self.tracks.get(name)) is not None:
+            return track.width, track.height
+        return picture_size(self.stills[name][0])
+
+    def stamps(self, name: str) -> NDArray[np.float64]:
+        """Time ``[N]`` of every frame by the camera's own clock, seconds, ascending."""
+        if (track := self.tracks.get(name)) is not None:
+            return track.seconds
+        return np.arange(len(self.stills[name])) / self.picture_fps
+
+    def pictures(self, name: str, indices: Sequence[int] | NDArray[np.intp]) -> Iterator[NDArray[np.uint8]]:
+        """Pictures ``[H, W, 3]`` sRGB of frames of one camera, whose numbers ascend, at their stored size.
+
+        Raises:
+            CaptureError: a picture cannot be read.
+        """
+        if (track := self.tracks.get(name)) is not None:
+            for run in _runs([int(index) for index in indices]):
+                yield from self._decoded(name, track, run)
+        else:
+            for index in indices:
+                yield read_picture(self.stills[name][index])
+
+    def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+        def tell(lost: int, following: int | None, reason: str) -> None:
+            raise CaptureError(
+                f"The video {track.path} of camera {name!r} cannot be decoded at {lost * track.tick_seconds:.3f} s "
+                f"({reason}): truncated or damaged; copy or record it again, or leave it out with --without {name}."
+            )
+
+        stamps = [track.stamps[index] for index in indices]
+        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=tell)) as pictures:
+            for picture in pictures:
+                assert picture is not None, "what is lost was told"
+                yield picture
+
+    def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
+        """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound.
+
+        Raises:
+            CaptureError: the sound cannot be decoded.
+        """
+        if name not in self.tracks:
+            return None
+        samples = read_audio(self.files[name], rate=(rate := 48_000))
+        return None if samples is None else (samples, float(rate))
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """What a camera's file states as text, by lower-case key; nothing for pictures.
+
+        Raises:
+            CaptureError: the file cannot be opened.
+        """
+        if name not in self.tracks:
+            return {}
+        with open_video(self.files[name]) as container:
+            stated = {**container.streams.video[0].metadata, **container.metadata}
+        return {key.lower(): value for key, value in stated.items()}
+
+    def only(self, names: Collection[str]) -> "Footage":
+        """These cameras alone."""
+        return Footage(
+            self.where,
+            {name: file for name, file in self.files.items() if name in names},
+            {name: track for name, track in self.tracks.items() if name in names},
+            {name: still for name, still in self.stills.items() if name in names},
+            self.picture_fps,
+        )
+
+
+def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
+    """The cameras of a folder.
+
+    Args:
+        where: the folder, in one of the layouts of this module.
+        picture_fps: frames a second of folders of pictures.
+
+    Raises:
+        CaptureError: the folder is missing or holds no videos or pictures, two files have the name of one camera, or
+            a file cannot be read.
+    """
+    if not where.is_dir():
+        kind = "a file" if where.exists() else "missing"
+        raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
+    for root in (where / name for name in SUBFOLDERS):
+        if root.is_dir() and (files := _found(root)):
+            ordered = {name: files[name] for name in sorted(files, key=natural)}
+            return _footage(where, ordered, picture_fps or PICTURE_FPS)
+    held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6]) or "nothing"
+    raise CaptureError(f"{where} holds no videos and no pictures, but {held}; expected {LAYOUTS}.")
+
+
+def _runs(indices: Sequence[int]) -> list[list[int]]:
+    """Ascending numbers of frames, split where it is faster to seek."""
+    runs: list[list[int]] = []
+    for index in indices:
+        if runs and index - runs[-1][-1] <= WORTH_SEEKING:
+            runs[-1].append(index)
+        else:
+            runs.append([index])
+    return runs
+
+
+def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Footage:
+    videos = {name: file for name, file in files.items() if file.suffix.lower() in VIDEO_SUFFIXES}
+    stills = {
+        name: pictures_of(file) if file.is_dir() else (file,) for name, file in files.items() if name not in videos
+    }
+    if videos and stills:
+        video, still = next(iter(videos)), next(iter(stills))
+        raise CaptureError(
+            f"{where} has a video of camera {video!r} and pictures of camera {still!r}; expected one kind of all "
+            "cameras: move the others out of the folder."
+        )
+    return Footage(where, files, scan_videos(videos) if videos else {}, stills, picture_fps)
+
+
+def _found(root: Path) -> dict[str, Path]:
+    """Files or folders of the cameras of ``root`` by name; nothing when there are none."""
+    entries = sorted(entry for entry in root.iterdir() if not entry.name.startswith("."))
+    for suffixes in (VIDEO_SUFFIXES, PICTURE_SUFFIXES):
+        found: dict[str, Path] = {}
+        for entry in entries:
+            file = entry if entry.is_file() and entry.suffix.lower() in suffixes else None
+            if entry.is_dir() and entry.name not in NO_CAMERAS:
+                file = _of_folder(entry, suffixes)
+            if file is None:
+                continue
+            name = entry.stem if entry.is_file() else entry.name
+            if name in found:
+                raise CaptureError(
+                    f"{found[name].name} and {file.name} in {root} are both of camera {name!r}; expected one file per "
+                    "camera: join them or move one out of the folder."
+                )
+            found[name] = file
+        if found:
+            return found
+    return {}
+
+
+def _of_folder(folder: Path, suffixes: Collection[str]) -> Path | None:
+    """The one video in a camera's folder, or the folder itself when it holds pictures."""
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+    if not files:
+        return None
+    if suffixes is PICTURE_SUFFIXES:
+        return folder
+    if len(files) > 1:
+        raise CaptureError(
+            f"The folder {folder} of camera {folder.name!r} holds {len(files)} videos ({files[0].name}, "
+            f"{files[1].name}, ...); expected one per camera: join the chapters of the take to one file."
+        )
+    return files[0]

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations that are there already: of other tools, or of another capture of the same cameras."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from structgstream.data.calibrated_capture import read_calibrated
+from structgstream.data.calibration_files import transforms
+from structgstream.data.colmap import find_model, read_model
+from structgstream.data.immersive import MODELS, read_models
+from structgstream.data.json_videos import FILE as CAMERAS
+from structgstream.data.json_videos import read_cameras
+from structgstream.data.lenses import Pinhole
+from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.prepared import FILE as PREPARED
+from structgstream.data.prepared import read_prepared
+from structgstream.errors import CalibrationError
+
+
+def find_calibration(where: Path) -> Calibration | None:
+    """The calibration in a folder, or that a file holds; None when there is none that is known.
+
+    Raises:
+        CalibrationError: it is broken, or a pickle.
+    """
+    folder, file = (where, None) if where.is_dir() else (where.parent, where)
+
+    def meant(name: str) -> bool:
+        return (folder / name).is_file() and file in (None, folder / name)
+
+    if meant(PREPARED):
+        return _of_prepared(folder)
+    if meant(CAMERAS):
+        return _of_cameras(folder / CAMERAS)
+    if meant(MODELS):
+        return read_models(folder / MODELS)
+    readers: tuple[Callable[[], Calibration | None], ...] = (
+        lambda: _of_colmap(folder, file),
+        lambda: _of_transforms(folder, file),
+        lambda: read_calibrated(folder, file),
+    )
+    return next((found for read in readers if (found := read()) is not None), None)
+
+
+def demand_calibration(where: Path) -> Calibration:
+    """As :func:`find_calibration`.
+
+    Raises:
+        CalibrationError: there is none, or it is broken.
+    """
+    if not where.exists():
+        raise CalibrationError(f"The calibration {where} does not exist; give a file or a folder of docs/captures.md.")
+    found = find_calibration(where)
+    if found is None:
+        raise CalibrationError(
+            f"{where} is no calibration that is known; expected a file of docs/captures.md (aniposelib, EasyMocap, "
+            "multical, Kalibr, CMU Panoptic, Qualisys, ZJU-MoCap, OpenCV, transforms.json, models.json, COLMAP)."
+        )
+    return found
+
+
+def _of_prepared(folder: Path) -> Calibration:
+    capture = read_prepared(folder)
+    cameras = []
+    for name, camera in capture.cameras.items():
+        filmed = camera.filmed.camera
+        size = (filmed.width, filmed.height)
+        cameras.append(PosedCamera(name, filmed.viewmat.numpy(), filmed.K.numpy(), size, camera.filmed.lens))
+    return Calibration(folder / PREPARED, tuple(cameras), held_out=sorted(capture.held_out))
+
+
+def _of_cameras(file: Path) -> Calibration:
+    rig, _, _ = read_cameras(file)
+    cameras = tuple(
+        PosedCamera(name, camera.viewmat.numpy(), camera.K.numpy(), (camera.width, camera.height), Pinhole())
+        for name, camera in rig.cameras.items()
+    )
+    return Calibration(file, cameras, held_out=rig.testing)
+
+
+def _of_colmap(folder: Path, file: Path | None) -> Calibration | None:
+    model = find_model(folder)
+    if model is None or (file is not None and file.parent != model):
+        return None
+    return read_model(model)
+
+
+def _of_transforms(folder: Path, file: Path | None) -> Calibration | None:
+    files = transforms.find(folder)
+    return transforms.read(files) if files and (file is None or file in files) else None

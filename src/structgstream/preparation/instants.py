@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the same instants, by the clocks of the cameras."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.timeline import Clock
+from structgstream.errors import CaptureError
+from structgstream.preparation.footage import Footage
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Shots(Sequence[Picture]):
+    """Pictures of one camera, decoded when they are asked for, so that a long take does not fill the memory."""
+
+    footage: Footage
+    camera: str
+    indices: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[Picture]:
+        """In order, in one pass through the file."""
+        order = sorted(set(self.indices))
+        if list(self.indices) == order:
+            yield from self.footage.pictures(self.camera, order)
+        else:
+            yield from (self[number] for number in range(len(self)))
+
+    @overload
+    def __getitem__(self, number: int) -> Picture: ...
+    @overload
+    def __getitem__(self, number: slice) -> "Shots": ...
+    def __getitem__(self, number: int | slice) -> "Picture | Shots":
+        if isinstance(number, slice):
+            return Shots(self.footage, self.camera, self.indices[number])
+        return next(self.footage.pictures(self.camera, [self.indices[number]]))
+
+
+def shared_seconds(footage: Footage, clocks: Mapping[str, Clock]) -> tuple[float, float]:
+    """First and last moment that all cameras filmed, in the time that they share.
+
+    Raises:
+        CaptureError: there is none.
+    """
+    spans = {}
+    for name in footage.cameras:
+        clock, stamps = clocks.get(name, Clock()), footage.stamps(name)
+        spans[name] = (
+            clock.offset_seconds + clock.rate * stamps[0],
+            clock.offset_seconds + clock.rate * stamps[-1],
+        )
+    late = max(spans, key=lambda name: spans[name][0])
+    early = min(spans, key=lambda name: spans[name][1])
+    first, last = spans[late][0], spans[early][1]
+    if first > last + 1e-6:
+        raise CaptureError(
+            f"The cameras of {footage.where} have no moment in common: {footage.path(early).name} of camera {early!r} "
+            f"ends {first - last:.3f} s before {footage.path(late).name} of camera {late!r} begins (lengths "
+            f"{_length(spans, early)} and {_length(spans, late)}); give longer videos, or leave one camera out with "
+            "--without."
+        )
+    return first, last
+
+
+def shots_of(footage: Footage, clocks: Mapping[str, Clock], seconds: Sequence[float]) -> dict[str, Shots]:
+    """Each camera's pictures nearest to these moments of the shared time."""
+    found = {}
+    for name in footage.cameras:
+        clock = clocks.get(name, Clock())
+        times = clock.offset_seconds + clock.rate * footage.stamps(name)
+        indices = [int(np.abs(times - moment).argmin()) for moment in seconds]
+        found[name] = Shots(footage, name, tuple(indices))
+    return found
+
+
+def spread_moments(first: float, last: float, count: int) -> list[float]:
+    """Moments from the first to the last, both included; fewer when the take has no length."""
+    if last <= first:
+        return [first]
+    return np.linspace(first, last, max(count, 1)).tolist() if count > 1 else [first]
+
+
+def _length(spans: Mapping[str, tuple[float, float]], name: str) -> str:
+    return f"{spans[name][1] - spans[name][0]:.3f} s"

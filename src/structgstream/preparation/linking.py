@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Brings what was filmed into a capture, without storing it twice where that is possible."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import Literal
+
+from structgstream.errors import StorageError
+
+Link = Literal["hard", "symlink", "copy"]
+
+
+def bring(source: Path, target: Path, *, link: Link) -> None:
+    """Makes ``target`` the file or the folder of files ``source``; what is there already stays.
+
+    Args:
+        source: a file, or a folder of files.
+        target: its place in the capture.
+        link: ``hard`` links, and copies where file systems differ; ``symlink`` points to the source; ``copy`` copies.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    try:
+        if source.is_dir():
+            target.mkdir(parents=True, exist_ok=True)
+            for file in sorted(entry for entry in source.iterdir() if entry.is_file()):
+                _bring_file(file, target / file.name, link)
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _bring_file(source, target, link)
+    except OSError as error:
+        raise StorageError(
+            f"{source} cannot be brought to {target} ({error.strerror}); make room, or use --link symlink."
+        ) from None
+
+
+def _bring_file(source: Path, target: Path, link: Link) -> None:
+    if _same(source, target, link):
+        return
+    target.unlink(missing_ok=True)
+    source = source.resolve()
+    if link == "symlink":
+        target.symlink_to(source)
+        return
+    if link == "hard":
+        try:
+            os.link(source, target)
+            return
+        except OSError:  # another file system, or one without links
+            pass
+    part = target.with_name(f"{target.name}.part")
+    shutil.copy2(source, part)
+    os.replace(part, target)
+
+
+def _same(source: Path, target: Path, link: Link) -> bool:
+    """Whether the target is that of an earlier run."""
+    if not target.exists():
+        return False
+    if link == "symlink" or target.is_symlink():
+        return link == "symlink" and target.is_symlink() and target.resolve() == source.resolve()
+    if target.samefile(source):
+        return link != "copy"
+    one, other = source.stat(), target.stat()
+    return (one.st_size, one.st_mtime_ns) == (other.st_size, other.st_mtime_ns)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a user may ask of a preparation."""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from structgstream.errors import ConfigError
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.calibration.colmap import LensModel
+from structgstream.preparation.linking import Link
+from structgstream.preparation.synchronization import Method
+
+METHODS = ("auto", "sfm", "board")
+UNITS_IN_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A length that was measured: between the middles of two cameras' lenses, in metres."""
+
+    first: str
+    second: str
+    metres: float
+
+
+@dataclass(frozen=True)
+class PrepareOptions:
+    """How a capture is made.
+
+    Args:
+        calibration: ``sfm``, ``board``, ``auto`` (a file of another tool beside the videos, else ``sfm``), or a
+            calibration file or the folder that holds one.
+        lens: distortion that is estimated: ``pinhole``, ``radial``, ``opencv`` or ``fisheye``; None for ``radial`` by
+            structure from motion and ``opencv`` by a board.
+        intrinsics: ``shared`` for cameras of one make and zoom, else ``own``.
+        refine: adjust a given calibration to the pictures.
+        board: what was printed.
+        board_videos: videos in which the board is shown to the cameras; None for the videos themselves.
+        distance: a measured length that makes the unit metres; None for none.
+        synchronize: how clocks are found, see ``preparation.synchronization``.
+        field_of_view: degrees across the pictures after undistortion; None for the largest without black borders.
+        size: width and height after undistortion, pixels; None for those of the videos.
+        held_out: names of cameras, ``("auto",)`` for the one that others surround best, or none.
+        near: near plane in the capture's units; None to take it from the points.
+        fps: frames a second of pictures; None for 30.
+        without: names of cameras to leave out.
+        link: how files are brought into the capture.
+        instants: number of instants that structure from motion looks at.
+        tone: estimate a tone curve per camera.
+    """
+
+    calibration: str | Path = "auto"
+    lens: LensModel | None = None
+    intrinsics: Literal["own", "shared"] = "own"
+    refine: bool = False
+    board: Board = Board()
+    board_videos: Path | None = None
+    distance: Distance | None = None
+    synchronize: Method = "auto"
+    field_of_view: float | None = None
+    size: tuple[int, int] | None = None
+    held_out: tuple[str, ...] = ()
+    near: float | None = None
+    fps: float | None = None
+    without: tuple[str, ...] = ()
+    link: Link = "hard"
+    instants: int = 3
+    tone: bool = False
+
+    def __post_init__(self) -> None:
+        if self.near is not None and not self.near > 0:
+            raise ConfigError(f"The near plane must be positive, got {self.near:g}.")
+        if self.fps is not None and not self.fps > 0:
+            raise ConfigError(f"Frames a second must be positive, got {self.fps:g}.")
+        if self.instants < 1:
+            raise ConfigError(f"Structure from motion needs at least one instant, got {self.instants}.")
+
+
+def parse_length(text: str) -> float:
+    """A length as it is written on the command line, in metres: ``3.2m``, ``320cm``, ``50mm``, ``10.5ft``.
+
+    Raises:
+        ConfigError: no positive length.
+    """
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]*)\s*", text)
+    if found is None or found[2] not in UNITS_IN_METRES or not float(found[1]) > 0:
+        raise ConfigError(f"A length is a positive number with its unit, such as 3.2m, 50mm or 10.5ft; got {text!r}.")
+    return float(found[1]) * UNITS_IN_METRES[found[2]]
+
+
+def parse_distance(first: str, second: str, length: str) -> Distance:
+    """A distance as it is written on the command line: two cameras and a length.
+
+    Raises:
+        ConfigError: no positive length, or one camera twice.
+    """
+    if first == second:
+        raise ConfigError(f"A distance is between two cameras, got {first!r} twice.")
+    return Distance(first, second, parse_length(length))
+
+
+def parse_board(text: str) -> Board:
+    """A board as it is written on the command line: ``7x5:50mm``, or ``7x5:50mm:DICT_4X4_50``.
+
+    Raises:
+        ConfigError: anything else, or sizes that make no board.
+    """
+    squares, *rest = text.split(":")
+    if not 1 <= len(rest) <= 2:
+        raise ConfigError(f"A board is COLUMNSxROWS:SQUARE, such as 7x5:50mm; got {text!r}.")
+    columns, rows = parse_size(squares)
+    board = Board(columns, rows, parse_length(rest[0]))
+    return board if len(rest) == 1 else replace(board, dictionary=rest[1])
+
+
+def board_text(board: Board) -> str:
+    """The reverse of :func:`parse_board`."""
+    text = f"{board.columns}x{board.rows}:{1000 * board.square_metres:g}mm"
+    return text if board.dictionary == Board().dictionary else f"{text}:{board.dictionary}"
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """A size as it is written on the command line: ``1280x720``.
+
+    Raises:
+        ConfigError: anything else.
+    """
+    found = re.fullmatch(r"\s*(\d+)\s*x\s*(\d+)\s*", text)
+    if found is None or not (int(found[1]) and int(found[2])):
+        raise ConfigError(f"A size is WIDTHxHEIGHT in pixels, such as 1280x720; got {text!r}.")
+    return int(found[1]), int(found[2])

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From videos of still cameras to a calibrated capture, step by step; steps that were done are not done again."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from structgstream.preparation.calibrating import chosen_method
+from structgstream.preparation.camera_steps import CameraSteps
+from structgstream.preparation.capture_steps import REPORT, CaptureSteps, assembled, with_tones
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.job import new_job
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.steps import Listener, Silent
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """A capture that was prepared.
+
+    Args:
+        path: its folder, for ``open_capture`` and ``reconstruct``.
+        findings: what the check says, errors first.
+        steps: what each step found, in words.
+        skipped: steps whose results were there already.
+        report: the page of the report.
+    """
+
+    path: Path
+    findings: tuple[Finding, ...]
+    steps: Mapping[str, str]
+    skipped: tuple[str, ...]
+    report: Path
+
+
+def prepare_capture(
+    videos: Path, capture: Path, *, options: PrepareOptions | None = None, listener: Listener | None = None
+) -> Preparation:
+    """Makes the capture, or goes on with one that was interrupted.
+
+    Args:
+        videos: the folder of the cameras' videos or pictures, see ``preparation.footage``.
+        capture: the folder to make; the same call again does only what has changed.
+        options: what is asked for.
+        listener: is told of steps and progress.
+
+    Raises:
+        CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` holds something else.
+        ConfigError: options that the cameras do not allow.
+        StorageError: the capture cannot be written.
+        MissingExtraError: a package is missing that a step needs.
+    """
+    options = options or PrepareOptions()
+    job = new_job(videos, capture, options=options, listener=listener or Silent())
+    find = CameraSteps(job)
+    footage = find.find()
+    method = chosen_method(footage, options)
+    clocks = find.synchronize(footage, method)
+    solved = find.calibrate(footage, clocks.clocks, method)
+    clocks = find.synchronize_again(footage, clocks, method, solved)
+    content = assembled(footage, clocks.clocks, solved, options)
+    if options.tone:
+        content = with_tones(content, find.tones(footage, clocks.clocks, solved, content.held_out))
+    make = CaptureSteps(job)
+    make.bring(footage, content)
+    content = make.points(make.near(content))
+    findings = make.check(content)
+    return Preparation(capture, findings, job.told, tuple(job.steps.skipped), capture / REPORT / "index.html")

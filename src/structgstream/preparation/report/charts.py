@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Charts of a check: errors of pairs, coverage from above and from the side, colours, times."""
+
+from pathlib import Path
+
+import numpy as np
+
+from structgstream.data.matching import Floats, level_normal
+from structgstream.figure import COLORS, FAINT, INK, OTHER, figure_of, save_figure, without_frame
+from structgstream.preparation.checking.check import Examination
+from structgstream.preparation.checking.findings import CheckReport
+from structgstream.preparation.checking.overlap import cameras_per_point
+
+LIMIT_MS = 5.0
+FAR_PERCENTILE = 97.0
+MOST_LABELS = 60
+
+
+def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float) -> None:
+    """Median epipolar error of every pair; pairs without matches stay white.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        StorageError: the file cannot be written.
+    """
+    names = list(report.cameras)
+    values = np.full((len(names), len(names)), np.nan)
+    for pair in report.pairs:
+        if pair.epipolar_pixels is not None:
+            one, other = names.index(pair.first), names.index(pair.second)
+            values[one, other] = values[other, one] = pair.epipolar_pixels
+    side = float(np.clip(0.42 * len(names) + 1.6, 4.5, 13))
+    figure = figure_of(side + 0.8, side)
+    axis = figure.subplots()
+    shown = axis.imshow(values, cmap="viridis", vmin=0, vmax=2 * limit_pixels)
+    axis.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    axis.set_xticks(np.arange(len(names) + 1) - 0.5, minor=True)
+    axis.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)
+    axis.grid(which="minor", color=FAINT, linewidth=0.6)
+    axis.tick_params(which="both", length=0)
+    axis.spines[:].set_visible(False)
+    if len(names) <= 16:
+        for row, column in zip(*np.nonzero(np.isfinite(values))):
+            dark = values[row, column] < 1.3 * limit_pixels
+            axis.text(
+                column, row, f"{values[row, column]:.1f}", ha="center", va="center", fontsize=7,
+                color="white" if dark else INK,
+            )  # fmt: skip
+    bar = figure.colorbar(shown, ax=axis, shrink=0.7, pad=0.02, extend="max")
+    bar.set_label("median distance to epipolar lines, pixels", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    axis.set_title("Error of each pair; white: no matches", fontsize=10, loc="left", color=INK)
+    save_figure(figure, path)
+
+
+def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) -> None:
+    """The rig and the points from above and from the side, coloured by the number of cameras that see them.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        StorageError: the file cannot be written.
+    """
+    cameras = examined.cameras
+    centers = np.stack([camera.center.numpy() for camera in cameras.values()])
+    axes = np.stack([camera.viewmat.numpy()[2, :3] for camera in cameras.values()])
+    points, counts = examined.tracks.points, cameras_per_point(examined.tracks.points, cameras)
+    frame = _level_frame(examined, centers)
+    centers, axes, points = centers @ frame.T, axes @ frame.T, points @ frame.T
+    points, counts = _within(points, counts, centers)
+    radius = max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-9)
+    figure = figure_of(11.0, 5.4)
+    label = f"{unit}" if unit == "metres" else "capture's units"
+    shown = None
+    for axis, (across, up), title in zip(
+        figure.subplots(1, 2), ((0, 1), (1, 2)), ("from above", "from the side"), strict=True
+    ):
+        if len(points):
+            shown = axis.scatter(
+                points[:, across], points[:, up], c=counts, cmap="viridis", s=5, vmin=0, vmax=len(cameras)
+            )
+        for number, name in enumerate(cameras):
+            off = name in examined.suspects.off
+            color = COLORS[3] if off else INK
+            start = centers[number]
+            axis.annotate(
+                "", start[[across, up]] + 0.22 * radius * axes[number][[across, up]], start[[across, up]],
+                arrowprops={"arrowstyle": "-|>", "color": color, "lw": 1.2, "shrinkA": 0, "shrinkB": 0},
+            )  # fmt: skip
+            axis.plot(start[across], start[up], "s", color=color, markersize=5)
+            if off or (len(cameras) <= MOST_LABELS and across == 0):
+                behind = start - 0.05 * radius * axes[number]
+                axis.annotate(
+                    name, behind[[across, up]], fontsize=7, color=color, ha="center", va="center",
+                    xytext=-9 * _unit(axes[number][[across, up]]), textcoords="offset points",
+                )  # fmt: skip
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.margins(0.08)
+        axis.set_title(title, fontsize=10, loc="left", color=INK)
+        axis.set_xlabel(label, fontsize=8)
+        without_frame(axis)
+        axis.grid(axis="both", color=FAINT, linewidth=0.8)
+    if shown is not None:
+        bar = figure.colorbar(shown, ax=figure.axes, shrink=0.8, pad=0.01)
+        bar.set_label("cameras whose picture holds the point", fontsize=8)
+        bar.ax.tick_params(labelsize=8)
+    figure.suptitle(f"Rig and points (near plane at {near:.3g} {label})", fontsize=10, color=INK)
+    save_figure(figure, path)
+
+
+def draw_colors(path: Path, report: CheckReport) -> None:
+    """Exposure and white balance of each camera against the median camera.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        StorageError: the file cannot be written.
+    """
+    names = [name for name, camera in report.cameras.items() if camera.exposure_stops is not None]
+    figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
+    axis = figure.subplots()
+    at = np.arange(len(names))
+    kinds = (("exposure_stops", "exposure", OTHER), ("red_stops", "red / green", COLORS[3]),
+             ("blue_stops", "blue / green", COLORS[0]))  # fmt: skip
+    for number, (key, label, color) in enumerate(kinds):
+        values = [getattr(report.cameras[name], key) for name in names]
+        axis.bar(at + 0.27 * (number - 1), values, width=0.25, color=color, label=label)
+    largest = max((abs(getattr(report.cameras[name], key)) for name in names for key, _, _ in kinds), default=0)
+    axis.set_ylim(-max(0.4, 1.15 * largest), max(0.4, 1.15 * largest))
+    axis.axhline(0, color=INK, linewidth=0.8)
+    axis.set_xticks(at, names, rotation=90 if len(names) > 12 else 0, fontsize=8)
+    axis.set_ylabel("stops against the median camera", fontsize=8)
+    axis.set_title("Exposure and white balance", fontsize=10, loc="left", color=INK)
+    without_frame(axis)
+    axis.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")
+    save_figure(figure, path)
+
+
+def draw_times(path: Path, report: CheckReport) -> None:
+    """Time offset that is left between cameras, with its uncertainty and the limit of 5 ms.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        StorageError: the file cannot be written.
+    """
+    known = {name: camera for name, camera in report.cameras.items() if camera.offset_ms is not None}
+    names = list(known)
+    values = np.array([camera.offset_ms for camera in known.values()], float)
+    spread = np.array([camera.offset_uncertainty_ms or 0.0 for camera in known.values()], float)
+    late = np.abs(values) > LIMIT_MS
+    figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
+    axis = figure.subplots()
+    axis.axhspan(-LIMIT_MS, LIMIT_MS, color="#e8f4ec", zorder=0)
+    for side in (-LIMIT_MS, LIMIT_MS):
+        axis.axhline(side, color=COLORS[2], linewidth=1, linestyle="--")
+    axis.annotate(
+        "5 ms", (1.0, LIMIT_MS), xycoords=("axes fraction", "data"), fontsize=8, color=COLORS[2], ha="left", va="center"
+    )
+    axis.axhline(0, color=INK, linewidth=0.8)
+    for mask, color in ((~late, COLORS[0]), (late, COLORS[3])):
+        if mask.any():
+            axis.errorbar(
+                np.flatnonzero(mask), values[mask], yerr=2 * spread[mask], fmt="o", color=color, markersize=5, capsize=3
+            )
+    most = max(2 * LIMIT_MS, 1.2 * float((np.abs(values) + 2 * spread).max(initial=0)))
+    axis.set_ylim(-most, most)
+    axis.set_xticks(range(len(names)), names, rotation=90 if len(names) > 12 else 0, fontsize=8)
+    axis.set_ylabel("late by, milliseconds", fontsize=8)
+    axis.set_title("Time against the other cameras (bars: two standard deviations)", fontsize=10, loc="left", color=INK)
+    without_frame(axis)
+    save_figure(figure, path)
+
+
+def _level_frame(examined: Examination, centers: Floats) -> Floats:
+    """Rows: across, into the scene, up, where up is perpendicular to the cameras' x axes."""
+    up = level_normal(examined.cameras)
+    spread = centers - centers.mean(0)
+    spread = spread - np.outer(spread @ up, up)
+    across = np.linalg.svd(spread, full_matrices=False)[2][0] if len(spread) > 1 else np.array([1.0, 0, 0])
+    across = across - (across @ up) * up
+    across /= max(float(np.linalg.norm(across)), 1e-12)
+    into = np.cross(up, across)
+    ahead = np.mean([camera.viewmat.numpy()[2, :3] for camera in examined.cameras.values()], axis=0)
+    if ahead @ into < 0:  # the cameras at the bottom, what they see above
+        across, into = -across, -into
+    return np.stack([across, into, up])
+
+
+def _within(points: Floats, counts: np.ndarray, centers: Floats) -> tuple[Floats, np.ndarray]:
+    """Without the few points far away, which would make the rig a dot."""
+    if not len(points):
+        return points, counts
+    apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    reach = max(float(np.percentile(apart, FAR_PERCENTILE)), 1e-9)
+    reach = min(reach, 6 * max(float(np.linalg.norm(centers - np.median(points, axis=0), axis=1).max()), 1e-9))
+    return points[apart <= reach], counts[apart <= reach]
+
+
+def _unit(vector: Floats) -> Floats:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-9 else np.array([0.0, -1.0])

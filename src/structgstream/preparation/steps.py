@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results of steps on the disk: a step whose inputs and options are the same is not done again.
+
+A result is ``work/STEP.json`` (numbers, and the key) and ``work/STEP.npz`` (arrays). The key is a hash of the step's
+inputs and of the keys of the steps before it; the JSON is written last, so what an interruption leaves is done again.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.errors import StorageError
+
+FOLDER = "work"
+VERSION = 1  # of the steps' results; a new one does all steps again
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a step leaves: ``values`` are what JSON holds, ``arrays`` plain arrays by name."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+class Listener(Protocol):
+    """Is told of steps as they go."""
+
+    def begin(self, step: str, *, skipped: bool) -> None:
+        """A step begins; ``skipped`` when its result is there already."""
+        ...
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        """A part of the running step is done."""
+        ...
+
+    def end(self, step: str, summary: str) -> None:
+        """A step is done; ``summary`` says what came of it."""
+        ...
+
+
+class Silent:
+    """A listener that says nothing."""
+
+    def begin(self, step: str, *, skipped: bool) -> None:
+        """Says nothing."""
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        """Says nothing."""
+
+    def end(self, step: str, summary: str) -> None:
+        """Says nothing."""
+
+
+Value = TypeVar("Value")
+
+
+class Steps:
+    """Runs the steps of one capture.
+
+    Args:
+        capture: the capture's folder; results go to ``work`` in it.
+        listener: is told of them.
+    """
+
+    def __init__(self, capture: Path, listener: Listener) -> None:
+        self._folder = capture / FOLDER
+        self._listener = listener
+        self._keys: dict[str, str] = {}
+        self.skipped: list[str] = []
+
+    def key(self, step: str) -> str:
+        """The key of a step that was run."""
+        return self._keys[step]
+
+    def run(
+        self,
+        step: str,
+        inputs: Mapping[str, object],
+        compute: Callable[[], Value],
+        *,
+        pack: Callable[[Value], Stored],
+        unpack: Callable[[Stored], Value],
+        summary: Callable[[Value], str],
+        after: tuple[str, ...] = (),
+    ) -> Value:
+        """The result of a step, from the disk when its inputs are the same.
+
+        Args:
+            step: its name.
+            inputs: what it depends on beside other steps, as JSON can hold it.
+            compute: makes the result.
+            pack: the result as numbers and arrays.
+            unpack: the reverse.
+            summary: the result in one line.
+            after: steps whose results it uses.
+
+        Raises:
+            StorageError: the result cannot be written.
+        """
+        described = {"version": VERSION, "step": step, "inputs": inputs, "after": [self._keys[name] for name in after]}
+        key = hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()
+        self._keys[step] = key
+        stored = self._read(step, key)
+        self._listener.begin(step, skipped=stored is not None)
+        if stored is not None:
+            self.skipped.append(step)
+            value = unpack(stored)
+        else:
+            value = compute()
+            self._write(step, key, pack(value))
+        self._listener.end(step, summary(value))
+        return value
+
+    def _read(self, step: str, key: str) -> Stored | None:
+        try:
+            content = json.loads((self._folder / f"{step}.json").read_text())
+            if content["key"] != key:
+                return None
+            with np.load(self._folder / f"{step}.npz", allow_pickle=False) as file:
+                return Stored(content["values"], {name: file[name] for name in file.files})
+        except (OSError, ValueError, KeyError, TypeError, EOFError):
+            return None  # missing or cut: the step is done again
+
+    def _write(self, step: str, key: str, stored: Stored) -> None:
+        numbers, arrays = self._folder / f"{step}.json", self._folder / f"{step}.npz"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            numbers.unlink(missing_ok=True)
+            part = arrays.with_suffix(".part")
+            with part.open("wb") as file:
+                np.savez_compressed(file, **stored.arrays)  # pyright: ignore[reportArgumentType]
+            os.replace(part, arrays)
+            part.write_text(json.dumps({"key": key, "values": stored.values}, indent=1) + "\n")
+            os.replace(part, numbers)
+        except OSError as error:
+            raise StorageError(
+                f"The result of step {step!r} cannot be written to {self._folder} ({error.strerror}); make room, and "
+                "run the command again: it goes on from there."
+            ) from None
+
+
+def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
+    """What tells that files are the same without reading them: name, file, size and time of change of each."""
+    found = []
+    for name, path in files.items():
+        inside = sorted(path.iterdir()) if path.is_dir() else [path]
+        for file in inside:
+            status = file.stat()
+            found.append((name, file.name, status.st_size, status.st_mtime_ns))
+    return found

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands prepare and board, as a user types them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rooms import write_room
+from structgstream.cli.app import main
+
+
+def test_prepare_then_check_and_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_room(tmp_path / "videos")
+    out = tmp_path / "out"
+    command = ["prepare", str(tmp_path / "videos"), "-o", str(out), "--synchronize", "none", "--held-out", "cam02"]
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert "calibrate    cameras.json: 5 cameras" in told
+    assert "found nothing that would spoil a stream" in told
+    file = out / "capture.json"
+    content = json.loads(file.read_text())
+    assert content["held_out"] == ["cam02"]
+    for entry in content["cameras"].values():
+        entry["viewmat"] = [[entry["viewmat"][j][i] for j in range(3)] + [0.1] for i in range(3)] + [[0, 0, 0, 1]]
+    file.write_text(json.dumps(content))
+    assert main(["prepare", "--check", str(out), "--report", str(tmp_path / "report")]) == 1
+    assert (tmp_path / "report" / "index.html").is_file()
+    assert "structgstream: " in capsys.readouterr().err
+
+
+def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["prepare", str(tmp_path)]) == 2
+    assert "-o CAPTURE" in capsys.readouterr().err
+    assert main(["prepare", str(tmp_path), "-o", str(tmp_path / "out"), "--size", "720p"]) == 2
+    assert "WIDTHxHEIGHT" in capsys.readouterr().err
+    assert main(["prepare", "--check", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    capsys.readouterr()
+    assert main(["prepare", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
+    assert "is missing; give the folder" in capsys.readouterr().err
+
+
+def test_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["board", "-o", str(tmp_path / "new" / "board.pdf"), "--paper", "A4", "--square", "30mm"]) == 0
+    assert (tmp_path / "new" / "board.pdf").read_bytes().startswith(b"%PDF")
+    assert "--calibration board --board 7x5:30mm" in capsys.readouterr().out
+    assert main(["board", "-o", str(tmp_path / "board.pdf"), "--squares", "5x5"]) == 2

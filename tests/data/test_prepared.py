@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from captures import HEIGHT, WIDTH, all_numbers, numbers, picture, small_rig, write_picture, write_video, write_videos
+from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
+from structgstream.data.open import open_capture
+from structgstream.data.prepared import (
+    FILE,
+    PreparedCamera,
+    PreparedCapture,
+    open_prepared,
+    read_prepared,
+    write_prepared,
+)
+from structgstream.data.timeline import Clock
+from structgstream.data.tone import ToneCurve
+from structgstream.data.undistortion import rectilinear
+from structgstream.errors import CalibrationError, CaptureError, StorageError
+
+LENSES = (Pinhole(), RadialTangential(k1=-0.1, k2=0.02, p1=0.001), Fisheye(k1=0.02), Pinhole())
+
+
+def content(
+    *, suffix: str = ".mp4", folder: str = "videos", lenses: tuple[Any, ...] = (Pinhole(),) * 4
+) -> PreparedCapture:
+    cameras = {}
+    for (name, camera), lens in zip(small_rig().cameras.items(), lenses, strict=True):
+        filmed = LensCamera(camera, lens)
+        cameras[name] = PreparedCamera(f"{folder}/{name}{suffix}", filmed, rectilinear(filmed))
+    return PreparedCapture(cameras, 30.0, 0.25, "metres", frozenset({"cam01"}))
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    values = json.loads((path / FILE).read_text())
+    change(values)
+    (path / FILE).write_text(json.dumps(values))
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    wanted = content(lenses=LENSES)
+    first = wanted.cameras["cam00"]
+    curve = ToneCurve(tuple(tuple(np.linspace(0.02 * k, 1, 8)) for k in range(3)))
+    cameras = {**wanted.cameras, "cam00": replace(first, clock=Clock(-1.25, 1.00001), tone=curve)}
+    wanted = replace(wanted, cameras=cameras, points="points.npy")
+    write_prepared(tmp_path, wanted)
+    found = read_prepared(tmp_path)
+    assert (found.fps, found.near, found.unit, found.held_out) == (30.0, 0.25, "metres", frozenset({"cam01"}))
+    assert found.points == "points.npy"
+    for name, camera in wanted.cameras.items():
+        read = found.cameras[name]
+        assert (read.files, read.clock, read.tone, read.filmed.lens) == (
+            camera.files, camera.clock, camera.tone, camera.filmed.lens,
+        )  # fmt: skip
+        for one, other in ((read.filmed.camera, camera.filmed.camera), (read.pinhole, camera.pinhole)):
+            assert torch.equal(one.K, other.K)
+            assert torch.equal(one.viewmat, other.viewmat)
+            assert (one.width, one.height) == (other.width, other.height)
+
+
+def test_videos_are_opened_in_step(tmp_path: Path) -> None:
+    """Camera 2 started two frames late by its own clock, which counts from its own start."""
+    capture = content()
+    write_videos(tmp_path / "videos", list(capture.cameras), frames=6)
+    cameras = dict(capture.cameras)
+    cameras["cam02"] = replace(cameras["cam02"], clock=Clock(-2 / 30))
+    write_prepared(tmp_path, replace(capture, cameras=cameras, held_out=frozenset()))
+    source = open_capture(tmp_path)
+    frames = {frame.index: frame for frame in source.frames(0)}
+    together = [frame for frame in frames.values() if len(frame.images) == 4]
+    for frame in together:
+        carried = {name: numbers(image)[1] for name, image in frame.images.items()}
+        assert carried["cam02"] == carried["cam00"] + 2
+    assert len(together) == 4
+    assert source.rig["cam00"].near == 0.25
+
+
+def test_lenses_are_undistorted_to_the_stated_pinhole(tmp_path: Path) -> None:
+    capture = content(lenses=(RadialTangential(k1=-0.1),) * 4)
+    capture = replace(
+        capture,
+        cameras={
+            name: replace(camera, pinhole=rectilinear(camera.filmed, degrees=50.0, size=(40, 30)))
+            for name, camera in capture.cameras.items()
+        },
+    )
+    write_videos(tmp_path / "videos", list(capture.cameras), frames=2)
+    write_prepared(tmp_path, capture)
+    source = open_capture(tmp_path)
+    frame = next(source.frames(0))
+    assert {image.shape for image in frame.images.values()} == {(30, 40, 3)}
+    assert source.rig["cam03"].K[0, 0] == pytest.approx(20 / np.tan(np.radians(25)))
+    assert source.rig.testing == ("cam01",)
+
+
+def test_folders_of_pictures(tmp_path: Path) -> None:
+    capture = content(folder="pictures", suffix="")
+    for number, name in enumerate(capture.cameras):
+        for frame in range(5):
+            write_picture(tmp_path / "pictures" / name / f"{frame:03d}.png", picture(number, frame))
+    cameras = dict(capture.cameras)
+    cameras["cam01"] = replace(cameras["cam01"], clock=Clock(1 / 30))
+    write_prepared(tmp_path, replace(capture, cameras=cameras))
+    source = open_capture(tmp_path)
+    assert len(source) == 4
+    assert all_numbers(source.frames(0))[0] == [(0, 1), (1, 0), (2, 1), (3, 1)]
+
+
+def test_points_come_along_unless_another_camera_is_held_out(tmp_path: Path) -> None:
+    capture = replace(content(), points="points.npy")
+    write_videos(tmp_path / "videos", list(capture.cameras), frames=2)
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    np.save(tmp_path / "points.npy", points)
+    write_prepared(tmp_path, capture)
+    assert np.array_equal(open_capture(tmp_path).points, points)  # type: ignore[arg-type]
+    assert np.array_equal(open_capture(tmp_path, held_out=()).points, points)  # type: ignore[arg-type]
+    assert open_capture(tmp_path, held_out=("cam02",)).points is None
+    assert open_capture(tmp_path, held_out=("cam02",), scale=0.5).points is None
+
+
+def test_a_later_version_is_refused(tmp_path: Path) -> None:
+    write_prepared(tmp_path, content())
+    edit(tmp_path, lambda values: values.update(version=2))
+    with pytest.raises(CalibrationError, match=r"version 2; this program reads .*version 1: prepare the capture again"):
+        read_prepared(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda values: values["cameras"]["cam02"].pop("K"), r"Camera 'cam02' of .*capture\.json cannot be read"),
+        (lambda values: values["cameras"]["cam02"]["lens"].update(model="soft"), r"Camera 'cam02' .*soft"),
+        (lambda values: values["cameras"]["cam02"]["lens"].update(k9=1), r"Camera 'cam02' .*k9"),
+        (lambda values: values["cameras"]["cam02"].update(size=[9, 9]), r"Camera 'cam02' .*principal point"),
+        (lambda values: values.update(unit="yards"), r"capture\.json cannot be read .*yards"),
+        (lambda values: values.pop("fps"), r"capture\.json cannot be read \(.*fps"),
+    ],
+)
+def test_broken_content_names_its_camera(tmp_path: Path, change: Callable[[dict[str, Any]], object], told: str) -> None:
+    write_prepared(tmp_path, content())
+    edit(tmp_path, change)
+    with pytest.raises(CalibrationError, match=told):
+        read_prepared(tmp_path)
+
+
+def test_files_that_went_or_changed(tmp_path: Path) -> None:
+    capture = content()
+    write_prepared(tmp_path, capture)
+    with pytest.raises(CaptureError, match=r"cam00\.mp4 of camera 'cam00' is missing; restore it"):
+        open_prepared(tmp_path)
+    write_videos(tmp_path / "videos", list(capture.cameras), frames=2)
+    write_video(tmp_path / "videos" / "cam02.mp4", [picture(2, 0, width=2 * WIDTH, height=2 * HEIGHT)] * 2)
+    with pytest.raises(
+        CalibrationError, match=r"cam02\.mp4 has 128x96 pixels, the intrinsics of camera 'cam02' are for 64x48"
+    ):
+        open_prepared(tmp_path)
+
+
+def test_points_may_not_be_a_pickle(tmp_path: Path) -> None:
+    capture = replace(content(), points="points.npy")
+    write_videos(tmp_path / "videos", list(capture.cameras), frames=2)
+    np.save(tmp_path / "points.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    write_prepared(tmp_path, capture)
+    with pytest.raises(CalibrationError, match=r"points\.npy cannot be read"):
+        open_prepared(tmp_path)
+
+
+def test_nothing_is_left_where_it_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"capture\.json cannot be written"):
+        write_prepared(tmp_path / "file", content())

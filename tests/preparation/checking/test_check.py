@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mistakes made in a rig whose truth is known, and what the check says of each."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from memory_captures import MemoryCapture
+from planes import room_frame, room_rig
+from structgstream.cameras import Camera, CameraRig
+from structgstream.frames import MultiViewFrame
+from structgstream.preparation.checking.check import Checked, check_capture
+
+Cameras = dict[str, Camera]
+TURNED = ("cam02", 1.0)
+
+
+@cache
+def room() -> tuple[CameraRig, MultiViewFrame]:
+    """Large enough pictures for keypoints; exposures as the cameras of ``planes`` have them."""
+    rig = room_rig(8)
+    return rig, room_frame(rig)
+
+
+def checked(change: Callable[[Cameras], object] | None = None, **known: object) -> Checked:
+    rig, frame = room()
+    cameras = dict(rig.cameras)
+    if change is not None:
+        change(cameras)
+    source = MemoryCapture(rig.mapped(cameras), [frame], **known)  # type: ignore[arg-type]
+    return check_capture(source, unit="metres")
+
+
+def errors(check: Checked) -> list[str]:
+    return [finding.sentence for finding in check.report.errors]
+
+
+def turned(camera: Camera, degrees: float) -> Camera:
+    angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 0] = turn[2, 2] = angle.cos()
+    turn[0, 2], turn[2, 0] = angle.sin(), -angle.sin()
+    return replace(camera, viewmat=turn @ camera.viewmat)
+
+
+def moved(camera: Camera, factor: float) -> Camera:
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] *= factor
+    return replace(camera, viewmat=viewmat)
+
+
+def scaled(camera: Camera, factor: float) -> Camera:
+    return replace(camera, K=camera.K * torch.tensor([[factor], [factor], [1.0]], dtype=torch.float64))
+
+
+def test_a_good_rig_is_fine() -> None:
+    check = checked()
+    assert not errors(check)
+    report = check.report
+    assert report.median_epipolar_pixels is not None
+    assert report.median_epipolar_pixels < 0.5
+    assert report.coverage.points > 50
+    assert report.coverage.seen_by_three > 0.9
+    assert report.nearest is not None
+    assert 1.5 < report.nearest < 2.6  # the board stands 2.5 in front of the cameras
+    for camera in report.cameras.values():
+        assert camera.reprojection_pixels is not None
+        assert camera.reprojection_pixels < 0.7
+        assert camera.overlaps >= 3
+
+
+def test_the_camera_that_was_turned_is_named() -> None:
+    def bump(cameras: Cameras) -> None:
+        cameras["cam02"] = turned(cameras["cam02"], 1.5)
+
+    check = checked(bump)
+    (found,) = check.report.errors
+    assert found.cameras == ("cam02",)
+    assert "Camera 'cam02' is off" in found.sentence
+    degrees = float(found.sentence.split("place it ")[1].split(" degrees")[0])
+    assert degrees == pytest.approx(1.5, abs=0.35)
+    assert check.report.cameras["cam02"].reprojection_pixels > 2  # type: ignore[operator]
+
+
+def test_exchanged_names_are_told() -> None:
+    def swap(cameras: Cameras) -> None:
+        cameras["cam01"], cameras["cam05"] = cameras["cam05"], cameras["cam01"]
+
+    (found,) = checked(swap).report.errors
+    assert set(found.cameras) == {"cam01", "cam05"}
+    assert "are exchanged" in found.sentence
+
+
+def inverted(cameras: Cameras) -> None:
+    for name, camera in cameras.items():
+        cameras[name] = replace(camera, viewmat=torch.linalg.inv(camera.viewmat))
+
+
+def flipped(cameras: Cameras) -> None:
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    for name, camera in cameras.items():
+        cameras[name] = replace(camera, viewmat=flip @ camera.viewmat)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"), [(inverted, "camera to world in place of world to camera"), (flipped, "OpenGL axes")]
+)
+def test_a_convention_of_all_poses_is_told(change: Callable[[Cameras], None], told: str) -> None:
+    (sentence,) = errors(checked(change))
+    assert told in sentence
+    assert "all cameras" in sentence
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda camera: replace(camera, viewmat=torch.linalg.inv(camera.viewmat)), "inverted"),
+        (lambda camera: moved(camera, 1000.0), "millimetres among metres"),
+        (lambda camera: scaled(camera, 0.5), "intrinsics of a picture of 80x60 pixels, its pictures have 160x120"),
+    ],
+)
+def test_a_mistake_of_one_camera_is_told(change: Callable[[Camera], Camera], told: str) -> None:
+    def mistake(cameras: Cameras) -> None:
+        cameras["cam03"] = change(cameras["cam03"])
+
+    found = checked(mistake).report.errors
+    assert [finding.cameras for finding in found] == [("cam03",)]
+    assert told in found[0].sentence
+
+
+def test_a_near_plane_behind_the_scene_is_told() -> None:
+    def far(cameras: Cameras) -> None:
+        for name, camera in cameras.items():
+            cameras[name] = replace(camera, near=300.0)
+
+    (sentence,) = errors(checked(far))
+    assert "beyond 100% of the points" in sentence
+    assert "different units" in sentence
+
+
+def test_positions_in_millimetres_are_told() -> None:
+    def large(cameras: Cameras) -> None:
+        for name, camera in cameras.items():
+            cameras[name] = replace(moved(camera, 1000.0), near=300.0)
+
+    (sentence,) = errors(checked(large))
+    assert "millimetres" in sentence
+
+
+def test_points_of_another_unit_are_told() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.5, -0.4, 0.3], [0.5, 0.6, 1.5], (200, 3))
+    assert not errors(checked(points=points))
+    (sentence,) = errors(checked(points=1000 * points))
+    assert "1000 times too large (millimetres among metres)" in sentence
+
+
+def test_exposure_is_measured() -> None:
+    """Cameras of ``planes`` have gains of sRGB values; halving one in linear light is a stop."""
+    rig, frame = room()
+    half = frame.images["cam04"].astype(float) / 255
+    linear = np.where(half <= 0.04045, half / 12.92, ((half + 0.055) / 1.055) ** 2.4) / 2
+    dark = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    images = {**frame.images, "cam04": (255 * dark).round().astype(np.uint8)}
+    before = checked().report.cameras["cam04"].exposure_stops
+    after = check_capture(MemoryCapture(rig, [replace(frame, images=images)])).report
+    assert before is not None
+    assert after.cameras["cam04"].exposure_stops == pytest.approx(before - 1, abs=0.15)
+    assert any("Exposure differs" in finding.sentence and "'cam04'" in finding.sentence for finding in after.findings)
+
+
+def test_a_camera_that_was_bumped_in_between_is_told() -> None:
+    rig, frame = room()
+    shifted = {**frame.images, "cam06": np.roll(frame.images["cam06"], (5, 9), axis=(0, 1))}
+    source = MemoryCapture(rig, [frame, replace(frame, index=1, images=shifted)])
+    (found,) = check_capture(source).report.errors
+    assert found.cameras == ("cam06",)
+    shift = float(found.sentence.split("shifted by ")[1].split(" pixels")[0])
+    assert shift == pytest.approx(np.hypot(5, 9), abs=0.5)
+
+
+def test_cameras_without_overlap_are_told() -> None:
+    rig, frame = room()
+    blind = {name: room_frame(rig, textured=False).images[name] for name in ("cam00", "cam01")}
+    check = check_capture(MemoryCapture(rig, [replace(frame, images={**frame.images, **blind})]))
+    apart = [finding for finding in check.report.findings if "have no matches" in finding.sentence]
+    assert {name for finding in apart for name in finding.cameras} == {"cam00", "cam01"}
+    nothing = check_capture(MemoryCapture(rig, [room_frame(rig, textured=False)]))
+    assert "enough matches to check their poses" in nothing.report.findings[0].sentence
+
+
+def test_an_absent_camera_is_left_out() -> None:
+    rig, frame = room()
+    images = {name: image for name, image in frame.images.items() if name != "cam07"}
+    report = check_capture(MemoryCapture(rig, [replace(frame, images=images)])).report
+    assert not report.errors
+    assert report.cameras["cam07"].points == 0
+    assert report.cameras["cam07"].reprojection_pixels is None

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from captures import numbers, picture, write_picture, write_video, write_videos
+from structgstream.errors import CaptureError
+from structgstream.preparation.footage import find_footage
+
+
+def test_videos_in_natural_order(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["cam10", "cam2", "cam1"], frames=5)
+    footage = find_footage(tmp_path)
+    assert footage.cameras == ("cam1", "cam2", "cam10")
+    assert footage.size("cam2") == (64, 48)
+    assert footage.fps == 30.0
+    assert footage.stamps("cam2") == pytest.approx(np.arange(5) / 30)
+    assert footage.audio("cam1") is None
+
+
+def test_chosen_pictures_of_a_long_video(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [picture(1, frame % 200) for frame in range(200)])
+    footage = find_footage(tmp_path)
+    wanted = [0, 1, 7, 90, 91, 199]
+    assert [numbers(image)[1] for image in footage.pictures("a", wanted)] == wanted
+
+
+@pytest.mark.parametrize("below", ["", "videos"])
+def test_a_folder_per_camera_with_its_video(tmp_path: Path, below: str) -> None:
+    for number, name in enumerate(("left", "right")):
+        write_video(tmp_path / below / name / f"GX0100{number}.mp4", [picture(number, 0)] * 2)
+    (tmp_path / "masks").mkdir()
+    footage = find_footage(tmp_path)
+    assert footage.cameras == ("left", "right")
+    assert footage.path("right").name == "GX01001.mp4"
+
+
+def test_folders_of_pictures_and_single_pictures(tmp_path: Path) -> None:
+    for frame in range(3):
+        write_picture(tmp_path / "many" / "images" / "a" / f"{frame}.png", picture(1, frame))
+        write_picture(tmp_path / "one" / f"cam{frame}.png", picture(frame, 0))
+    many = find_footage(tmp_path / "many", picture_fps=25)
+    assert many.stamps("a") == pytest.approx([0, 0.04, 0.08])
+    assert [numbers(image)[1] for image in many.pictures("a", [0, 2])] == [0, 2]
+    one = find_footage(tmp_path / "one")
+    assert one.cameras == ("cam0", "cam1", "cam2")
+    assert one.stamps("cam1").tolist() == [0.0]
+    assert one.only(["cam2", "cam0"]).cameras == ("cam0", "cam2")
+
+
+def write_sound(path: Path, *, delay_seconds: float) -> None:
+    """A click at second 0.2 of the pictures' clock; the sound begins late."""
+    with av.open(str(path), "w") as container:
+        video = container.add_stream("libx264", rate=30)
+        video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
+        sound = container.add_stream("pcm_s16le", rate=48_000)
+        for number in range(30):
+            frame = av.VideoFrame.from_ndarray(picture(0, number), format="rgb24")
+            frame.pts = number
+            container.mux(video.encode(frame))
+        container.mux(video.encode())
+        samples = np.zeros((1, 24_000), np.int16)
+        samples[0, round((0.2 - delay_seconds) * 48_000)] = 30_000
+        audio = av.AudioFrame.from_ndarray(samples, format="s16", layout="mono")
+        audio.sample_rate, audio.pts = 48_000, round(delay_seconds * 48_000)
+        container.mux(sound.encode(audio))
+        container.mux(sound.encode())
+
+
+@pytest.mark.parametrize("delay_seconds", [0.0, 0.1])
+def test_sound_is_on_the_pictures_clock(tmp_path: Path, delay_seconds: float) -> None:
+    write_sound(tmp_path / "a.mkv", delay_seconds=delay_seconds)
+    found = find_footage(tmp_path).audio("a")
+    assert found is not None
+    samples, rate = found
+    assert np.abs(samples).argmax() / rate == pytest.approx(0.2, abs=0.002)
+
+
+def test_what_is_no_footage_is_told(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"is missing; give the folder that holds the cameras' videos"):
+        find_footage(tmp_path / "nowhere")
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(CaptureError, match=r"holds no videos and no pictures, but notes\.txt; expected CAMERA\.mp4"):
+        find_footage(tmp_path)
+    with pytest.raises(CaptureError, match="is a file"):
+        find_footage(tmp_path / "notes.txt")
+
+
+def test_ambiguous_files_are_told(tmp_path: Path) -> None:
+    write_videos(tmp_path / "twice", ["a"], frames=2)
+    write_videos(tmp_path / "twice" / "a", ["b"], frames=2)
+    with pytest.raises(CaptureError, match=r"b\.mp4 and a\.mp4 in .* are both of camera 'a'|a\.mp4 and b\.mp4"):
+        find_footage(tmp_path / "twice")
+    write_videos(tmp_path / "chapters" / "left", ["GX01", "GX02"], frames=2)
+    with pytest.raises(CaptureError, match=r"camera 'left' holds 2 videos .*join the chapters"):
+        find_footage(tmp_path / "chapters")
+
+
+def test_a_damaged_video_names_its_camera(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [picture(0, frame) for frame in range(40)])
+    file = tmp_path / "a.mp4"
+    data = bytearray(file.read_bytes())
+    begin = data.index(b"mdat") + 4
+    data[begin + (len(data) - begin) // 3 :] = bytes(len(data) - begin - (len(data) - begin) // 3)
+    footage = find_footage(tmp_path)
+    file.write_bytes(bytes(data))
+    with pytest.raises(CaptureError, match=r"a\.mp4 of camera 'a' cannot be decoded .*--without a"):
+        list(footage.pictures("a", range(40)))

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+from pathlib import Path
+
+import pytest
+
+from structgstream.errors import StorageError
+from structgstream.preparation.linking import bring
+
+
+def test_each_kind_of_link(tmp_path: Path) -> None:
+    source = tmp_path / "a.mp4"
+    source.write_text("film")
+    bring(source, tmp_path / "hard" / "a.mp4", link="hard")
+    bring(source, tmp_path / "soft" / "a.mp4", link="symlink")
+    bring(source, tmp_path / "copy" / "a.mp4", link="copy")
+    assert (tmp_path / "hard" / "a.mp4").samefile(source)
+    assert (tmp_path / "soft" / "a.mp4").is_symlink()
+    assert (tmp_path / "copy" / "a.mp4").read_text() == "film"
+    assert not (tmp_path / "copy" / "a.mp4").samefile(source)
+
+
+def test_what_is_there_stays_and_what_changed_is_renewed(tmp_path: Path) -> None:
+    source, target = tmp_path / "a.mp4", tmp_path / "copy" / "a.mp4"
+    source.write_text("film")
+    bring(source, target, link="copy")
+    inode = target.stat().st_ino
+    bring(source, target, link="copy")
+    assert target.stat().st_ino == inode
+    source.write_text("another film")
+    bring(source, target, link="copy")
+    assert target.read_text() == "another film"
+    bring(source, target, link="hard")
+    assert target.read_text() == "another film"
+
+
+def test_a_link_that_cannot_be_made_is_a_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(source: Path, target: Path) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", refused)
+    (tmp_path / "a").write_text("film")
+    bring(tmp_path / "a", tmp_path / "b" / "a", link="hard")
+    assert (tmp_path / "b" / "a").read_text() == "film"
+
+
+def test_folders_come_file_by_file(tmp_path: Path) -> None:
+    (tmp_path / "cam").mkdir()
+    for number in range(3):
+        (tmp_path / "cam" / f"{number}.png").write_text(str(number))
+    bring(tmp_path / "cam", tmp_path / "out" / "cam", link="hard")
+    assert sorted(file.name for file in (tmp_path / "out" / "cam").iterdir()) == ["0.png", "1.png", "2.png"]
+
+
+def test_no_room_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("film")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"cannot be brought to .*--link symlink"):
+        bring(tmp_path / "a", tmp_path / "file" / "a", link="hard")

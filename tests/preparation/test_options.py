@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+
+from structgstream.errors import ConfigError
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.options import board_text, parse_board, parse_distance, parse_length, parse_size
+
+
+def test_lengths() -> None:
+    assert [parse_length(text) for text in ("3.2m", "320cm", "3200 mm", "3.2")] == pytest.approx([3.2] * 4)
+    assert parse_length("10ft") == pytest.approx(3.048)
+    for wrong in ("", "m", "-1m", "0m", "3 parsec"):
+        with pytest.raises(ConfigError, match="positive number with its unit"):
+            parse_length(wrong)
+
+
+def test_distances_and_sizes() -> None:
+    assert parse_distance("a", "b", "50mm").metres == pytest.approx(0.05)
+    with pytest.raises(ConfigError, match="'a' twice"):
+        parse_distance("a", "a", "1m")
+    assert parse_size("1280x720") == (1280, 720)
+    with pytest.raises(ConfigError, match="WIDTHxHEIGHT"):
+        parse_size("720p")
+
+
+@pytest.mark.parametrize("board", [Board(), Board(9, 6, 0.08), Board(6, 4, 0.1, dictionary="DICT_4X4_50")])
+def test_a_board_is_named_and_read(board: Board) -> None:
+    assert parse_board(board_text(board)) == board
+
+
+def test_what_names_no_board() -> None:
+    with pytest.raises(ConfigError, match="COLUMNSxROWS:SQUARE"):
+        parse_board("7x5")

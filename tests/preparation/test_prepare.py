@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From videos with a calibration to a capture: steps, resuming, and what is refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from captures import write_videos
+from rooms import write_room
+from structgstream.data.open import open_capture
+from structgstream.data.prepared import read_prepared
+from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.prepare import prepare_capture
+
+OPTIONS = PrepareOptions(synchronize="none")
+
+
+def test_a_capture_is_made_once_and_only_what_changed_again(tmp_path: Path) -> None:
+    rig = write_room(tmp_path / "videos")
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+    assert made.skipped == ()
+    assert not [finding for finding in made.findings if finding.severity == "error"]
+    assert made.report.is_file()
+    source = open_capture(tmp_path / "out")
+    assert (len(source), source.fps) == (2, 30.0)
+    assert source.points is not None
+    for name in rig:
+        assert torch.equal(source.rig[name].viewmat, rig[name].viewmat)
+        assert 0.6 < source.rig[name].near < 1.4  # the board stands 2.5 in front of the cameras
+    again = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+    assert set(again.skipped) == {"synchronize", "calibrate", "scale", "near", "points", "check"}
+    assert again.findings == made.findings
+    distance = Distance("cam00", "cam04", 2.0)
+    metres = prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, distance=distance))
+    assert set(metres.skipped) == {"synchronize", "calibrate"}
+    found = read_prepared(tmp_path / "out")
+    assert found.unit == "metres"
+    one, other = (found.cameras[name].pinhole.center for name in ("cam00", "cam04"))
+    assert float((one - other).norm()) == pytest.approx(2.0)
+
+
+def test_an_interrupted_preparation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    write_room(tmp_path / "videos", cameras=4)
+    with monkeypatch.context() as patched:
+        patched.setattr("structgstream.preparation.capture_steps.initial_points", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+    assert len(open_capture(tmp_path / "out")) == 2
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+    assert "near" in made.skipped
+    assert "points" not in made.skipped
+
+
+def test_a_folder_of_something_else_is_not_written_into(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.txt").write_text("years of work")
+    with pytest.raises(CaptureError, match="not empty and was not made by prepare"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["thesis.txt"]
+    (tmp_path / "other" / "work").mkdir(parents=True)
+    (tmp_path / "other" / "work" / "source.json").write_text(json.dumps({"videos": "/elsewhere"}))
+    with pytest.raises(CaptureError, match="was prepared from /elsewhere, not from"):
+        prepare_capture(tmp_path / "videos", tmp_path / "other", options=OPTIONS)
+    with pytest.raises(CaptureError, match="folder of the videos itself"):
+        prepare_capture(tmp_path / "videos", tmp_path / "videos", options=OPTIONS)
+
+
+def test_two_cameras_are_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path / "videos", ["left", "right"], frames=2)
+    with pytest.raises(CalibrationError, match="cameras 'left', 'right' alone; a capture needs 3 or more"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_of_another_size_is_refused(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos")
+    file = tmp_path / "videos" / "cameras.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps(content | {"width": 200, "height": 100}))
+    with pytest.raises(CalibrationError, match=r"camera 'cam00' have 160x120 pixels, .*cameras\.json is for 200x100"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+
+
+def test_a_pickle_is_refused(tmp_path: Path) -> None:
+    write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
+    (tmp_path / "videos" / "calibration.pkl").write_bytes(b"\x80\x04.")
+    with pytest.raises(CalibrationError, match=r"calibration\.pkl is a pickle, .* refused"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (PrepareOptions(synchronize="none", without=("cam9",)), "no camera 'cam9' to leave out"),
+        (PrepareOptions(synchronize="none", held_out=("cam9",)), "camera 'cam9' to hold out is not there"),
+    ],
+)
+def test_options_of_cameras_that_are_not_there(tmp_path: Path, options: PrepareOptions, told: str) -> None:
+    write_room(tmp_path / "videos", cameras=4)
+    with pytest.raises(ConfigError, match=told):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
+
+
+def test_a_calibration_that_is_not_there(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos", cameras=4)
+    with pytest.raises(CalibrationError, match="does not exist"):
+        prepare_capture(
+            tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, calibration=tmp_path / "nowhere.toml")
+        )

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from structgstream.errors import StorageError
+from structgstream.preparation.steps import FOLDER, Silent, Steps, Stored, fingerprint
+
+
+def run(steps: Steps, step: str, value: int, done: list[str], *, after: tuple[str, ...] = ()) -> int:
+    def compute() -> int:
+        done.append(step)
+        return value
+
+    return steps.run(
+        step,
+        {"value": value},
+        compute,
+        pack=lambda found: Stored({"found": found}, {"row": np.arange(found)}),
+        unpack=lambda stored: int(stored.values["found"] + 0 * len(stored.arrays["row"])),
+        summary=str,
+        after=after,
+    )
+
+
+def test_a_step_is_done_once(tmp_path: Path) -> None:
+    done: list[str] = []
+    steps = Steps(tmp_path, Silent())
+    for _ in range(2):
+        steps = Steps(tmp_path, Silent())
+        assert run(steps, "a", 3, done) == 3
+        assert run(steps, "b", 4, done, after=("a",)) == 4
+    assert done == ["a", "b"]
+    assert steps.skipped == ["a", "b"]
+
+
+def test_a_change_does_what_depends_on_it_again(tmp_path: Path) -> None:
+    done: list[str] = []
+    for value in (3, 5):
+        steps = Steps(tmp_path, Silent())
+        run(steps, "a", value, done)
+        run(steps, "b", 4, done, after=("a",))
+        run(steps, "c", 7, done)
+    assert done == ["a", "b", "c", "a", "b"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: (folder / "a.json").write_text("{"),
+        lambda folder: (folder / "a.npz").write_bytes(b"PK"),
+        lambda folder: (folder / "a.npz").unlink(),
+        lambda folder: (folder / "a.json").unlink(),
+    ],
+)
+def test_what_was_cut_is_done_again(tmp_path: Path, damage: Callable[[Path], object]) -> None:
+    done: list[str] = []
+    run(Steps(tmp_path, Silent()), "a", 3, done)
+    damage(tmp_path / FOLDER)
+    assert run(Steps(tmp_path, Silent()), "a", 3, done) == 3
+    assert done == ["a", "a"]
+
+
+def test_an_interruption_leaves_no_result(tmp_path: Path) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Steps(tmp_path, Silent()).run(
+            "a", {}, interrupted, pack=lambda _: Stored(), unpack=lambda _: 0, summary=lambda _: ""
+        )
+    assert not list(tmp_path.rglob("a.*"))
+
+
+def test_a_full_disk_is_told(tmp_path: Path) -> None:
+    (tmp_path / FOLDER).write_text("")
+    with pytest.raises(StorageError, match=r"step 'a' cannot be written .* it goes on from there"):
+        run(Steps(tmp_path, Silent()), "a", 1, [])
+
+
+def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("one")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "c").write_text("two")
+    files = {"a": tmp_path / "a", "b": tmp_path / "b"}
+    before = fingerprint(files)
+    assert fingerprint(files) == before
+    (tmp_path / "b" / "c").write_text("three")
+    assert fingerprint(files) != before
