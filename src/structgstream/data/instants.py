@@ -76,6 +76,19 @@ def measured_rate(seconds: Sequence[Floats]) -> float | None:
 
     It is robust to missing frames and exact for usual rates. Of different rates it is the lowest.
     """
+    rate = counted_rate(seconds)
+    if rate is None:
+        return None
+    usual = min(STANDARD_RATES, key=lambda standard: abs(standard - rate))
+    return usual if abs(usual / rate - 1) < 3e-4 else rate
+
+
+def counted_rate(seconds: Sequence[Floats]) -> float | None:
+    """As :func:`measured_rate`, but what is close to a usual rate is not taken for it.
+
+    Frames are counted over the whole take: the median of steps that jitter is not their mean, and instants at such a
+    rate would leave the frames.
+    """
     rates = []
     for own in seconds:
         if len(own) < 2:
@@ -89,8 +102,7 @@ def measured_rate(seconds: Sequence[Floats]) -> float | None:
     rate = float(np.median(rates))
     if any(abs(other / rate - 1) > SAME_RATE for other in rates):
         rate = float(np.median([other for other in rates if other / min(rates) - 1 <= SAME_RATE]))
-    usual = min(STANDARD_RATES, key=lambda standard: abs(standard - rate))
-    return usual if abs(usual / rate - 1) < 3e-4 else rate
+    return rate
 
 
 def tell_time_error(placed: Mapping[str, Placed], slots: range, *, fps: float, where: str) -> None:

@@ -63,3 +63,17 @@ def test_videos_shorter_than_the_offset() -> None:
     message = r"'cam0' \(3.97 s\) and 'cam1' \(3.97 s\) have no instant in common: .* 9.00 s apart"
     with pytest.raises(CaptureError, match=message):
         result(0.0, 9.0)
+
+
+@pytest.mark.parametrize("rate", [30.0, 30.005, 24.0])
+def test_jitter_is_not_taken_for_another_rate(rate: float) -> None:
+    """Steps of jittered stamps have a median that is not their mean; the instants must not leave the frames."""
+    random = np.random.default_rng(7)
+    jitter = 4e-3
+    common = {
+        name: (np.arange(1800) + offset) / rate + jitter * (random.beta(0.4, 1.6, 1800) - 0.2)
+        for name, offset in (("a", 0), ("b", 3), ("c", -2))
+    }
+    medians = [float(np.median(np.diff(times))) * rate for times in common.values()]
+    assert max(abs(median - 1) for median in medians) * 1800 / rate > 2 * jitter  # the median would drift that far
+    assert all(abs(late) < 1.5 * jitter for late in frame_residuals(common).values())

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.instants import counted_rate
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.streams import period_seconds
@@ -75,15 +76,14 @@ def synchronization(
         worst = max(late, key=lambda name: abs(left[name]))
         warnings += (
             f"Nearest frames of {_listed(late)} are up to {abs(left[worst]) * 1e3:.1f} ms off the common instants "
-            "(camera "
-            f"{worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal have no such rest.",
+            f"(camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal have no "
+            "such rest.",
         )
     vague = [name for name in stamps if uncertainties[name] > period_seconds(stamps[name]) / 4]
     if vague:
         warnings += (
             f"The clocks of {_listed(vague)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
-            "only, so "
-            "a frame may be wrong by one.",
+            "only, so a frame may be wrong by one.",
         )
     return Synchronization(estimates, method, reason, warnings)
 
@@ -93,10 +93,9 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
 
     Args:
         common: camera to the common seconds ``[T]`` of its frames. The instants have the rate of the slowest camera
-        and the
-            phase that suits all cameras best.
+            and the phase that suits all cameras best.
     """
-    period = max(period_seconds(times) for times in common.values())
+    period = 1 / (counted_rate(list(common.values())) or 30.0)  # one frame a camera: any rate is right
     start = max(times[0] for times in common.values())
     end = min(times[-1] for times in common.values())
     turns = [np.exp(2j * np.pi * _inside(times, start, end) / period).mean() for times in common.values()]
@@ -126,10 +125,8 @@ def _demand_overlap(common: Mapping[str, Floats]) -> None:
         if one[-1] < other[0] or other[-1] < one[0]:
             raise CaptureError(
                 f"Cameras {first!r} ({one[-1] - one[0]:.2f} s) and {second!r} ({other[-1] - other[0]:.2f} s) have "
-                "no instant in "
-                f"common: their clocks are {abs(one[0] - other[0]):.2f} s apart, more than the shorter video is "
-                "long. Give videos "
-                "of one take, all running before it begins."
+                f"no instant in common: their clocks are {abs(one[0] - other[0]):.2f} s apart, more than the shorter "
+                "video is long. Give videos of one take, all running before it begins."
             )
 
 
