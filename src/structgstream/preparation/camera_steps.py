@@ -26,7 +26,8 @@ from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
     Clocks,
-    moments_of,
+    first_clocks,
+    matched_pictures,
     refined,
     solved_by,
     synchronized,
@@ -60,26 +61,39 @@ class CameraSteps:
         return footage
 
     def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
-        cameras = None if isinstance(method, str) else from_other_tool(method, footage).cameras
+        """The clocks; by motion they may be unsure until the calibration is known."""
+
+        def find() -> Clocks:
+            if not isinstance(method, str):
+                return synchronized(footage, self.options, cameras=from_other_tool(method, footage).cameras)
+            # Pictures of a board are matched by their time, so there clocks must be known first.
+            by_itself = method == "sfm" or self.options.board_videos is not None
+            return (first_clocks if by_itself else synchronized)(footage, self.options)
+
         inputs = {
             "files": fingerprint(footage.files),
             "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
             "fps": footage.fps,
             "how": self.options.synchronize,
-            "calibration": None if isinstance(method, str) else fingerprint({"calibration": method.where}),
+            "calibration": method if isinstance(method, str) else fingerprint({"calibration": method.where}),
+            "board": self.options.board_videos is not None,
         }
-        return self._clocks("synchronize", inputs, lambda: synchronized(footage, self.options, cameras=cameras))
+        return self._clocks("synchronize", inputs, find)
 
     def synchronize_again(
         self, footage: Footage, clocks: Clocks, method: str | Calibration, solved: SolvedCalibration
     ) -> Clocks:
-        """By motion again when the calibration is known, which makes it exact."""
+        """By motion again when the calibration is known, which makes it exact.
+
+        Raises:
+            CaptureError: not even so.
+        """
         if clocks.method != "motion" or not isinstance(method, str):
             return clocks
         return self._clocks(
             "clocks",
             {},
-            lambda: synchronized(footage, self.options, cameras=solved.cameras, method="motion"),
+            lambda: synchronized(footage, self.options, cameras=solved.cameras),
             after=("scale",),
         )
 
@@ -91,7 +105,7 @@ class CameraSteps:
             after=after,
         )  # fmt: skip
 
-    def calibrate(self, footage: Footage, clocks: Mapping[str, Clock], method: str | Calibration) -> SolvedCalibration:
+    def calibrate(self, footage: Footage, clocks: Clocks, method: str | Calibration) -> SolvedCalibration:
         options = self.options
         name = method if isinstance(method, str) else method.where.name
         inputs = {
@@ -151,12 +165,13 @@ class CameraSteps:
         return found[0]
 
     def tones(
-        self, footage: Footage, clocks: Mapping[str, Clock], solved: SolvedCalibration, held_out: frozenset[str]
+        self, footage: Footage, clocks: Clocks, solved: SolvedCalibration, held_out: frozenset[str]
     ) -> dict[str, ToneCurve]:
+        """Tone curves; ``clocks`` are those of the calibration, whose pictures its observations are of."""
         curves, _ = self.steps.run(
             "tone",
             {"held_out": sorted(held_out)},
-            lambda: tone_curves(solved, moments_of(footage, clocks, self.options), held_out=sorted(held_out)),
+            lambda: tone_curves(solved, matched_pictures(footage, clocks, self.options), held_out=sorted(held_out)),
             pack=lambda found: Stored(
                 {"curves": {name: curve.controls for name, curve in found[0].items()}, "told": found[1]}
             ),
@@ -171,7 +186,7 @@ class CameraSteps:
 
 
 def _first(
-    method: str | Calibration, footage: Footage, clocks: Mapping[str, Clock], options: PrepareOptions
+    method: str | Calibration, footage: Footage, clocks: Clocks, options: PrepareOptions
 ) -> SolvedCalibration:
     if isinstance(method, str):
         return check_complete(solved_by(method, footage, clocks, options), footage)
@@ -186,6 +201,7 @@ def _packed_clocks(found: Clocks) -> Stored:
             "told": found.told,
             "late_seconds": dict(found.late_seconds),
             "uncertainty_seconds": dict(found.uncertainty_seconds),
+            "sure": found.sure,
         }
     )
 
@@ -193,7 +209,14 @@ def _packed_clocks(found: Clocks) -> Stored:
 def _unpacked_clocks(stored: Stored) -> Clocks:
     values = stored.values
     clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
-    return Clocks(clocks, values["method"], values["told"], values["late_seconds"], values["uncertainty_seconds"])
+    return Clocks(
+        clocks,
+        values["method"],
+        values["told"],
+        values["late_seconds"],
+        values["uncertainty_seconds"],
+        values["sure"],
+    )
 
 
 def _described(footage: Footage) -> str:

@@ -13,6 +13,7 @@ from structgstream.errors import CaptureError
 from structgstream.preparation.footage import Footage
 
 Picture = NDArray[np.uint8]
+STILL_PICTURES = 9
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,22 @@ def shots_of(footage: Footage, clocks: Mapping[str, Clock], seconds: Sequence[fl
         times = clock.offset_seconds + clock.rate * footage.stamps(name)
         indices = [int(np.abs(times - moment).argmin()) for moment in seconds]
         found[name] = Shots(footage, name, tuple(indices))
+    return found
+
+
+def still_pictures(footage: Footage) -> dict[str, list[Picture]]:
+    """One picture of each camera without what moves: each value is the median over pictures spread over its take.
+
+    It is of no moment, so it needs no clocks; what stands longer than half of the take remains.
+    """
+    found = {}
+    for name in footage.cameras:
+        taken = len(footage.stamps(name))
+        count = min(STILL_PICTURES, taken - 1 + taken % 2)  # an odd one, whose median is a value that was filmed
+        indices = np.unique(np.linspace(0, taken - 1, count).round().astype(int))
+        stacked = np.stack(list(footage.pictures(name, indices.tolist())))
+        stacked.partition(count // 2, axis=0)
+        found[name] = [stacked[count // 2].copy()]
     return found
 
 

@@ -14,7 +14,14 @@ from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.structure import solve_structure
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.instants import Shots, shared_seconds, shots_of, spread_moments
+from structgstream.preparation.instants import (
+    Picture,
+    Shots,
+    shared_seconds,
+    shots_of,
+    spread_moments,
+    still_pictures,
+)
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.synchronization import Method, synchronize
 from structgstream.preparation.tone import estimate_tones, sample_colors
@@ -23,6 +30,8 @@ TIMESTAMPS = "timestamps.csv"
 BOARD_SECONDS = 0.4
 """Between pictures of the board: it moves slowly, and neighbouring pictures say the same."""
 BOARD_MOMENTS = 60
+SURE_PERIODS = 0.5
+"""Standard error of a clock, in frame periods, up to which pictures of one moment can be chosen by it."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,7 @@ class Clocks:
         told: that, and what else is to be known, in words.
         late_seconds: by camera, how much later than the common instants its frames are.
         uncertainty_seconds: by camera, standard error of its time.
+        sure: whether pictures of one moment can be chosen by them.
     """
 
     clocks: Mapping[str, Clock]
@@ -42,6 +52,7 @@ class Clocks:
     told: str
     late_seconds: Mapping[str, float] = field(default_factory=dict)
     uncertainty_seconds: Mapping[str, float] = field(default_factory=dict)
+    sure: bool = True
 
 
 def synchronized(
@@ -49,7 +60,6 @@ def synchronized(
     options: PrepareOptions,
     *,
     cameras: Mapping[str, LensCamera] | None = None,
-    method: Method | None = None,
 ) -> Clocks:
     """The clocks of the cameras.
 
@@ -57,14 +67,13 @@ def synchronized(
         footage: what they filmed.
         options: ``synchronize`` says how.
         cameras: their calibration, where it is known.
-        method: in place of that of the options.
 
     Raises:
         CaptureError: they cannot be synchronised so, or have no moment in common.
         ConfigError: an unknown method.
     """
     single = all(len(footage.stamps(name)) == 1 for name in footage.cameras)
-    chosen: Method = "none" if single else method or options.synchronize
+    chosen: Method = "none" if single else options.synchronize
     table = footage.where / TIMESTAMPS
     try:
         found = synchronize(
@@ -79,17 +88,38 @@ def synchronized(
         raise CaptureError(f"{error} Cameras that one signal starts need none of this: --synchronize none.") from None
     clocks = {name: estimate.clock for name, estimate in found.clocks.items()}
     shared_seconds(footage, clocks)
-    told = f"{found.method}: {found.reason}" + "".join(f" {warning}" for warning in found.warnings)
+    told = ". ".join([f"{found.method}: {found.reason}", *found.warnings])
+    errors = {name: estimate.uncertainty_seconds for name, estimate in found.clocks.items()}
     return Clocks(
         clocks,
         found.method,
         told,
         {name: estimate.residual_seconds for name, estimate in found.clocks.items()},
-        {name: estimate.uncertainty_seconds for name, estimate in found.clocks.items()},
+        errors,
+        found.method != "motion" or max(errors.values()) <= SURE_PERIODS / footage.fps,
     )
 
 
-def solved_by(method: str, footage: Footage, clocks: Mapping[str, Clock], options: PrepareOptions) -> SolvedCalibration:
+def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
+    """The clocks of cameras whose calibration is to be found without them: by motion they may be unsure, or unknown.
+
+    Motion tells little without a calibration, and poses come from what stands still. So a failure is none here: with
+    the calibration motion is looked at again.
+
+    Raises:
+        CaptureError: by another method they cannot be synchronised.
+        ConfigError: an unknown method.
+    """
+    try:
+        return synchronized(footage, options)
+    except CaptureError as error:
+        if options.synchronize not in ("auto", "motion"):
+            raise
+        told = f"motion: not without the calibration ({str(error).split('; ')[0].split('. ')[0].rstrip('.')})"
+        return Clocks({name: Clock() for name in footage.cameras}, "motion", told, sure=False)
+
+
+def solved_by(method: str, footage: Footage, clocks: Clocks, options: PrepareOptions) -> SolvedCalibration:
     """Cameras by ``sfm`` or ``board``.
 
     Raises:
@@ -98,19 +128,19 @@ def solved_by(method: str, footage: Footage, clocks: Mapping[str, Clock], option
         MissingExtraError: pycolmap or cv2 is not installed.
     """
     if method == "sfm":
-        shots = moments_of(footage, clocks, options)
-        return solve_structure(shots, lens=options.lens or "radial", intrinsics=options.intrinsics)
+        pictures = matched_pictures(footage, clocks, options)
+        return solve_structure(pictures, lens=options.lens or "radial", intrinsics=options.intrinsics)
     if options.board_videos is not None:
         footage = board_footage(footage, options)
-        clocks = synchronized(footage, options).clocks
-    first, last = shared_seconds(footage, clocks)
+        clocks = synchronized(footage, options)
+    first, last = shared_seconds(footage, clocks.clocks)
     count = min(BOARD_MOMENTS, 1 + int((last - first) / BOARD_SECONDS))
-    shots = shots_of(footage, clocks, spread_moments(first, last, max(count, 2)))
+    shots = shots_of(footage, clocks.clocks, spread_moments(first, last, max(count, 2)))
     return solve_board(shots, options.board, lens=options.lens or "opencv")
 
 
 def refined(
-    solved: SolvedCalibration, footage: Footage, clocks: Mapping[str, Clock], options: PrepareOptions
+    solved: SolvedCalibration, footage: Footage, clocks: Clocks, options: PrepareOptions
 ) -> tuple[SolvedCalibration, str]:
     """The calibration adjusted to the pictures, and in words what that changed.
 
@@ -118,9 +148,12 @@ def refined(
         CalibrationError: too few matches agree with the calibration.
         CaptureError: pictures cannot be read.
     """
-    shots = moments_of(footage, clocks, options)
     found = refine(
-        shots, solved.cameras, free="lens" if options.lens else "focal", lens=options.lens, metres=solved.metres
+        matched_pictures(footage, clocks, options),
+        solved.cameras,
+        free="lens" if options.lens else "focal",
+        lens=options.lens,
+        metres=solved.metres,
     )
     told = (
         f"{found.held_back} matches that were kept out lie {found.before_pixels:.2f} px from their epipolar lines "
@@ -130,7 +163,7 @@ def refined(
 
 
 def tone_curves(
-    solved: SolvedCalibration, shots: Mapping[str, Shots], *, held_out: Sequence[str]
+    solved: SolvedCalibration, pictures: Mapping[str, Sequence[Picture]], *, held_out: Sequence[str]
 ) -> tuple[dict[str, ToneCurve], str]:
     """A tone curve for each camera, and in words what they change.
 
@@ -143,7 +176,7 @@ def tone_curves(
             "add --refine, or leave out --tone."
         )
     names = list(solved.cameras)
-    samples = sample_colors(shots, solved.observations, cameras=names)
+    samples = sample_colors(pictures, solved.observations, cameras=names)
     found = estimate_tones(samples, cameras=names, held_out=held_out)
     errors = found.errors
     return dict(found.curves), (
@@ -152,14 +185,19 @@ def tone_curves(
     )
 
 
-def moments_of(footage: Footage, clocks: Mapping[str, Clock], options: PrepareOptions) -> dict[str, Shots]:
-    """Pictures of the moments that structure from motion looks at.
+def matched_pictures(
+    footage: Footage, clocks: Clocks, options: PrepareOptions
+) -> Mapping[str, Shots] | Mapping[str, list[Picture]]:
+    """What structure from motion looks at: pictures of the same moments, or of what stands still while clocks are
+    unsure.
 
     Raises:
-        CaptureError: the cameras have no moment in common.
+        CaptureError: the cameras have no moment in common, or a picture cannot be read.
     """
-    first, last = shared_seconds(footage, clocks)
-    return shots_of(footage, clocks, spread_moments(first, last, options.instants))
+    if not clocks.sure:
+        return still_pictures(footage)
+    first, last = shared_seconds(footage, clocks.clocks)
+    return shots_of(footage, clocks.clocks, spread_moments(first, last, options.instants))
 
 
 def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
