@@ -161,9 +161,18 @@ def open_prepared(path: Path) -> FrameSource:
         source = synchronised(scan_videos(files), rig, where=path, fps=capture.fps, points=points, clocks=clocks)
     curves = {name: camera.tone for name, camera in capture.cameras.items() if camera.tone is not None}
     source = toned(source, curves)
-    pinholes = _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, path)
+    pinholes = prepared_rig(path, capture)
     undistorted = UndistortedSource(source, pinholes, filmed)
     return source if all(undistorted.is_unchanged(name) for name in rig) else undistorted
+
+
+def prepared_rig(path: Path, capture: PreparedCapture) -> CameraRig:
+    """The rig of the prepared capture at ``path``: what its pictures are undistorted to.
+
+    Raises:
+        CalibrationError: a camera to hold out is not there.
+    """
+    return _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, path)
 
 
 def lens_model(lens: Lens) -> str:

@@ -185,9 +185,7 @@ class CameraSteps:
         return curves
 
 
-def _first(
-    method: str | Calibration, footage: Footage, clocks: Clocks, options: PrepareOptions
-) -> SolvedCalibration:
+def _first(method: str | Calibration, footage: Footage, clocks: Clocks, options: PrepareOptions) -> SolvedCalibration:
     if isinstance(method, str):
         return check_complete(solved_by(method, footage, clocks, options), footage)
     return from_other_tool(method, footage)

@@ -3,7 +3,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,22 @@ from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import open_capture
 from structgstream.data.points import initial_points
-from structgstream.data.prepared import PreparedCamera, PreparedCapture, prepared_entries, write_prepared
+from structgstream.data.prepared import (
+    PreparedCamera,
+    PreparedCapture,
+    prepared_entries,
+    prepared_rig,
+    write_prepared,
+)
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.data.tone import ToneCurve
 from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
+from structgstream.data.wrappers import WithRig
 from structgstream.errors import ConfigError, StorageError
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.checking.check import Examination, check_capture, examine
+from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
@@ -47,7 +54,8 @@ class CaptureSteps:
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
         self.steps, self.listener, self.told = job.steps, job.listener, job.told
-        self.examination: Examination | None = None  # of frame 0, which two steps look at
+        self.examination: Examination | None = None  # which two steps look at
+        self._opened: FrameSource | None = None
 
     def bring(self, footage: Footage, content: PreparedCapture) -> None:
         self.listener.begin("bring", skipped=False)
@@ -69,7 +77,7 @@ class CaptureSteps:
             return content
 
         def measure() -> float | None:
-            self.examination = _examined(open_capture(self.capture))
+            self.examination = examine_capture(self._source(content))
             return nearest_depth(observed_depths(self.examination.tracks, self.examination.cameras))
 
         nearest = self.steps.run(
@@ -88,7 +96,7 @@ class CaptureSteps:
 
     def points(self, content: PreparedCapture) -> PreparedCapture:
         def estimate() -> NDArray[np.float64]:
-            source = open_capture(self.capture)
+            source = self._source(content)
             return initial_points(next(source.frames(0)), source.rig).positions
 
         found = self.steps.run(
@@ -112,7 +120,7 @@ class CaptureSteps:
         from structgstream.preparation.report.write import write_report
 
         def look() -> tuple[Finding, ...]:
-            source = open_capture(self.capture)
+            source = self._source(content)
             checked = check_capture(source, unit=content.unit, listener=self.listener, examination=self.examination)
             checked = replace(checked, report=replace(checked.report, steps=dict(self.told)))
             write_report(self.capture / REPORT, checked, listener=self.listener)
@@ -132,6 +140,26 @@ class CaptureSteps:
             summary=lambda findings: f"{len(findings)} findings; {REPORT}/index.html",
             after=("points",),
         )
+
+    def _source(self, content: PreparedCapture) -> FrameSource:
+        """The capture, opened once: indexing videos takes time, and what is to be said of them is said once."""
+        if self._opened is None:
+            self._opened = open_capture(self.capture)
+        points = None
+        if content.points is not None:
+            points = np.asarray(np.load(self.capture / content.points, allow_pickle=False), np.float64)
+        return _Grown(self._opened, prepared_rig(self.capture, content), points)
+
+
+@dataclass(frozen=True)
+class _Grown(WithRig):
+    """An opened capture with the near plane and the points that were found since."""
+
+    found: NDArray[np.float64] | None
+
+    @property
+    def points(self) -> NDArray[np.float64] | None:
+        return self.found
 
 
 def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
@@ -181,7 +209,3 @@ def with_tones(content: PreparedCapture, curves: Mapping[str, ToneCurve]) -> Pre
 def _described(content: PreparedCapture) -> str:
     """All that frames depend on, but for the files themselves."""
     return json.dumps(prepared_entries(content))
-
-
-def _examined(source: FrameSource) -> Examination:
-    return examine(next(source.frames(0)), source.rig.cameras)

@@ -200,3 +200,35 @@ def test_an_absent_camera_is_left_out() -> None:
     assert not report.errors
     assert report.cameras["cam07"].points == 0
     assert report.cameras["cam07"].reprojection_pixels is None
+
+
+def frames_without(absent: dict[str, set[int]], count: int) -> list[MultiViewFrame]:
+    _, frame = room()
+    return [
+        replace(
+            frame,
+            index=index,
+            images={name: image for name, image in frame.images.items() if index not in absent.get(name, set())},
+        )
+        for index in range(count)
+    ]
+
+
+def test_the_frame_that_is_looked_at_is_one_that_all_cameras_have() -> None:
+    rig, _ = room()
+    report = check_capture(MemoryCapture(rig, frames_without({"cam07": {0, 1}}, 4))).report
+    assert report.frame > 1
+    assert report.cameras["cam07"].points > 20
+    (found,) = [finding for finding in report.findings if finding.cameras == ("cam07",)]
+    assert found.severity == "warning"
+    assert "has no picture of frame 0" in found.sentence
+
+
+def test_cameras_without_a_frame_in_common_are_all_looked_at() -> None:
+    rig, _ = room()
+    report = check_capture(MemoryCapture(rig, frames_without({"cam00": {0, 1}, "cam01": {2, 3}}, 4))).report
+    assert not report.errors
+    assert all(camera.points > 20 for camera in report.cameras.values())
+    told = [finding.sentence for finding in report.findings]
+    assert any("Camera 'cam01' ends with frame" in sentence for sentence in told)
+    assert any("Camera 'cam00'" in sentence and "no picture of frame 0" in sentence for sentence in told)

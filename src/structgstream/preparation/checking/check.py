@@ -2,7 +2,7 @@
 """Checks a capture: poses, names, units, overlap, colours and times against its pictures."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +14,13 @@ from structgstream.preparation.checking.evidence import Evidence, gather, pair_e
 from structgstream.preparation.checking.explanations import explain
 from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Finding, PairCheck
 from structgstream.preparation.checking.overlap import coverage, overlap_findings, overlaps
+from structgstream.preparation.checking.presence import (
+    Presence,
+    note,
+    presence_findings,
+    stated_presence,
+    whole_frame,
+)
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
 from structgstream.preparation.checking.stillness import stillness_findings
 from structgstream.preparation.checking.suspects import Suspects, accused, acquitted, find_suspects
@@ -25,7 +32,11 @@ from structgstream.preparation.synchronization import SynchronizationCheck
 
 @dataclass(frozen=True)
 class Examination:
-    """All that was found at one instant; the pictures of a report are drawn from it."""
+    """All that was found at one instant; the pictures of a report are drawn from it.
+
+    Args:
+        presence: by camera, which frames of the capture it has a picture of.
+    """
 
     frame: MultiViewFrame
     cameras: Mapping[str, Camera]
@@ -33,6 +44,7 @@ class Examination:
     suspects: Suspects
     tracks: Tracks
     colors: Mapping[str, Color]
+    presence: Presence = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -62,6 +74,17 @@ def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination
     return Examination(frame, seen, evidence, suspects, tracks, compare_colors(evidence))
 
 
+def examine_capture(source: FrameSource) -> Examination:
+    """The examination of the first frame of a capture that all cameras have.
+
+    Raises:
+        CaptureError: a frame cannot be read.
+        MissingExtraError: cv2 is not installed.
+    """
+    presence = stated_presence(source)
+    return replace(examine(whole_frame(source, presence), source.rig.cameras), presence=presence)
+
+
 def check_capture(
     source: FrameSource,
     *,
@@ -69,13 +92,13 @@ def check_capture(
     listener: Listener | None = None,
     examination: Examination | None = None,
 ) -> Checked:
-    """Checks the first and the last frame of a capture; held-out cameras are looked at, too.
+    """Checks the first frame that all cameras have and the last; held-out cameras are looked at, too.
 
     Args:
         source: the opened capture.
         unit: of length, where it is known.
         listener: is told of the progress.
-        examination: of the first frame, where it was made already.
+        examination: of this capture, where it was made already.
 
     Raises:
         CaptureError: a frame cannot be read.
@@ -84,7 +107,8 @@ def check_capture(
     cameras = source.rig.cameras
     listener = listener or Silent()
     listener.progress(0, 3, "first frame")
-    first = examination or examine(next(source.frames(0)), cameras)
+    first = examination or examine_capture(source)
+    presence = {name: present.copy() for name, present in first.presence.items()}
     findings = explain(first.evidence, first.cameras, first.suspects, first.tracks) if first.suspects.off else []
     findings += overlap_findings(first.evidence.overlapping(), list(first.cameras))
     depths = observed_depths(first.tracks, first.cameras, off=first.suspects.off)
@@ -94,9 +118,11 @@ def check_capture(
         findings += scale_findings(depths, source.points, seen, radius=radius, unit=unit)
     findings += color_findings(first.colors)
     listener.progress(1, 3, "last frame")
-    if len(source) > 1:
-        last = next(source.frames(len(source) - 1))
-        findings += stillness_findings(first.frame.images, last.images, index=len(source) - 1)
+    if (end := len(source) - 1) > first.frame.index:
+        last = next(source.frames(end))
+        note(last, presence)
+        findings += stillness_findings(first.frame.images, last.images, frames=(first.frame.index, end))
+    findings += presence_findings(presence, source.fps)
     listener.progress(2, 3, "times")
     times = None if first.suspects.off else measure_times(source)
     findings += time_findings(times)
@@ -104,7 +130,7 @@ def check_capture(
     report = CheckReport(
         capture=source.name,
         frame=first.frame.index,
-        cameras=_camera_checks(first, source, times),
+        cameras=_camera_checks(first, source, times, presence),
         pairs=_pair_checks(first),
         coverage=coverage(_solid_points(first.tracks), first.cameras),
         findings=tuple(sorted(findings, key=lambda finding: finding.severity)),
@@ -137,7 +163,7 @@ def _solid_points(tracks: Tracks) -> np.ndarray:
 
 
 def _camera_checks(
-    examined: Examination, source: FrameSource, times: SynchronizationCheck | None
+    examined: Examination, source: FrameSource, times: SynchronizationCheck | None, presence: Presence
 ) -> dict[str, CameraCheck]:
     tracks, views = examined.tracks, examined.tracks.views
     counts = overlaps(examined.evidence.overlapping(), list(examined.cameras))
@@ -159,6 +185,7 @@ def _camera_checks(
             offset_uncertainty_ms=None
             if times is None or name not in times.late_seconds
             else 1e3 * times.uncertainty_seconds[name],
+            frames_lacking=int((~presence[name]).sum()),
         )
     return found
 

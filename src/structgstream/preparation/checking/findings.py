@@ -56,6 +56,7 @@ class CameraCheck:
         blue_stops: blue against green, relative to the median camera.
         offset_ms: time against the other cameras, milliseconds; None where it was not estimated.
         offset_uncertainty_ms: its standard deviation.
+        frames_lacking: number of the capture's frames that it has no picture of.
     """
 
     reprojection_pixels: float | None
@@ -67,6 +68,7 @@ class CameraCheck:
     blue_stops: float | None = None
     offset_ms: float | None = None
     offset_uncertainty_ms: float | None = None
+    frames_lacking: int = 0
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,14 @@ LEAST_MATCHES = 30
 
 
 def stillness_findings(
-    first: Mapping[str, NDArray[np.uint8]], last: Mapping[str, NDArray[np.uint8]], *, index: int
+    first: Mapping[str, NDArray[np.uint8]], last: Mapping[str, NDArray[np.uint8]], *, frames: tuple[int, int]
 ) -> list[Finding]:
-    """Cameras that were bumped between frame 0 and frame ``index``.
+    """Cameras that were bumped between two frames.
 
     Args:
-        first: name of a camera to its picture ``[H, W, 3]`` of frame 0.
-        last: the same of frame ``index``.
+        first: name of a camera to its picture ``[H, W, 3]`` of the first one.
+        last: the same of the other one.
+        frames: their numbers.
 
     Raises:
         MissingExtraError: cv2 is not installed.
@@ -35,8 +36,8 @@ def stillness_findings(
             findings.append(
                 Finding(
                     "error",
-                    f"Camera {name!r} was bumped between frame 0 and frame {index}: its picture is shifted by "
-                    f"{shift:.1f} pixels; use the frames before, or film again with the camera fixed.",
+                    f"Camera {name!r} was bumped between frame {frames[0]} and frame {frames[1]}: its picture is "
+                    f"shifted by {shift:.1f} pixels; use the frames before, or film again with the camera fixed.",
                     (name,),
                 )
             )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Charts of a check: errors of pairs, coverage from above and from the side, colours, times."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from structgstream.preparation.checking.overlap import cameras_per_point
 LIMIT_MS = 5.0
 FAR_PERCENTILE = 97.0
 MOST_LABELS = 60
+LABEL_REACH = 0.06  # of the rig's radius: closer cameras share a label
 
 
 def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float) -> None:
@@ -88,12 +90,19 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
                 arrowprops={"arrowstyle": "-|>", "color": color, "lw": 1.2, "shrinkA": 0, "shrinkB": 0},
             )  # fmt: skip
             axis.plot(start[across], start[up], "s", color=color, markersize=5)
-            if off or (len(cameras) <= MOST_LABELS and across == 0):
-                behind = start - 0.05 * radius * axes[number]
-                axis.annotate(
-                    name, behind[[across, up]], fontsize=7, color=color, ha="center", va="center",
-                    xytext=-9 * _unit(axes[number][[across, up]]), textcoords="offset points",
-                )  # fmt: skip
+        labels = [
+            name for name in cameras if name in examined.suspects.off or (len(cameras) <= MOST_LABELS and across == 0)
+        ]
+        order = list(cameras)
+        flat = centers[:, [across, up]]
+        for group in _near_ones([order.index(name) for name in labels], flat, reach=LABEL_REACH * radius):
+            names = [order[number] for number in group]
+            ahead = axes[group[0]][[across, up]]
+            axis.annotate(
+                "\n".join(names), flat[group[0]] - 0.05 * radius * ahead, fontsize=7,
+                color=COLORS[3] if set(names) & set(examined.suspects.off) else INK, ha="center", va="center",
+                xytext=-(5 + 4 * len(names)) * _unit(ahead), textcoords="offset points",
+            )  # fmt: skip
         axis.set_aspect("equal", adjustable="datalim")
         axis.margins(0.08)
         axis.set_title(title, fontsize=10, loc="left", color=INK)
@@ -193,6 +202,18 @@ def _within(points: Floats, counts: np.ndarray, centers: Floats) -> tuple[Floats
     reach = max(float(np.percentile(apart, FAR_PERCENTILE)), 1e-9)
     reach = min(reach, 6 * max(float(np.linalg.norm(centers - np.median(points, axis=0), axis=1).max()), 1e-9))
     return points[apart <= reach], counts[apart <= reach]
+
+
+def _near_ones(numbers: Sequence[int], places: Floats, *, reach: float) -> list[list[int]]:
+    """Cameras grouped by place ``[C, 2]``, as those above each other would have labels on top of each other."""
+    groups: list[list[int]] = []
+    for number in numbers:
+        near = (group for group in groups if np.linalg.norm(places[number] - places[group[0]]) < reach)
+        if (group := next(near, None)) is None:
+            groups.append([number])
+        else:
+            group.append(number)
+    return groups
 
 
 def _unit(vector: Floats) -> Floats:

@@ -86,6 +86,7 @@ COLUMNS = (
     ("red, stops", "red_stops", "{:+.2f}"),
     ("blue, stops", "blue_stops", "{:+.2f}"),
     ("late by, ms", "offset_ms", "{:+.1f}"),
+    ("frames lacking", "frames_lacking", "{}"),
 )
 
 

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cameras have a picture of which frame, and a frame in which all have one."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.images import ImageSource
+from structgstream.data.source import FrameSource
+from structgstream.data.video import VideoSource
+from structgstream.data.wrappers import SourceWrapper
+from structgstream.frames import MultiViewFrame
+from structgstream.preparation.checking.findings import Finding
+
+Presence = dict[str, NDArray[np.bool_]]
+MOST_TRIED = 4  # frames, where pictures that should be there cannot be decoded
+
+
+def stated_presence(source: FrameSource) -> Presence:
+    """For each camera whether it has a picture of each frame ``[N]``, as far as files say so without being decoded."""
+    inner = source
+    while isinstance(inner, SourceWrapper) and len(inner) == len(inner.source):
+        inner = inner.source
+    pictures: Mapping[str, tuple[object, ...]] = {}
+    if isinstance(inner, VideoSource):
+        pictures = inner.stamps
+    elif isinstance(inner, ImageSource):
+        pictures = inner.files
+    return {
+        name: np.array([picture is not None for picture in pictures[name][: len(source)]])
+        if name in pictures
+        else np.ones(len(source), bool)
+        for name in source.rig
+    }
+
+
+def whole_frame(source: FrameSource, presence: Presence) -> MultiViewFrame:
+    """The first frame of which all cameras have a picture.
+
+    Where there is none it is one of those with most pictures, and the others come from other frames: cameras stand
+    still. What turns out not to be decodable is noted in ``presence``.
+
+    Raises:
+        CaptureError: a frame cannot be read.
+    """
+    counts = np.sum(list(presence.values()), axis=0)
+    fullest = np.flatnonzero(counts == counts.max())
+    best: MultiViewFrame | None = None
+    for place in np.unique(np.linspace(0, len(fullest) - 1, MOST_TRIED).round().astype(int)):
+        frame = _read(source, int(fullest[place]), presence)
+        best = frame if best is None or len(frame.images) > len(best.images) else best
+        if len(best.images) == counts.max():
+            break
+    assert best is not None, "captures have frames"
+    for name in presence:
+        if name not in best.images and presence[name].any():
+            other = _read(source, int(np.flatnonzero(presence[name])[0]), presence)
+            best = replace(best, images={**other.images, **best.images}, masks={**other.masks, **best.masks})
+    return best
+
+
+def note(frame: MultiViewFrame, presence: Presence) -> None:
+    """Notes in ``presence`` which cameras a frame that was read has."""
+    for name, present in presence.items():
+        present[frame.index] = name in frame.images
+
+
+def presence_findings(presence: Presence, fps: float) -> list[Finding]:
+    """A warning for each camera that ends early, lacks frames, or has no picture of frame 0."""
+    findings = []
+    for name, present in presence.items():
+        if present.all():
+            continue
+        told = f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
+        if present.any():
+            told = " ".join(_told(name, present, fps))
+        findings.append(Finding("warning", told, (name,)))
+    return findings
+
+
+def _told(name: str, present: NDArray[np.bool_], fps: float) -> list[str]:
+    total, end = len(present), int(np.flatnonzero(present)[-1]) + 1
+    inside = np.flatnonzero(~present[:end])
+    told = []
+    if len(inside):
+        told.append(
+            f"Camera {name!r} lacks {len(inside)} of {total} frames, the first of them frame {inside[0]} "
+            f"({inside[0] / fps:.2f} s): it dropped or damaged them, and the others alone see what happens there; "
+            "film with a faster card or a lower data rate."
+        )
+    if end < total:
+        told.append(
+            f"Camera {name!r} ends with frame {end - 1} ({(end - 1) / fps:.2f} s) and is absent from the {total - end} "
+            "frames after that; use the frames before, or leave it out."
+        )
+    if not present[0]:
+        told.append(
+            f"Camera {name!r} has no picture of frame 0, from which a stream learns the scene; begin with frame "
+            f"{int(np.flatnonzero(present)[0])} (--start)."
+        )
+    return told
+
+
+def _read(source: FrameSource, index: int, presence: Presence) -> MultiViewFrame:
+    frame = next(source.frames(index))
+    note(frame, presence)
+    return frame
