@@ -82,7 +82,7 @@ class Prepare:
     without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = ()
     """Cameras to leave out."""
     tone: bool = False
-    """Estimate a tone curve for each camera, where makes or picture profiles differ."""
+    """Estimate a tone curve for each camera, where picture profiles differ strongly; seldom worth it."""
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None

@@ -12,7 +12,7 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.posed import Calibration
 from structgstream.data.posed_capture import filmed_by
 from structgstream.data.prepared import LENSES, camera_of, lens_model
-from structgstream.errors import CalibrationError
+from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.coordinates import with_distance
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.footage import Footage
@@ -36,6 +36,19 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
     if options.board_videos is not None:
         return "board"
     return find_calibration(footage.where) or "sfm"
+
+
+def check_tone(method: str | Calibration, options: PrepareOptions) -> None:
+    """
+    Raises:
+        ConfigError: tone curves without points in the pictures of the take, whose colours they are estimated from.
+    """
+    if options.tone and method != "sfm" and not options.refine:
+        name = "a board" if isinstance(method, str) else str(method.where)
+        raise ConfigError(
+            f"Tone curves are estimated from points that structure from motion or --refine find in the pictures, and a "
+            f"calibration by {name} has none; add --refine, or leave out --tone."
+        )
 
 
 def check_enough(footage: Footage) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.preparation.calibrating import chosen_method
+from structgstream.preparation.calibrating import check_tone, chosen_method
 from structgstream.preparation.camera_steps import CameraSteps
 from structgstream.preparation.capture_steps import REPORT, CaptureSteps, assembled, with_tones
 from structgstream.preparation.checking.findings import Finding
@@ -55,6 +55,7 @@ def prepare_capture(
     find = CameraSteps(job)
     footage = find.find()
     method = chosen_method(footage, options)
+    check_tone(method, options)
     first = find.synchronize(footage, method)
     solved = find.calibrate(footage, first, method)
     clocks = find.synchronize_again(footage, first, method, solved)

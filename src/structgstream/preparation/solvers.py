@@ -170,11 +170,6 @@ def tone_curves(
     Raises:
         CaptureError: too few points have colours.
     """
-    if not len(solved.observations):
-        raise CaptureError(
-            "Tone curves need the points of structure from motion or --refine, and this calibration has none; "
-            "add --refine, or leave out --tone."
-        )
     names = list(solved.cameras)
     samples = sample_colors(pictures, solved.observations, cameras=names)
     found = estimate_tones(samples, cameras=names, held_out=held_out)
