@@ -59,7 +59,7 @@ class Shifted:
 
     def pictures(self, name: str, indices: NDArray[np.intp]) -> Iterator[NDArray[np.uint8]]:
         for index in indices:
-            yield self.images[self.taken[name][index]][name]
+            yield self.images[int(self.taken[name][index])][name]
 
     def audio(self, name: str) -> None:
         return None

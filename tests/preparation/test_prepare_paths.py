@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every way to a capture, from videos with a known truth to what the capture says."""
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from captures import write_video, write_videos
+from filmed import Film, noise_texture, ring, room
+from footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take
+from rooms import write_room
+from structgstream.data.prepared import PreparedCapture, read_prepared
+from structgstream.data.timeline import Clock
+from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.preparation.calibration.comparison import calibration_errors
+from structgstream.preparation.footage import find_footage
+from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.prepare import Preparation, prepare_capture
+from structgstream.preparation.solvers import first_clocks, matched_pictures
+from takes import heard
+
+NONE = PrepareOptions(synchronize="none")
+
+
+def errors(made: Preparation) -> list[str]:
+    return [finding.sentence for finding in made.findings if finding.severity == "error"]
+
+
+def starts_in_frames(capture: PreparedCapture, fps: float) -> np.ndarray:
+    """When each camera began, relative to their mean."""
+    starts = np.array([camera.clock.offset_seconds * fps for camera in capture.cameras.values()])
+    return starts - starts.mean()
+
+
+def test_motion_and_structure_without_any_calibration(tmp_path: Path) -> None:
+    starts = [0, 7, 3, 12, 5]
+    truth = write_take(tmp_path / "videos", starts=starts, frames=60)
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole"))
+    assert not errors(made)
+    assert "clocks" in made.steps
+    found = read_prepared(tmp_path / "out")
+    assert np.abs(starts_in_frames(found, FPS) - (np.array(starts) - np.mean(starts))).max() < 0.3
+    filmed = {name: camera.filmed for name, camera in found.cameras.items()}
+    for error in calibration_errors(filmed, truth).values():
+        assert error.rotation_degrees < 0.3
+        assert error.position_percent < 1.5
+    page = made.report.read_text()
+    assert "sound cannot be used" in page  # why clocks come from motion
+
+
+def test_pictures_of_what_stands_still_need_no_clocks(tmp_path: Path) -> None:
+    still = {}
+    for name, seed in (("a", 1), ("b", 2), ("c", 3)):
+        still[name] = noise_texture(seed, size=64)
+        moving = [still[name].copy() for _ in range(9)]
+        if name == "a":
+            for index, one in enumerate(moving):
+                one[:, 7 * index : 7 * index + 7] = 255
+        write_video(tmp_path / f"{name}.mp4", moving)
+    footage = find_footage(tmp_path)
+    clocks = first_clocks(footage, PrepareOptions(synchronize="motion"))
+    assert not clocks.sure
+    assert "Too little moves in the pictures of 'b', 'c'" in clocks.told
+    for name, pictures in matched_pictures(footage, clocks, PrepareOptions()).items():
+        assert len(pictures) == 1
+        assert np.abs(pictures[0].astype(int) - still[name]).max() <= 4
+    with pytest.raises(CaptureError, match="share no clock"):
+        first_clocks(footage, PrepareOptions(synchronize="stamps"))
+
+
+def test_sound(tmp_path: Path) -> None:
+    rig = write_room(tmp_path / "videos", cameras=4, frames=150)
+    clocks = {name: Clock(0.31 * index) for index, name in enumerate(rig)}
+    for name, (samples, rate) in heard(clocks, seconds=5).items():
+        add_sound(tmp_path / "videos" / f"{name}.mp4", samples, rate)
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out")
+    found = read_prepared(tmp_path / "out")
+    assert made.steps["synchronize"].startswith("audio: all cameras have sound")
+    truth = np.array([clock.offset_seconds for clock in clocks.values()])
+    assert np.abs(starts_in_frames(found, 1.0) - (truth - truth.mean())).max() < 1e-3
+
+
+def test_a_board(tmp_path: Path) -> None:
+    rig = centred(ring(3, radius=1.1, arc_degrees=50, focal=300, size=(360, 270)))
+    write_board_take(tmp_path / "board", rig, instants=16, period=0.4)
+    for index, (name, filmed) in enumerate(rig.items()):
+        write_video(tmp_path / "videos" / f"{name}.mp4", [Film(filmed).picture(room(), noise=1, seed=index)] * 2)
+    options = replace(NONE, calibration="board", board=BOARD, board_videos=tmp_path / "board", lens="pinhole")
+    with pytest.raises(ConfigError, match="a calibration by a board has none; add --refine"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(options, tone=True))
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
+    assert not errors(made)
+    found = read_prepared(tmp_path / "out")
+    assert found.unit == "metres"
+    for error in calibration_errors({name: camera.filmed for name, camera in found.cameras.items()}, rig).values():
+        assert error.rotation_degrees < 0.2
+        assert error.position_percent < 1
+
+
+def test_refined_toned_and_in_metres(tmp_path: Path) -> None:
+    rig = write_room(tmp_path / "videos")
+    options = replace(NONE, refine=True, tone=True, distance=Distance("cam00", "cam04", 2.0))
+    with pytest.raises(ConfigError, match="add --refine"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(options, refine=False))
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
+    assert not errors(made)
+    assert "px from their epipolar lines" in made.steps["refine"]
+    assert "after curves" in made.steps["tone"]
+    found = read_prepared(tmp_path / "out")
+    assert found.unit == "metres"
+    assert any(camera.tone is not None for camera in found.cameras.values())
+    centers = {name: camera.pinhole.center for name, camera in found.cameras.items()}
+    assert float((centers["cam00"] - centers["cam04"]).norm()) == pytest.approx(2.0)
+    scale = 2.0 / float((rig["cam00"].center - rig["cam04"].center).norm())
+    across = float((centers["cam01"] - centers["cam03"]).norm())
+    assert across == pytest.approx(scale * float((rig["cam01"].center - rig["cam03"].center).norm()), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        ("exchanged", "are exchanged"),
+        ("inverted", "camera to world in place of world to camera"),
+        ("millimetres", "millimetres among metres"),
+    ],
+)
+def test_a_wrong_calibration_is_told(tmp_path: Path, mistake: str, told: str) -> None:
+    write_room(tmp_path / "videos", cameras=8)
+    file = tmp_path / "videos" / "cameras.json"
+    content = json.loads(file.read_text())
+    cameras = content["cameras"]
+    if mistake == "exchanged":
+        cameras["cam01"], cameras["cam05"] = cameras["cam05"], cameras["cam01"]
+    elif mistake == "inverted":
+        for entry in cameras.values():
+            entry["viewmat"] = np.linalg.inv(entry["viewmat"]).tolist()
+    else:
+        viewmat = np.array(cameras["cam03"]["viewmat"])
+        viewmat[:3, 3] *= 1000
+        cameras["cam03"]["viewmat"] = viewmat.tolist()
+    file.write_text(json.dumps(content))
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=NONE)
+    assert any(told in sentence for sentence in errors(made))
+    assert told in made.report.read_text()
+
+
+def test_dead_cameras_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_room(tmp_path / "videos", cameras=4, frames=9)
+    short = tmp_path / "short"
+    write_room(short, cameras=4, frames=4)
+    (short / "cam02.mp4").replace(tmp_path / "videos" / "cam02.mp4")
+    with caplog.at_level(logging.WARNING):
+        made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=NONE)
+    assert sum("'cam02' ends with" in record.getMessage() for record in caplog.records) == 1
+    (found,) = [finding for finding in made.findings if "ends with frame 3" in finding.sentence]
+    assert (found.severity, found.cameras) == ("warning", ("cam02",))
+    assert "is absent from the 5 frames after that" in made.report.read_text()
+
+
+def test_cameras_that_see_nothing_in_common(tmp_path: Path) -> None:
+    for seed in range(3):
+        write_video(tmp_path / "videos" / f"cam{seed}.mp4", [noise_texture(seed, size=160)] * 2)
+    with pytest.raises(CalibrationError, match="Too few cameras see anything in common"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, lens="pinhole"))
+
+
+def test_a_board_that_is_not_there(tmp_path: Path) -> None:
+    write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
+    with pytest.raises(CalibrationError, match="board"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, calibration="board"))
+    write_videos(tmp_path / "board", ["a", "b"], frames=2)
+    with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, board_videos=tmp_path / "board"))
+
+
+def test_videos_shorter_than_their_offset(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos", cameras=3, frames=4)
+    rows = "".join(f"cam0{index},0,{9 * index}\n" for index in range(3))
+    (tmp_path / "videos" / "timestamps.csv").write_text("camera,frame,seconds\n" + rows)
+    with pytest.raises(CaptureError, match=r"'cam00' \(0.10 s\) and 'cam01' \(0.10 s\) have no instant in common"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out")
+
+
+def test_an_unknown_codec(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos", cameras=3)
+    file = tmp_path / "videos" / "cam01.mp4"
+    file.write_bytes(file.read_bytes().replace(b"avc1", b"zzzz"))
+    with pytest.raises(CaptureError, match=r"cam01\.mp4 is coded in a way .* convert it to H\.264"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
