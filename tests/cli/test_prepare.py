@@ -8,6 +8,8 @@ import pytest
 
 from rooms import write_room
 from structgstream.cli.app import main
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.options import Distance, PrepareOptions
 
 
 def test_prepare_then_check_and_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -45,3 +47,24 @@ def test_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / "new" / "board.pdf").read_bytes().startswith(b"%PDF")
     assert "--calibration board --board 7x5:30mm" in capsys.readouterr().out
     assert main(["board", "-o", str(tmp_path / "board.pdf"), "--squares", "5x5"]) == 2
+
+
+def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[PrepareOptions] = []
+
+    def note(videos: Path, capture: Path, *, options: PrepareOptions, listener: object) -> None:
+        asked.append(options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("structgstream.preparation.prepare.prepare_capture", note)
+    command = f"prepare {tmp_path} -o {tmp_path / 'out'} --calibration board --board 9x6:80mm --board-videos {tmp_path}"
+    command += " --lens fisheye --intrinsics shared --refine --tone --distance a b 3.2m --synchronize audio --near 0.2"
+    command += " --field-of-view 90 --size 64x48 --held-out a b --fps 25 --without c --link copy"
+    assert main(command.split()) == 130
+    assert asked == [
+        PrepareOptions(
+            calibration="board", board=Board(9, 6, 0.08), board_videos=tmp_path, lens="fisheye", intrinsics="shared",
+            refine=True, tone=True, distance=Distance("a", "b", 3.2), synchronize="audio", near=0.2, field_of_view=90,
+            size=(64, 48), held_out=("a", "b"), fps=25, without=("c",), link="copy",
+        )
+    ]  # fmt: skip

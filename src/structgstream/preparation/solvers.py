@@ -88,7 +88,7 @@ def synchronized(
         raise CaptureError(f"{error} Cameras that one signal starts need none of this: --synchronize none.") from None
     clocks = {name: estimate.clock for name, estimate in found.clocks.items()}
     shared_seconds(footage, clocks)
-    told = ". ".join([f"{found.method}: {found.reason}", *found.warnings])
+    told = " ".join([f"{found.method}: {found.reason}" + ("." if found.warnings else ""), *found.warnings])
     errors = {name: estimate.uncertainty_seconds for name, estimate in found.clocks.items()}
     return Clocks(
         clocks,

@@ -119,4 +119,4 @@ def _fitted(one: NDArray[np.intp], other: NDArray[np.intp], values: Floats, coun
         np.add.at(right, other, -weights * values)
         gains = np.asarray(np.linalg.solve(system, right), np.float64)
         weights = 1 / np.maximum(np.abs(values - gains[one] + gains[other]), 0.02)
-    return gains
+    return np.asarray(gains, np.float64)
