@@ -58,10 +58,7 @@ PLAIN = Case("SNR 10 dB")
 SHORT = Case("two claps in 5 s, SNR 15 dB", seconds=5, spread=2, claps=2, talk=0.05, snr_db=15)
 CASES = (
     *(replace(PLAIN, title=f"SNR {snr} dB", snr_db=snr) for snr in (20, 10, 0)),
-    *(
-        replace(PLAIN, title="reverberation 1 s, 15 s", seconds=15, reverberation=1.0, seed=seed)
-        for seed in (9, 10, 11)
-    ),
+    *(replace(PLAIN, title="reverberation 1 s", reverberation=1.0, seed=seed) for seed in range(3)),
     *(replace(SHORT, seed=seed) for seed in range(6)),
     Case("drift of 20 ppm", cameras=3, seconds=120, claps=20, drift_ppm=20),
     Case("14 cameras", cameras=14),

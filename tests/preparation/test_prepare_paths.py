@@ -39,7 +39,7 @@ def starts_in_frames(capture: PreparedCapture, fps: float) -> np.ndarray:
 def test_motion_and_structure_without_any_calibration(tmp_path: Path) -> None:
     starts = [0, 7, 3, 12]
     truth = write_take(tmp_path / "videos", starts=starts, frames=45)
-    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole"))
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole", instants=1))
     assert not errors(made)
     assert "clocks" in made.steps
     found = read_prepared(tmp_path / "out")
