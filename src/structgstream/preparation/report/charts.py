@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from structgstream.figure import COLORS, FAINT, INK, OTHER, figure_of, save_figu
 from structgstream.preparation.checking.check import Examination
 from structgstream.preparation.checking.findings import CheckReport
 from structgstream.preparation.checking.overlap import cameras_per_point
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LIMIT_MS = 5.0
 FAR_PERCENTILE = 97.0
@@ -93,16 +97,7 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
         labels = [
             name for name in cameras if name in examined.suspects.off or (len(cameras) <= MOST_LABELS and across == 0)
         ]
-        order = list(cameras)
-        flat = centers[:, [across, up]]
-        for group in _near_ones([order.index(name) for name in labels], flat, reach=LABEL_REACH * radius):
-            names = [order[number] for number in group]
-            ahead = axes[group[0]][[across, up]]
-            axis.annotate(
-                "\n".join(names), flat[group[0]] - 0.05 * radius * ahead, fontsize=7,
-                color=COLORS[3] if set(names) & set(examined.suspects.off) else INK, ha="center", va="center",
-                xytext=-(5 + 4 * len(names)) * _unit(ahead), textcoords="offset points",
-            )  # fmt: skip
+        _draw_labels(axis, examined, labels, centers[:, [across, up]], axes[:, [across, up]], radius=radius)
         axis.set_aspect("equal", adjustable="datalim")
         axis.margins(0.08)
         axis.set_title(title, fontsize=10, loc="left", color=INK)
@@ -202,6 +197,22 @@ def _within(points: Floats, counts: np.ndarray, centers: Floats) -> tuple[Floats
     reach = max(float(np.percentile(apart, FAR_PERCENTILE)), 1e-9)
     reach = min(reach, 6 * max(float(np.linalg.norm(centers - np.median(points, axis=0), axis=1).max()), 1e-9))
     return points[apart <= reach], counts[apart <= reach]
+
+
+def _draw_labels(
+    axis: "Axes", examined: Examination, labels: Sequence[str], places: Floats, ahead: Floats, *, radius: float
+) -> None:
+    """Names of cameras behind them; ``places`` and directions ``ahead`` ``[C, 2]`` are of all cameras."""
+    order, off = list(examined.cameras), set(examined.suspects.off)
+    for group in _near_ones([order.index(name) for name in labels], places, reach=LABEL_REACH * radius):
+        names = [order[number] for number in group]
+        first, away = group[0], 5 + 4 * len(names)
+        ahead_of = _unit(ahead[first])
+        axis.annotate(
+            "\n".join(names), tuple(places[first] - 0.05 * radius * ahead[first]), fontsize=7,
+            color=COLORS[3] if off.intersection(names) else INK, ha="center", va="center",
+            xytext=(-away * ahead_of[0], -away * ahead_of[1]), textcoords="offset points",
+        )  # fmt: skip
 
 
 def _near_ones(numbers: Sequence[int], places: Floats, *, reach: float) -> list[list[int]]:
