@@ -36,7 +36,9 @@ def starts_in_frames(capture: PreparedCapture, fps: float) -> np.ndarray:
     return starts - starts.mean()
 
 
-def test_motion_and_structure_without_any_calibration(tmp_path: Path) -> None:
+def test_motion_and_structure_without_any_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where motion alone tells no clocks: the calibration comes from what stands still."""
+    monkeypatch.setattr("structgstream.preparation.solvers.SURE_PERIODS", 0.0)
     starts = [0, 7, 3, 12]
     truth = write_take(tmp_path / "videos", starts=starts, frames=45)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole", instants=1))
