@@ -42,6 +42,7 @@ from structgstream.preparation.calibration.board import Board
 SEED = 14
 BOARD_FPS = 5.0  # the board moves slowly
 RING_METRES, RING_HEIGHT = 2.0, 1.3
+RING_BOARD = Board(square_metres=0.12)  # a board of 0.35 m is 100 pixels wide at 2 m, too few for its markers
 GIVEN_DEGREES, GIVEN_METRES = 0.3, 0.008
 
 
@@ -225,7 +226,8 @@ def given_calibration(truth: Truth) -> dict[str, object]:
 
 def film(name: str, folder: Path, light: Light) -> None:
     """Films one variant."""
-    variant, board = VARIANTS[name], Board()
+    variant = VARIANTS[name]
+    board = RING_BOARD if variant.take == "ring" else Board()
     shutil.rmtree(folder, ignore_errors=True)
     shoot = Shoot(name, variant, light, lens_cameras(variant, light))
     truth = truth_of(name, variant, shoot.cameras, light, board)
