@@ -126,8 +126,7 @@ def unpacked(stored: Stored) -> SolvedCalibration:
 
 def summary(solved: SolvedCalibration) -> str:
     """A calibration in one line."""
-    lenses = sorted({lens_model(filmed.lens) for filmed in solved.cameras.values()})
-    told = f"{len(solved.cameras)} cameras, lenses {', '.join(lenses)}"
+    told = f"{len(solved.cameras)} cameras"
     if len(solved.observations):
         errors = solved.errors()
         errors = errors[np.isfinite(errors)]

@@ -31,16 +31,19 @@ def mutual_matches(first: Keypoints, second: Keypoints, *, config: MatchConfig =
     """Mutually best matches ``[S, 2]``, indices into the two lists, of keypoints that share an instant."""
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.uint32)
-    best, passes = _best(first, second, config)
-    back, _ = _best(second, first, config)
+    best, passes, back = _best(first, second, config)
     kept = np.flatnonzero(passes & (back[best] == np.arange(len(first))))
     return np.stack([kept, best[kept]], 1).astype(np.uint32)
 
 
-def _best(query: Keypoints, others: Keypoints, config: MatchConfig) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """For each keypoint of ``query`` the most alike of ``others`` and whether it stands out."""
+def _best(
+    query: Keypoints, others: Keypoints, config: MatchConfig
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.intp]]:
+    """For each keypoint of ``query`` the most alike of ``others`` and whether it stands out; and the reverse of the
+    first, from the same products."""
     best = np.zeros(len(query), np.intp)
     passes = np.zeros(len(query), bool)
+    back, most = np.zeros(len(others), np.intp), np.full(len(others), -np.inf, np.float32)
     everywhere = query.seen.shape[1] == 1
     there = others.seen.astype(np.float32).T
     for start in range(0, len(query), BLOCK):
@@ -48,6 +51,10 @@ def _best(query: Keypoints, others: Keypoints, config: MatchConfig) -> tuple[NDA
         similarity = query.descriptors[rows] @ others.descriptors.T
         if not everywhere:
             similarity[query.seen[rows].astype(np.float32) @ there == 0] = -1.0
+        likest = similarity.argmax(0)
+        values = similarity[likest, np.arange(len(others))]
+        back = np.where(values > most, start + likest, back)
+        most = np.maximum(values, most)
         chosen = similarity.argmax(1)
         lines = np.arange(len(similarity))
         top = similarity[lines, chosen]
@@ -56,7 +63,7 @@ def _best(query: Keypoints, others: Keypoints, config: MatchConfig) -> tuple[NDA
         apart, further = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, next_best))
         best[rows] = chosen
         passes[rows] = (apart < config.ratio * further) & (apart < config.distance)
-    return best, passes
+    return best, passes, back
 
 
 def all_matches(
