@@ -100,7 +100,11 @@ def test_a_pickle_is_refused(tmp_path: Path) -> None:
     ("options", "told"),
     [
         (PrepareOptions(synchronize="none", without=("cam9",)), "no camera 'cam9' to leave out"),
-        (PrepareOptions(synchronize="none", held_out=("cam9",)), "camera 'cam9' to hold out is not there"),
+        (PrepareOptions(synchronize="none", held_out=("cam9",)), "no camera 'cam9' to hold out"),
+        (
+            PrepareOptions(synchronize="none", distance=Distance("cam1", "cam9", 1.0)),
+            "no camera.* 'cam9' to measure from",
+        ),
     ],
 )
 def test_options_of_cameras_that_are_not_there(tmp_path: Path, options: PrepareOptions, told: str) -> None:

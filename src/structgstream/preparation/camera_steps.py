@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps that find the cameras: what they filmed, their clocks, poses and lenses, the unit of length."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict
 
 from structgstream.data.calibration import listed
@@ -50,15 +50,24 @@ class CameraSteps:
     def find(self) -> Footage:
         self.listener.begin("find", skipped=False)
         footage = find_footage(self.videos, picture_fps=self.options.fps)
-        if unknown := [name for name in self.options.without if name not in footage.cameras]:
-            raise ConfigError(
-                f"{self.videos} has no {listed(unknown)} to leave out; its cameras are {', '.join(footage.cameras)}."
-            )
+        self._check_names(self.options.without, footage, purpose="leave out")
         footage = footage.only([name for name in footage.cameras if name not in self.options.without])
+        held_out, distance = self.options.held_out, self.options.distance
+        self._check_names(() if held_out == ("auto",) else held_out, footage, purpose="hold out")
+        self._check_names(
+            () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
+        )
         check_enough(footage)
         claim(self.capture, self.videos)
         self.listener.end("find", _described(footage))
         return footage
+
+    def _check_names(self, names: Collection[str], footage: Footage, *, purpose: str) -> None:
+        """Refuses cameras that are not there, before anything takes time."""
+        if unknown := [name for name in names if name not in footage.cameras]:
+            raise ConfigError(
+                f"{self.videos} has no {listed(unknown)} to {purpose}; its cameras are {', '.join(footage.cameras)}."
+            )
 
     def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
         """The clocks; by motion they may be unsure until the calibration is known."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.calibration import NEAR_IN_RIG_RADII, listed
+from structgstream.data.calibration import NEAR_IN_RIG_RADII
 from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import open_capture
@@ -27,7 +27,7 @@ from structgstream.data.tone import ToneCurve
 from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
-from structgstream.errors import ConfigError, StorageError
+from structgstream.errors import StorageError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 from structgstream.preparation.checking.findings import Finding
@@ -163,16 +163,8 @@ class _Grown(WithRig):
 
 
 def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
-    """The cameras to hold out.
-
-    Raises:
-        ConfigError: one that is not there.
-    """
-    if options.held_out == ("auto",):
-        return frozenset({best_surrounded(rig)})
-    if unknown := [name for name in options.held_out if name not in rig.cameras]:
-        raise ConfigError(f"{listed(unknown)} to hold out is not there; the cameras are {', '.join(rig)}.")
-    return frozenset(options.held_out)
+    """The cameras to hold out."""
+    return frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
 
 
 def assembled(
@@ -184,7 +176,7 @@ def assembled(
     """The content of ``capture.json`` with the usual near plane, without points and tone curves.
 
     Raises:
-        ConfigError: a camera to hold out that is not there, or a field of view or size that cannot be.
+        ConfigError: a field of view or size that cannot be.
         CalibrationError: a lens that cannot be undistorted.
     """
     cameras = {}
