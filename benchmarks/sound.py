@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.timeline import Clock
 from structgstream.preparation.synchronization.audio import audio_ties, sound_of
 from structgstream.preparation.synchronization.solving import connected, solve_clocks
@@ -21,8 +22,6 @@ from structgstream.preparation.synchronization.solving import connected, solve_c
 HERTZ = 96_000  # of the made sound
 DECAY_SECONDS = 0.004  # of a clap
 SLACK_SECONDS = 0.02  # as in synchronize
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

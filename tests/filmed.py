@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from rigs import look_at
 from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
 from structgstream.preparation.calibration.board import Board
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

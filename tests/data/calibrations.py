@@ -9,12 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from captures import HEIGHT, WIDTH, small_rig
+from structgstream.data.arrays import Floats
 from structgstream.data.posed import PosedCamera
-
-Floats = NDArray[np.float64]
 
 POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (30, 3))
 NAMES = ("cam00", "cam01", "cam02")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.errors import CaptureError
 from structgstream.preparation.tone import LEAST_SAMPLES, ColorSamples, ToneEstimate, estimate_tones, sample_colors
 
-Floats = NDArray[np.float64]
 NAMES = tuple(f"cam{number}" for number in range(8))
 
 

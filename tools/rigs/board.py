@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from tools.rigs.optics import SUBPIXELS, normalised_subpixels
 from tools.rigs.rig import turned
 
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.board import Board
-
-Floats = NDArray[np.float64]
 
 PAPER, INK = 0.82, 0.035  # reflectances
 MARGIN_SQUARES = 0.5

@@ -9,10 +9,9 @@ import torch
 from numpy.typing import NDArray
 from tools.rigs.filming import Filming
 
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
-
-Floats = NDArray[np.float64]
 
 SIZE = (640, 480)
 FOCAL_PIXELS = 600.0

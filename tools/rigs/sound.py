@@ -5,9 +5,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from structgstream.data.arrays import Floats
 
 SAMPLE_RATE = 48_000
 SPEED = 343.0  # metres a second, air at 20 degrees Celsius

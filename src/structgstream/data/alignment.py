@@ -6,12 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,14 @@ and distances ``d``, the border of the cell in the direction ``u`` is at half of
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
+from structgstream.data.arrays import Floats
 from structgstream.errors import ConfigError
 
 DIRECTIONS = 360
 ALIKE = 1.5
 """Cells whose areas differ by less are alike, as cameras are placed by hand; the most central of them is taken."""
-Floats = NDArray[np.float64]
 
 
 def best_surrounded(rig: CameraRig) -> str:

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
+
 log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 STANDARD_RATES = tuple(rate * factor for rate in (24, 25, 30, 50, 60, 120) for factor in (1.0, 1000 / 1001))
 SAME_RATE = 0.02
 """Rates that differ by less than this share are one: short videos do not tell them apart."""

@@ -17,11 +17,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from structgstream.cameras import Camera
-
-Floats = NDArray[np.float64]
+from structgstream.data.arrays import Floats
 
 NEWTON_STEPS = 50
 CLOSE_ENOUGH = 1e-10

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
 from structgstream.errors import MissingExtraError
-
-Floats = NDArray[np.float64]
 
 _DEPTH_SHARES = (0.5, 0.7, 1.0, 1.4, 2.0)
 _GRID = (np.arange(6) + 0.5) / 6

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.matching import Features, Floats, load_cv2, sift_features
+from structgstream.data.arrays import Floats
+from structgstream.data.matching import Features, load_cv2, sift_features
 
 Pair = tuple[str, str]
 

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
 from structgstream.data.images import reduced_mask
-from structgstream.data.matching import Floats, back_project, inside, load_cv2, project
+from structgstream.data.matching import back_project, inside, load_cv2, project
 
 FloatImage = NDArray[np.float32]
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.data.arrays import Floats
 from structgstream.data.matching import (
     Features,
-    Floats,
     back_project,
     guided_matches,
     inside,

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.data.arrays import Floats
 from structgstream.data.matching import (
-    Floats,
     angles,
     epipolar_errors,
     fundamental_matrix,

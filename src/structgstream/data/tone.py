@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import SourceWrapper, resized_to
 from structgstream.errors import CalibrationError, MissingExtraError
 from structgstream.frames import MultiViewFrame
 
-Floats = NDArray[np.float64]
 DEGREE = 3
 KNOTS = np.concatenate([np.zeros(DEGREE + 1), np.linspace(0, 1, 6)[1:-1], np.ones(DEGREE + 1)])
 IDENTITY = np.stack([KNOTS[i + 1 : i + 1 + DEGREE].mean() for i in range(len(KNOTS) - DEGREE - 1)])

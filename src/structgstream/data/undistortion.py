@@ -17,8 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_mask
-from structgstream.data.lenses import Floats, LensCamera, Pinhole
+from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig
 from structgstream.errors import CalibrationError, ConfigError

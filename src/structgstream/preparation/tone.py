@@ -12,12 +12,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.tone import CHANNELS, IDENTITY, ToneCurve, basis
 from structgstream.errors import CaptureError
 from structgstream.preparation.tone_fit import common_curves, curve_towards, gain_and_bias, slopes
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 DARKEST, BRIGHTEST = 3, 252

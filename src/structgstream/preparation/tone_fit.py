@@ -16,9 +16,9 @@ a scale from their median. Curvature and departure from the identity have wide p
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.tone import IDENTITY, basis
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 ROUNDS = 20

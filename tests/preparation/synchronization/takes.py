@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from rigs import look_at
 from structgstream.cameras import Camera, CameraRig
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.timeline import Clock
 from structgstream.frames import MultiViewFrame
 
-Floats = NDArray[np.float64]
 WIDTH, HEIGHT = 160, 120
 SOUND_HERTZ = 96000
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.errors import ConfigError
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.board_sightings import Sighting
 from structgstream.preparation.calibration.colmap import colmap_pose, pycolmap_module
 
-Floats = NDArray[np.float64]
 Sightings = Mapping[str, Sequence[Sighting]]
 
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.board_model import (
-    Floats,
     Sightings,
     board_model,
     matrix,

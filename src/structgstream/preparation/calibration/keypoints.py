@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.preparation.calibration.colmap import pycolmap_module
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.keypoints import Keypoints
 from structgstream.preparation.calibration.view_graph import Pair
-
-Floats = NDArray[np.float64]
 
 
 def camera_rays(filmed: LensCamera, pixels: Floats) -> Floats:

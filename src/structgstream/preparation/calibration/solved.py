@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.alignment import Alignment
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 

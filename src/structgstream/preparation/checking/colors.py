@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.matching import Floats, load_cv2
+from structgstream.data.arrays import Floats
+from structgstream.data.matching import load_cv2
 from structgstream.preparation.checking.evidence import Evidence
 from structgstream.preparation.checking.findings import Finding
 

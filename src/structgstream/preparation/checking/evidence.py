@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
 from structgstream.data.matching import (
-    Floats,
     angles,
     epipolar_errors,
     fundamental_matrix,

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
-from structgstream.data.matching import Floats, inside, project
+from structgstream.data.matching import inside, project
 from structgstream.data.pair_matches import Pair
 from structgstream.preparation.checking.findings import Coverage, Finding
 

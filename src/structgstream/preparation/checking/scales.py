@@ -6,7 +6,8 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from structgstream.cameras import Camera
-from structgstream.data.matching import Floats, project
+from structgstream.data.arrays import Floats
+from structgstream.data.matching import project
 from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.checking.overlap import cameras_per_point
 from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.matching import Floats, epipolar_errors, fundamental_matrix, load_cv2, project, rays
+from structgstream.data.arrays import Floats
+from structgstream.data.matching import epipolar_errors, fundamental_matrix, load_cv2, project, rays
 from structgstream.preparation.checking.evidence import Evidence
 
 AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from structgstream.data.matching import Floats, level_normal
+from structgstream.data.arrays import Floats
+from structgstream.data.matching import level_normal
 from structgstream.figure import COLORS, FAINT, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.preparation.checking.check import Examination
 from structgstream.preparation.checking.findings import CheckReport

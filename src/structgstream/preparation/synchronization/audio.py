@@ -16,12 +16,11 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal, best_lag
 from structgstream.preparation.synchronization.solving import Tie
-
-Floats = NDArray[np.float64]
 
 SPEED_OF_SOUND = 343.0  # metres a second, at 20 degrees Celsius
 STEP_SECONDS = 0.004  # of onsets

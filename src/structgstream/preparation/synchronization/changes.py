@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
-
-Floats = NDArray[np.float64]
 
 LONGER_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
 SMOOTHING = 1.0  # standard deviation, reduced pixels

@@ -10,9 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.errors import MissingExtraError
-
-Floats = NDArray[np.float64]
 
 GROUPS = 8  # of channels, left out one by one to see how the peak moves
 

@@ -12,11 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.preparation.synchronization.changes import Changes
 
-Floats = NDArray[np.float64]
 Straighten = Callable[[Floats], Floats]
 """From pixels ``[S, 2]`` as filmed to points that obey the fundamental matrix; NaN where the lens has no inverse."""
 

@@ -8,11 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, load_cv2, sift_features
 from structgstream.preparation.synchronization.epipolar import PairGeometry
-
-Floats = NDArray[np.float64]
 
 SAME_PLACE = 1e-6  # distance of cameras at one place, as a share of theirs to the origin
 FEATURES = 3000

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.instants import counted_rate
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.streams import period_seconds
-
-Floats = NDArray[np.float64]
 
 WARNED_SECONDS = 5e-3
 

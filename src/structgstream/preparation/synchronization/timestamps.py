@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from structgstream.data.arrays import Floats
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.streams import period_seconds
-
-Floats = NDArray[np.float64]
 
 COLUMNS = ("camera", "frame", "seconds")
 MOST_DEVIATION = 0.5  # of a row from a steady clock, in frame periods

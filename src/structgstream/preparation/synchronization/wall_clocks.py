@@ -12,14 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-import numpy as np
-from numpy.typing import NDArray
-
+from structgstream.data.arrays import Floats
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.streams import period_seconds
-
-Floats = NDArray[np.float64]
 
 FAR_FROM_ZERO_SECONDS = 10.0
 CREATION_SIGMA_SECONDS = 0.05  # writing a file begins some frames before or after the first picture
