@@ -17,6 +17,9 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.errors import MissingExtraError
 
+Pair = tuple[str, str]
+"""Names of two cameras."""
+
 _DEPTH_SHARES = (0.5, 0.7, 1.0, 1.4, 2.0)
 _GRID = (np.arange(6) + 0.5) / 6
 _BEST_ANGLES_DEGREES = (7.0, 20.0)
@@ -156,9 +159,9 @@ def neighbor_views(cameras: Mapping[str, Camera], *, count: int, distance: float
     return chosen
 
 
-def unique_pairs(neighbours: Mapping[str, tuple[str, ...]]) -> list[tuple[str, str]]:
+def unique_pairs(neighbours: Mapping[str, tuple[str, ...]]) -> list[Pair]:
     """Each pair of neighbours once, in the mapping's order."""
-    pairs: dict[frozenset[str], tuple[str, str]] = {}
+    pairs: dict[frozenset[str], Pair] = {}
     for name, others in neighbours.items():
         for other in others:
             pairs.setdefault(frozenset((name, other)), (name, other))

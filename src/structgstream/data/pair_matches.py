@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import Features, load_cv2, sift_features
-
-Pair = tuple[str, str]
+from structgstream.data.descriptor_matches import mutual_matches
+from structgstream.data.matching import Features, Pair, load_cv2, sift_features
 
 
 @dataclass(frozen=True)
@@ -93,18 +92,13 @@ class PairMatcher:
         first, second = (self._features[name] for name in pair)
         if min(len(first.pixels), len(second.pixels)) < config.min_inliers:
             return empty
-        similarity = first.descriptors @ second.descriptors.T
-        best = similarity.argmax(1)
-        two = np.partition(similarity, -2, axis=1)[:, -2:]
-        distances = np.sqrt(np.maximum(2 - 2 * two, 0))
-        mutual = similarity.argmax(0)[best] == np.arange(len(best))
-        kept = np.flatnonzero(mutual & (distances[:, 1] < config.ratio * distances[:, 0]))
-        if len(kept) < config.min_inliers:
+        rows, columns = mutual_matches(first.descriptors, second.descriptors, ratio=config.ratio).T
+        if len(rows) < config.min_inliers:
             return empty
         cv2 = load_cv2()
-        pixels1, pixels2 = first.pixels[kept], second.pixels[best[kept]]
+        pixels1, pixels2 = first.pixels[rows], second.pixels[columns]
         _, mask = cv2.findFundamentalMat(pixels1, pixels2, cv2.FM_RANSAC, config.inlier_pixels, 0.999, 2000)
-        agree = np.zeros(len(kept), bool) if mask is None else mask.ravel().astype(bool)
+        agree = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
         if agree.sum() < config.min_inliers or agree.mean() < config.min_inlier_share:
             return empty
-        return np.stack([kept[agree], best[kept][agree]], 1)
+        return np.stack([rows[agree], columns[agree]], 1)

@@ -18,6 +18,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import (
     Features,
+    Pair,
     back_project,
     guided_matches,
     inside,
@@ -160,7 +161,7 @@ def _sift_points(
         found = pool.map(lambda name: sift_features(images[name], count=config.features, mask=masks.get(name)), cameras)
         features = dict(zip(cameras, found, strict=True))
 
-        def match(pair: tuple[str, str]) -> NDArray[np.intp]:
+        def match(pair: Pair) -> NDArray[np.intp]:
             first, second = pair
             return guided_matches(
                 features[first],
@@ -184,7 +185,7 @@ def _sift_points(
 def _confirm_points(
     cameras: Mapping[str, Camera],
     features: Mapping[str, Features],
-    matches: Mapping[tuple[str, str], NDArray[np.intp]],
+    matches: Mapping[Pair, NDArray[np.intp]],
     *,
     tolerance: float,
 ) -> tuple[Floats, NDArray[np.intp], Floats]:

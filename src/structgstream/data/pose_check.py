@@ -17,6 +17,7 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import (
+    Pair,
     angles,
     epipolar_errors,
     fundamental_matrix,
@@ -133,7 +134,7 @@ def reinterpreted(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tens
     return {name: replace(camera, viewmat=change(camera.viewmat)) for name, camera in cameras.items()}
 
 
-def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[tuple[str, str]]:
+def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[Pair]:
     """Pairs of neighbours, spread over the rig."""
     pairs = unique_pairs(neighbor_views(cameras, count=2, distance=viewing_distance(cameras)))
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), config.pairs)).round().astype(int)
@@ -142,7 +143,7 @@ def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[tuple
 
 def _judge(
     cameras: Mapping[str, Camera],
-    matches: Mapping[tuple[str, str], tuple[Floats, Floats]],
+    matches: Mapping[Pair, tuple[Floats, Floats]],
     config: PoseCheckConfig,
 ) -> PoseCheck:
     errors: list[Floats] = []

@@ -2,8 +2,7 @@
 import numpy as np
 
 from filmed import noise_texture
-from structgstream.preparation.calibration.keypoints import Keypoints, camera_keypoints
-from structgstream.preparation.calibration.pair_matches import mutual_matches
+from structgstream.preparation.calibration.keypoints import camera_keypoints
 
 
 def scene(shift: int) -> np.ndarray:
@@ -48,21 +47,3 @@ def test_reduced_pictures_give_pixels_of_the_whole_one() -> None:
 
 def test_bare_pictures_give_none() -> None:
     assert len(camera_keypoints([np.full((60, 80, 3), 90, np.uint8)] * 2)) == 0
-
-
-def made(looks: list[int], seen: list[list[int]]) -> Keypoints:
-    descriptors = np.zeros((len(looks), 128), np.float32)
-    descriptors[np.arange(len(looks)), looks] = 1
-    return Keypoints(np.zeros((len(looks), 2)), descriptors, np.array(seen, bool))
-
-
-def test_keypoints_match_only_within_an_instant() -> None:
-    first = made([0, 1, 2], [[1, 0], [1, 1], [0, 1]])
-    second = made([0, 1, 2], [[0, 1], [0, 1], [0, 1]])
-    assert mutual_matches(first, second).tolist() == [[1, 1], [2, 2]]
-
-
-def test_a_rival_at_another_instant_does_not_count() -> None:
-    first = made([0, 5], [[1, 0], [1, 0]])
-    assert mutual_matches(first, made([0, 0, 7], [[1, 0], [0, 1], [1, 1]])).tolist() == [[0, 0]]
-    assert mutual_matches(first, made([0, 0, 7], [[1, 0], [1, 1], [1, 1]])).tolist() == []

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 from structgstream.preparation.calibration.keypoints import Keypoints
-from structgstream.preparation.calibration.view_graph import Pair
 
 
 def camera_rays(filmed: LensCamera, pixels: Floats) -> Floats:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.comparison import rig_alignment
@@ -23,7 +24,7 @@ from structgstream.preparation.calibration.triangulation import (
     posed_model,
     without,
 )
-from structgstream.preparation.calibration.view_graph import Pair, connected
+from structgstream.preparation.calibration.view_graph import connected
 
 _log = logging.getLogger(__name__)
 

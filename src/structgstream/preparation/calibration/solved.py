@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from structgstream.data.alignment import Alignment
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 
 Indices = NDArray[np.intp]
 
@@ -84,7 +85,7 @@ class SolvedCalibration:
         errors = self.errors()
         return {name: _median(errors[self.observations.camera == index]) for index, name in enumerate(self.cameras)}
 
-    def pair_errors(self) -> dict[tuple[str, str], PairError]:
+    def pair_errors(self) -> dict[Pair, PairError]:
         """Agreement of each pair of cameras."""
         errors = np.full((len(self.points), len(self.cameras)), np.nan)
         errors[self.observations.point, self.observations.camera] = self.errors()

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, pycolmap_module
 from structgstream.preparation.calibration.coordinates import normalized
 from structgstream.preparation.calibration.intrinsics import guessed_camera
+from structgstream.preparation.calibration.keypoint_matches import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
 from structgstream.preparation.calibration.mapping import (
     Freedom,
@@ -33,12 +35,10 @@ from structgstream.preparation.calibration.mapping import (
     observed,
     size_of,
 )
-from structgstream.preparation.calibration.pair_matches import MatchConfig, all_matches
 from structgstream.preparation.calibration.pictures import checked_pictures
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.view_graph import (
     Matches,
-    Pair,
     PairConfig,
     connected,
     verified_pairs,
@@ -74,7 +74,7 @@ class StructureConfig:
     """
 
     keypoints: KeypointConfig = field(default_factory=KeypointConfig)
-    matching: MatchConfig = field(default_factory=MatchConfig)
+    matching: KeypointMatchConfig = field(default_factory=KeypointMatchConfig)
     pairs: PairConfig = field(default_factory=PairConfig)
     pixels: float = 3.0
     degrees: float = 1.5

@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, pycolmap_module
+from structgstream.preparation.calibration.keypoint_matches import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
 from structgstream.preparation.calibration.mapping import filtered, observed
-from structgstream.preparation.calibration.pair_matches import MatchConfig, all_matches
 from structgstream.preparation.calibration.pictures import checked_pictures
 from structgstream.preparation.calibration.posed_matches import agreeing_matches
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.calibration.view_graph import Pair, PairConfig, verified_pairs, write_database
+from structgstream.preparation.calibration.view_graph import PairConfig, verified_pairs, write_database
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class TriangulationConfig:
     """
 
     keypoints: KeypointConfig = field(default_factory=KeypointConfig)
-    matching: MatchConfig = field(default_factory=MatchConfig)
+    matching: KeypointMatchConfig = field(default_factory=KeypointMatchConfig)
     pairs: PairConfig = field(default_factory=PairConfig)
     slack_degrees: float = 0.4
     pixels: float = 3.0

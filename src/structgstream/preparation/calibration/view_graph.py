@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.matching import Pair
 from structgstream.preparation.calibration.colmap import pycolmap_module
 from structgstream.preparation.calibration.keypoints import Keypoints
 
-Pair = tuple[str, str]
 Matches = Mapping[Pair, NDArray[np.uint32]]
 
 

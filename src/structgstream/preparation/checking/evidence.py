@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import (
+    Pair,
     angles,
     epipolar_errors,
     fundamental_matrix,
@@ -20,7 +21,7 @@ from structgstream.data.matching import (
     unique_pairs,
     viewing_distance,
 )
-from structgstream.data.pair_matches import MatchConfig, Pair, PairMatcher
+from structgstream.data.pair_matches import MatchConfig, PairMatcher
 from structgstream.frames import MultiViewFrame
 
 ALL_PAIRS = 32  # cameras; with more, only neighbours by the given poses are matched

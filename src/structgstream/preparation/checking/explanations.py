@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.pair_matches import Pair
+from structgstream.data.matching import Pair
 from structgstream.data.pose_check import MISTAKES, reinterpreted
 from structgstream.preparation.checking.evidence import Evidence, pair_error
 from structgstream.preparation.checking.findings import Finding

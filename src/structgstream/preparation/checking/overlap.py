@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
-from structgstream.data.matching import inside, project
-from structgstream.data.pair_matches import Pair
+from structgstream.data.matching import Pair, inside, project
 from structgstream.preparation.checking.findings import Coverage, Finding
 
 LEAST_OVERLAPS = 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from structgstream.cameras import Camera
-from structgstream.data.pair_matches import Pair
+from structgstream.data.matching import Pair
 from structgstream.preparation.checking.evidence import PairError
 from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
 

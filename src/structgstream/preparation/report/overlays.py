@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from structgstream.data.matching import fundamental_matrix
-from structgstream.data.pair_matches import Pair
+from structgstream.data.matching import Pair, fundamental_matrix
 from structgstream.figure import COLORS, INK, figure_of, save_figure
 from structgstream.preparation.checking.check import Examination
 from structgstream.preparation.checking.evidence import pair_errors

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal, best_lag
 from structgstream.preparation.synchronization.solving import Tie
@@ -89,7 +90,7 @@ def audio_ties(sounds: Mapping[str, Sound], *, distances: Mapping[str, float] | 
     return ties
 
 
-def _pairs(names: list[str]) -> list[tuple[str, str]]:
+def _pairs(names: list[str]) -> list[Pair]:
     if len(names) <= ALL_PAIRS:
         return list(combinations(names, 2))
     return [(names[i], names[(i + stride) % len(names)]) for stride in STRIDES for i in range(len(names))]
