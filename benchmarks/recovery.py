@@ -48,7 +48,7 @@ def clock_errors(
     names = [name for name in truth if name in clocks]
     stamps = np.array([[takes[name][0], sum(takes[name]) / 2, takes[name][1]] for name in names])
     true, found = (
-        np.array([own[name].offset_seconds + own[name].rate * row for name, row in zip(names, stamps, strict=True)])
+        np.array([own[name].common_seconds(row) for name, row in zip(names, stamps, strict=True)])
         for own in (truth, clocks)
     )
     slope, shift = np.polyfit(true.ravel(), found.ravel(), 1)

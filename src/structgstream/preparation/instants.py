@@ -53,11 +53,8 @@ def shared_seconds(footage: Footage, clocks: Mapping[str, Clock]) -> tuple[float
     """
     spans = {}
     for name in footage.cameras:
-        clock, stamps = clocks.get(name, Clock()), footage.stamps(name)
-        spans[name] = (
-            clock.offset_seconds + clock.rate * stamps[0],
-            clock.offset_seconds + clock.rate * stamps[-1],
-        )
+        first, last = clocks.get(name, Clock()).common_seconds(footage.stamps(name)[[0, -1]])
+        spans[name] = first, last
     late = max(spans, key=lambda name: spans[name][0])
     early = min(spans, key=lambda name: spans[name][1])
     first, last = spans[late][0], spans[early][1]
@@ -75,8 +72,7 @@ def shots_of(footage: Footage, clocks: Mapping[str, Clock], seconds: Sequence[fl
     """Each camera's pictures nearest to these moments of the shared time."""
     found = {}
     for name in footage.cameras:
-        clock = clocks.get(name, Clock())
-        times = clock.offset_seconds + clock.rate * footage.stamps(name)
+        times = clocks.get(name, Clock()).common_seconds(footage.stamps(name))
         indices = [int(np.abs(times - moment).argmin()) for moment in seconds]
         found[name] = Shots(footage, name, tuple(indices))
     return found

@@ -65,7 +65,7 @@ def synchronization(
     Raises:
         CaptureError: two cameras have no instant in common.
     """
-    common = {name: clocks[name].offset_seconds + clocks[name].rate * own for name, own in stamps.items()}
+    common = {name: clocks[name].common_seconds(own) for name, own in stamps.items()}
     _demand_overlap(common)
     left = frame_residuals(common)
     estimates = {name: ClockEstimate(clocks[name], method, float(uncertainties[name]), left[name]) for name in stamps}
