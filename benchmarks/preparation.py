@@ -9,7 +9,6 @@ from the prepared capture and one from the same videos with the true calibration
 
 import argparse
 import json
-import os
 import shutil
 import sys
 import time
@@ -18,18 +17,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tools.rigs.truth import Truth, read_truth
 
+from benchmarks.exact import stream_scores, write_exact
 from benchmarks.recovery import camera_errors, plain, summary
 from structgstream.data.lenses import LensCamera
-from structgstream.data.points import initial_points
-from structgstream.data.prepared import PreparedCapture, open_prepared, read_prepared, write_prepared
+from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.data.undistortion import rectilinear
 from structgstream.errors import StructGStreamError
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.comparison import rig_alignment
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
@@ -71,6 +67,7 @@ OPTIONS: Mapping[str, Mapping[str, PrepareOptions]] = {
     "mild": {"sfm": PrepareOptions(), "sfm, shared": PrepareOptions(intrinsics="shared")},
     "phone": {"sfm": PrepareOptions(), "sfm, opencv": PrepareOptions(lens="opencv")},
     "fisheye": {"sfm, fisheye": PrepareOptions(lens="fisheye")},
+    "bumped": {"sfm": PrepareOptions(), "sfm, without cam04": PrepareOptions(without=("cam04",))},
 }
 """What is asked for beside size, field of view and the held-out camera, by rig and in a few words."""
 
@@ -124,10 +121,11 @@ def measured(run: Run, folder: Path, work: Path, *, frames: int, streams: bool) 
     content = read_prepared(capture)
     found |= recovered(content, truth, find_footage(videos))
     if streams and truth.held_out is not None:
-        exact = with_truth(content, truth, capture, work / f"{name}-exact")
+        exact = work / f"{name}-exact"
+        write_exact(capture, exact, true_cameras(truth), true_clocks(truth))
         found["psnr"] = {
-            "prepared": held_out_psnr(capture, work / f"{name}.sgs", frames=frames, held_out=truth.held_out),
-            "exact": held_out_psnr(exact, work / f"{name}-exact.sgs", frames=frames, held_out=truth.held_out),
+            kind: stream_scores(folder, work / f"{folder.name}.sgs", preset=SHORT, frames=frames)["psnr"]
+            for kind, folder in {"prepared": capture, "exact": exact}.items()
         }
     return found
 
@@ -153,46 +151,6 @@ def true_cameras(truth: Truth) -> dict[str, LensCamera]:
 def true_clocks(truth: Truth) -> dict[str, Clock]:
     """The clocks of a rig."""
     return {name: Clock(camera.offset_seconds, camera.rate) for name, camera in truth.cameras.items()}
-
-
-def with_truth(content: PreparedCapture, truth: Truth, capture: Path, folder: Path) -> Path:
-    """The prepared capture with the true calibration, in the coordinates and the common time of the prepared one.
-
-    Pictures, near plane and the way in which initial points are found are the same.
-    """
-    shutil.rmtree(folder, ignore_errors=True)
-    cameras = true_cameras(truth)
-    both = {name: cameras[name] for name in content.cameras}
-    moved = rig_alignment(both, {name: camera.filmed for name, camera in content.cameras.items()})
-    clocks = common(true_clocks(truth), {name: camera.clock for name, camera in content.cameras.items()})
-    exact = {}
-    for name, camera in content.cameras.items():
-        filmed = moved.filmed(both[name])
-        pinhole = rectilinear(filmed, degrees=FIELD_OF_VIEW_DEGREES, size=SIZE)
-        exact[name] = replace(camera, filmed=filmed, pinhole=pinhole, clock=clocks[name])
-        target = folder / camera.files
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.link(capture / camera.files, target)
-    written = replace(content, cameras=exact, points=None)
-    write_prepared(folder, written)
-    source = open_prepared(folder)
-    np.save(folder / SEED_POINTS, initial_points(next(source.frames(0)), source.rig).positions)
-    write_prepared(folder, replace(written, points=SEED_POINTS))
-    return folder
-
-
-def common(truth: Mapping[str, Clock], estimate: Mapping[str, Clock]) -> dict[str, Clock]:
-    """The true clocks, with the zero of the estimated common time."""
-    shift = float(np.median([clock.offset_seconds - truth[name].offset_seconds for name, clock in estimate.items()]))
-    return {name: replace(truth[name], offset_seconds=truth[name].offset_seconds + shift) for name in estimate}
-
-
-def held_out_psnr(capture: Path, path: Path, *, frames: int, held_out: str) -> float:
-    """Mean over a short stream's frames of the held-out camera's PSNR, dB."""
-    from structgstream.api import evaluate, reconstruct
-
-    reconstruct(capture, path, preset=SHORT, frames=frames, held_out=(held_out,), overwrite=True)
-    return float(evaluate(path, capture, metrics="basic").mean.psnr)
 
 
 def table(result: Mapping[str, Any]) -> str:
