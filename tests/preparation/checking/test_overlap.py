@@ -2,7 +2,7 @@
 from itertools import combinations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -28,6 +28,7 @@ def test_cameras_are_counted_that_have_a_point_in_their_picture() -> None:
 
 
 @examples(60)
+@example({("cam0", "cam1"), ("cam2", "cam3")})  # two groups of one size: one of them is told
 @given(st.sets(st.sampled_from(EVERY), min_size=1))
 def test_groups_are_those_of_the_graph(pairs: set[tuple[str, str]]) -> None:
     """All but one of the largest groups are told, each camera of them once; so is who has a single neighbour."""

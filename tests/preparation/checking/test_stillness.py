@@ -42,6 +42,14 @@ def test_what_moves_in_the_scene_is_no_motion_of_the_camera() -> None:
     assert picture_shift(view(), other) is None
 
 
+def test_things_that_move_in_several_ways_are_no_motion_of_the_camera() -> None:
+    """Nothing stands still, but no one homography is followed by most."""
+    bands = [
+        view(*shift)[:, 60 * band : 60 * band + 60] for band, shift in enumerate([(9, 0), (0, 9), (-7, 3), (3, -8)])
+    ]
+    assert picture_shift(view(), np.concatenate(bands, axis=1)) is None
+
+
 def test_pictures_of_other_things_and_bare_ones_tell_nothing() -> None:
     assert picture_shift(view(), noise_texture(9, size=SIZE)) is None
     assert picture_shift(view(), np.full_like(view(), 90)) is None

@@ -43,11 +43,11 @@ def test_two_that_agree_with_each_other_only_are_both_off() -> None:
     assert set(verdict(errors, 7).off) == {"cam1", "cam5"}
 
 
-def test_the_worse_one_of_equals_goes_first() -> None:
-    """Of two cameras with one bad pair each, it is that of the larger errors; the other is cleared by that."""
-    errors = {("cam0", "cam1"): PairError(9.0, 0.9, 50), ("cam0", "cam2"): PairError(7.0, 0.9, 50)}
-    errors |= {("cam1", "cam2"): GOOD, ("cam1", "cam3"): GOOD, ("cam2", "cam3"): GOOD}
-    assert verdict(errors, 4).off == ("cam0",)
+def test_of_equal_shares_the_larger_errors_come_first() -> None:
+    """All pairs of the first two cameras are bad."""
+    errors = {("cam0", "cam1"): PairError(9.0, 0.3, 50), ("cam0", "cam2"): PairError(4.0, 0.3, 50)}
+    errors |= {("cam1", "cam3"): PairError(8.0, 0.3, 50), ("cam2", "cam3"): GOOD}
+    assert verdict(errors, 4).off == ("cam1", "cam0")
 
 
 def test_most_pairs_bad_is_no_single_cameras_mistake() -> None:
