@@ -60,7 +60,7 @@ def test_names_are_matched(names: tuple[str, ...], files: tuple[str, ...]) -> No
     [
         (("left", "middle", "right"), ("one", "two", "three")),
         (("cam1", "cam2", "cam3"), ("a1", "a2", "a4")),  # other numbers
-        (("cam1", "cam2", "cam3"), ("a1", "b1", "a2")),  # one number twice
+        (("cam1", "cam2"), ("a1", "b1", "a2")),  # one number twice
         (("left", "right", "up"), ("left_right", "right_1", "up_1")),  # one has two of the words
     ],
 )

@@ -62,14 +62,10 @@ def test_curves_rise_whatever_the_samples_say() -> None:
     assert (np.diff(found) / np.diff(IDENTITY)).min() >= LEAST_SLOPE - 1e-9
 
 
-def test_tones_that_no_sample_has_go_on_smoothly() -> None:
-    """Samples between 0.3 and 0.6 alone: beyond them the curve neither jumps nor turns."""
+def test_tones_that_no_sample_has_go_on_as_their_neighbours() -> None:
     values = np.random.default_rng(0).uniform(0.3, 0.6, 500)
     found = curve_towards(values, values + 0.05, free=slopes())
-    shift = curve(found) - LEVELS
-    assert shift[(LEVELS > 0.3) & (LEVELS < 0.6)] == pytest.approx(0.05, abs=0.01)
-    assert shift.min() > -0.02
-    assert shift.max() < 0.1
+    np.testing.assert_allclose(curve(found) - LEVELS, 0.05, atol=0.005)
 
 
 def test_cameras_meet_in_their_mean() -> None:

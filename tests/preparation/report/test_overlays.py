@@ -11,7 +11,7 @@ import pytest
 from evidence_made import turned
 from memory_captures import MemoryCapture
 from planes import HEIGHT, WIDTH, room_frame, room_rig
-from structgstream.preparation.checking.check import Checked, check_capture
+from structgstream.preparation.checking.check import Checked, check_capture, examine
 from structgstream.preparation.checking.evidence import pair_errors
 from structgstream.preparation.report import overlays
 
@@ -50,6 +50,15 @@ def test_pairs_are_the_worst_of_who_is_off_then_the_worst_and_the_surest(checked
     assert max(errors, key=lambda pair: errors[pair].matches) in pairs
 
 
+def test_where_nobody_is_off_the_worst_pair_is_shown_all_the_same() -> None:
+    rig = room_rig(4)
+    examined = examine(room_frame(rig), rig.cameras)
+    errors = pair_errors(examined.evidence, examined.cameras)
+    first, *others = overlays.chosen_pairs(examined)
+    assert first == max(errors, key=lambda pair: errors[pair].pixels)
+    assert [errors[pair].matches for pair in others] == sorted((errors[pair].matches for pair in others), reverse=True)
+
+
 def lines_and_marks(axis: Any) -> tuple[list[np.ndarray], np.ndarray]:
     """Ends of the coloured lines ``[2, 2]``, and places of the marks, in the order of drawing."""
     lines = [line.get_xydata() for line in axis.lines if len(line.get_xydata()) == 2][1::2]  # a white one is under each
@@ -78,6 +87,7 @@ def test_lines_run_through_their_points_from_border_to_border(drawn: Callable[..
             assert -1e-6 <= y <= HEIGHT + 1e-6
         first = {tuple(line.get_xydata()[0]) for line in left.lines}
         assert first <= {tuple(pixel) for pixel in examined.evidence.pixels(pair)[0]}
+        assert len(first) == overlays.LINES
         spread = np.array(sorted(first))
         apart = np.linalg.norm(spread[:, None] - spread[None], axis=2) + 1e9 * np.eye(len(spread))
         assert apart.min() > 15  # far from each other
