@@ -84,10 +84,9 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     """Run benchmarks, or print a result as Markdown."""
     if sys.argv[1:2] == ["table"]:
-        from benchmarks.report import table
+        from benchmarks.report import print_tables, table
 
-        for path in sys.argv[2:]:
-            print(table(json.loads(Path(path).read_text())))
+        print_tables(sys.argv[2:], table)
         return
     options = parsed()
     result = measured(options)

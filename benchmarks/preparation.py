@@ -21,6 +21,7 @@ from tools.rigs.truth import Truth, read_truth
 
 from benchmarks.exact import stream_scores, write_exact
 from benchmarks.recovery import camera_errors, plain, summary
+from benchmarks.report import print_tables
 from structgstream.data.lenses import LensCamera
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
@@ -208,8 +209,7 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
 def main() -> None:
     """Measures, or prints a result as Markdown."""
     if sys.argv[1:2] == ["table"]:
-        for path in sys.argv[2:]:
-            print(table(json.loads(Path(path).read_text())))
+        print_tables(sys.argv[2:], table)
         return
     from benchmarks.machine import machine
 

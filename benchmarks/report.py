@@ -1,8 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results as text: for the screen while a run goes on, and as the tables of docs/performance.md."""
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
+
+
+def print_tables(files: Iterable[str], table: Callable[[Mapping[str, Any]], str]) -> None:
+    """Prints results, which are files of JSON, as Markdown."""
+    for path in files:
+        print(table(json.loads(Path(path).read_text())))
 
 
 def milliseconds(seconds: float) -> str:

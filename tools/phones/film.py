@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
+from structgstream.data.video_writer import bt709_frame, state_bt709
 from structgstream.data.wrappers import SourceWrapper
 from structgstream.frames import MultiViewFrame
 
@@ -26,8 +27,6 @@ Picture = NDArray[np.uint8]
 TIME_BASE = Fraction(1, 90_000)
 SAMPLE_RATE, BLOCK = 48_000, 1024
 SPEED_OF_SOUND = 343.0
-BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2
-BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
 MOST_OFFSET_FRAMES = 6
 LEAST_SIDE = 64  # a block of x265, which corrupts its memory below that
 JITTER_SECONDS, DROPPED = 0.0015, 0.04
@@ -133,8 +132,7 @@ class PhoneVideo:
         context.codec_tag = "hvc1"
         context.time_base = self._video.time_base = TIME_BASE
         context.options = {**context.options, "x265-params": "log-level=error:pools=none:frame-threads=1"}
-        context.color_range, context.colorspace = LIMITED_RANGE, BT709
-        context.color_primaries, context.color_trc = BT709, BT709
+        state_bt709(context)
         if phone.quarter_turns:
             self._video.set_display_rotation(90 * phone.quarter_turns)
         self._audio = None
@@ -147,17 +145,9 @@ class PhoneVideo:
         if index not in self._phone.frames:
             return
         stored = np.ascontiguousarray(np.rot90(shown, -self._phone.quarter_turns))
-        frame = av.VideoFrame.from_ndarray(stored, format="rgb24").reformat(
-            format="yuv420p10le",
-            src_colorspace=BT709,
-            dst_colorspace=BT709,
-            src_color_range=FULL_RANGE,
-            dst_color_range=LIMITED_RANGE,
-            interpolation=BICUBIC | ACCURATE_ROUNDING,
-        )
+        frame = bt709_frame(stored, pixels="yuv420p10le")
         stamp = self._phone.stamps[self._phone.frames.index(index)]
         frame.pts, frame.time_base = round(stamp / TIME_BASE), TIME_BASE
-        frame.color_range, frame.colorspace = LIMITED_RANGE, BT709
         self._container.mux(self._video.encode(frame))
 
     def close(self) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tools.rigs.sound import SAMPLE_RATE
 
+from structgstream.data.video_writer import bt709_frame, state_bt709
+
 TIME_BASE = Fraction(1, 90_000)
-BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2
-BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
 CRF = 14
 
 
@@ -44,8 +44,7 @@ def write_video(
         context = video.codec_context
         context.bit_rate = 0  # a rate left at its default would win over the constant quality
         context.time_base = TIME_BASE
-        context.color_range, context.colorspace = LIMITED_RANGE, BT709
-        context.color_primaries, context.color_trc = BT709, BT709
+        state_bt709(context)
         video.pix_fmt = "yuv420p"
         audio = None
         if sound is not None:
@@ -54,16 +53,8 @@ def write_video(
         for number, (picture, stamp) in enumerate(zip(pictures, stamps, strict=True)):
             if number == 0:
                 video.height, video.width = picture.shape[:2]
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
-                format="yuv420p",
-                src_colorspace=BT709,
-                dst_colorspace=BT709,
-                src_color_range=FULL_RANGE,
-                dst_color_range=LIMITED_RANGE,
-                interpolation=BICUBIC | ACCURATE_ROUNDING,
-            )
+            frame = bt709_frame(picture)
             frame.pts, frame.time_base = round(stamp / TIME_BASE), TIME_BASE
-            frame.color_range, frame.colorspace = LIMITED_RANGE, BT709
             container.mux(video.encode(frame))
         container.mux(video.encode())
         if audio is not None and sound is not None:

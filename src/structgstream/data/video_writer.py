@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType, TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         self._stream.pix_fmt = "yuv420p"
         context = self._stream.codec_context
         context.bit_rate = 0  # a rate left at its default would win over the constant quality
-        context.color_range, context.colorspace = LIMITED_RANGE, BT709
-        context.color_primaries, context.color_trc = BT709, BT709
+        state_bt709(context)
 
     def write(self, picture: NDArray[np.uint8]) -> None:
         """Adds a picture ``[H, W, 3]`` sRGB.
@@ -61,16 +61,8 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if self._count == 0:
             self._stream.height, self._stream.width = even.shape[:2]
-        frame = self._av.VideoFrame.from_ndarray(even, format="rgb24").reformat(
-            format="yuv420p",
-            src_colorspace=BT709,
-            dst_colorspace=BT709,
-            src_color_range=FULL_RANGE,
-            dst_color_range=LIMITED_RANGE,
-            interpolation=BICUBIC | ACCURATE_ROUNDING,
-        )
+        frame = bt709_frame(even)
         frame.pts, frame.time_base = self._count, 1 / self._fps
-        frame.color_range, frame.colorspace = LIMITED_RANGE, BT709
         self._count += 1
         self._mux(frame)
 
@@ -93,6 +85,34 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
             self._container.mux(self._stream.encode(frame))  # pyright: ignore[reportArgumentType]
         except (OSError, self._av.error.FFmpegError) as error:
             raise StorageError(f"The video {self.path} cannot be written ({error.strerror}).") from None
+
+
+def state_bt709(codec_context: Any) -> None:
+    """Writes into a stream of PyAV that its frames are those of :func:`bt709_frame`."""
+    codec_context.color_range, codec_context.colorspace = LIMITED_RANGE, BT709
+    codec_context.color_primaries, codec_context.color_trc = BT709, BT709
+
+
+def bt709_frame(picture: NDArray[np.uint8], *, pixels: str = "yuv420p") -> Any:
+    """A picture ``[H, W, 3]`` sRGB as a frame of PyAV, without a time stamp: BT.709, limited range.
+
+    Args:
+        pixels: FFmpeg's name of the pixel format.
+
+    Raises:
+        MissingExtraError: PyAV is not installed.
+    """
+    frame = _av().VideoFrame.from_ndarray(picture, format="rgb24")
+    frame = frame.reformat(
+        format=pixels,
+        src_colorspace=BT709,
+        dst_colorspace=BT709,
+        src_color_range=FULL_RANGE,
+        dst_color_range=LIMITED_RANGE,
+        interpolation=BICUBIC | ACCURATE_ROUNDING,
+    )
+    frame.color_range, frame.colorspace = LIMITED_RANGE, BT709
+    return frame
 
 
 def _av() -> ModuleType:

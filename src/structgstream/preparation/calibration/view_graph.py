@@ -49,24 +49,6 @@ def verified_pairs(
     Args:
         cameras: of pycolmap, with the focal lengths to begin with.
     """
-    found = pair_geometries(keypoints, matches, cameras, seed=seed, workers=workers, config=config)
-    return {
-        pair: geometry
-        for pair, geometry in found.items()
-        if len(geometry.inlier_matches) >= max(config.least, config.least_share * len(matches[pair]))
-    }
-
-
-def pair_geometries(
-    keypoints: Mapping[str, Keypoints],
-    matches: Matches,
-    cameras: Mapping[str, Any],
-    *,
-    seed: int,
-    workers: int,
-    config: PairConfig = PairConfig(),
-) -> dict[Pair, Any]:
-    """Robust two-view geometries of all pairs with at least ``config.least`` matches."""
     pycolmap = pycolmap_module()
 
     def estimate(pair: Pair) -> Any:
@@ -84,7 +66,12 @@ def pair_geometries(
 
     pairs = [pair for pair, found in matches.items() if len(found) >= config.least]
     with ThreadPoolExecutor(workers) as pool:
-        return dict(zip(pairs, pool.map(estimate, pairs), strict=True))
+        found = dict(zip(pairs, pool.map(estimate, pairs), strict=True))
+    return {
+        pair: geometry
+        for pair, geometry in found.items()
+        if len(geometry.inlier_matches) >= max(config.least, config.least_share * len(matches[pair]))
+    }
 
 
 def write_database(

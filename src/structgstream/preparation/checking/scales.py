@@ -21,6 +21,7 @@ UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000
          "metres)", 100.0: "100 times too small (metres among centimetres)", 0.01: "100 times too large (centimetres "
          "among metres)"}  # fmt: skip
 FIT = 0.5
+LEAST_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
 
 
 def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Floats:
@@ -95,9 +96,14 @@ def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> s
     typical = float(np.median(depths))
     if fits >= FIT and 0.02 < _typical_depth(points, cameras) / typical < 50:
         return None
-    apart = {factor: abs(np.log(_typical_depth(points * factor, cameras) / typical)) for factor in FACTORS}
-    likely = min(FACTORS, key=lambda factor: apart[factor])
-    if apart[likely] < np.log(5):
+    extent = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    apart = {
+        factor: abs(np.log(_typical_depth(points * factor, cameras) / typical))
+        for factor in FACTORS
+        if factor * extent > LEAST_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
+    }
+    likely = min(apart, key=lambda factor: apart[factor], default=None)
+    if likely is not None and apart[likely] < np.log(5):
         return (
             f"The points that come with the capture lie at impossible depths: they look {UNITS[likely]}; convert "
             "points and positions of cameras to one unit, or leave the points out."

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.matching import load_cv2, sift_features
 from structgstream.preparation.checking.findings import Finding
 
@@ -54,18 +55,15 @@ def picture_shift(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float | N
     before, after = (sift_features(picture, count=KEYPOINTS) for picture in (one, other))
     if min(len(before.pixels), len(after.pixels)) < LEAST_MATCHES:
         return None
-    similarity = before.descriptors @ after.descriptors.T
-    best = similarity.argmax(1)
-    two = np.sqrt(np.maximum(2 - 2 * np.partition(similarity, -2, axis=1)[:, -2:], 0))
-    kept = np.flatnonzero((similarity.argmax(0)[best] == np.arange(len(best))) & (two[:, 1] < RATIO * two[:, 0]))
-    if len(kept) < LEAST_MATCHES:
+    rows, columns = mutual_matches(before.descriptors, after.descriptors, ratio=RATIO).T
+    if len(rows) < LEAST_MATCHES:
         return None
-    start, end = before.pixels[kept], after.pixels[best[kept]]
+    start, end = before.pixels[rows], after.pixels[columns]
     still = STILL_PIXELS * max(one.shape[1] / 1000, 1)
     apart = np.linalg.norm(end - start, axis=1)
     if (apart < still).mean() > STILL_SHARE:
         return None
     _, mask = cv2.findHomography(start, end, cv2.RANSAC, 2 * still)
-    follows = np.zeros(len(kept), bool) if mask is None else mask.ravel().astype(bool)
+    follows = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
     shift = float(np.median(apart[follows])) if follows.any() else 0.0
     return shift if follows.mean() > MOVED_SHARE and shift > still else None

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
+from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, load_cv2, sift_features
 from structgstream.preparation.synchronization.epipolar import PairGeometry
@@ -61,7 +62,7 @@ class StaticGeometry:
         one, other = self.features[first], self.features[second]
         if min(len(one.pixels), len(other.pixels)) < LEAST_INLIERS:
             return None
-        matches = _mutual_matches(one, other)
+        matches = mutual_matches(one.descriptors, other.descriptors, ratio=RATIO)
         if len(matches) < LEAST_INLIERS:
             return None
         F, inliers = load_cv2().findFundamentalMat(
@@ -87,20 +88,6 @@ def static_features(pictures: list[NDArray[np.uint8]]) -> Features:
     still = np.median(np.stack(reduced), axis=0).astype(np.uint8)
     found = sift_features(still, count=FEATURES, contrast=0.005)
     return Features(found.pixels * [width / size[0], height / size[1]], found.descriptors)
-
-
-def _mutual_matches(one: Features, other: Features) -> NDArray[np.intp]:
-    """Pairs ``[S, 2]`` of features that are each other's nearest, the second nearest being clearly farther."""
-    similarity = one.descriptors @ other.descriptors.T
-    nearest = similarity.argmax(1)
-    rows = np.arange(len(nearest))
-    best = similarity[rows, nearest]
-    back = similarity.argmax(0)
-    similarity[rows, nearest] = -1
-    second = similarity.max(1)
-    distinct = np.sqrt(np.maximum(2 - 2 * best, 0)) < RATIO * np.sqrt(np.maximum(2 - 2 * second, 1e-12))
-    kept = np.flatnonzero(distinct & (back[nearest] == rows))
-    return np.stack([kept, nearest[kept]], axis=1)
 
 
 def _same(pixels: Floats) -> Floats:

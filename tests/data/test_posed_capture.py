@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of a calibration for pictures of some names and sizes; whole captures are opened in ``test_colmap_capture``
+and ``test_calibrated_capture``."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from captures import HEIGHT, WIDTH, small_rig
+from structgstream.data.lenses import RadialTangential
+from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.posed_capture import filmed_by
+from structgstream.errors import CalibrationError
+
+LENS = RadialTangential(k1=-0.1)
+ROOT = Path("take")
+
+
+def calibration(names: Sequence[str], *, size: tuple[int, int] | None = (WIDTH, HEIGHT)) -> Calibration:
+    """Cameras of an arc; those of the names beyond them stand where the first does."""
+    rig = list(small_rig(max(len(names), 3)).cameras.values())
+    cameras = [
+        PosedCamera(name, own.viewmat.numpy(), own.K.numpy(), size, LENS) for name, own in zip(names, rig, strict=False)
+    ]
+    return Calibration(Path("rig.json"), tuple(cameras))
+
+
+def owners(found: dict, given: Calibration) -> dict[str, str]:
+    """The calibrated camera of each file, by its pose."""
+    poses = {camera.name: camera.viewmat for camera in given.cameras}
+    return {
+        name: next(own for own, pose in poses.items() if np.allclose(pose, camera.camera.viewmat))
+        for name, camera in found.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (("left", "middle", "right"), ("left", "middle", "right")),
+        (("left", "middle", "right"), ("take2_left", "middle-0007", "right.raw")),
+        (("cam_1", "cam_2", "cam_10"), ("Camera01", "Camera02", "Camera10")),
+        (("images/left/0001.png", "images/middle/0001.png", "images/right/0001.png"), ("left", "middle", "right")),
+        (("left.png", "middle.png", "right.png"), ("left", "middle", "right")),
+    ],
+)
+def test_names_are_matched(names: tuple[str, ...], files: tuple[str, ...]) -> None:
+    given = calibration(names)
+    found = filmed_by(given, dict.fromkeys(reversed(files), (WIDTH, HEIGHT)), root=ROOT)
+    assert owners(found, given) == dict(zip(files, names, strict=True))
+    assert list(found) == list(reversed(files))  # the order of the pictures
+    assert {camera.lens for camera in found.values()} == {LENS}
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (("left", "middle", "right"), ("one", "two", "three")),
+        (("cam1", "cam2", "cam3"), ("a1", "a2", "a4")),  # other numbers
+        (("cam1", "cam2"), ("a1", "b1", "a2")),  # one number twice
+        (("left", "right", "up"), ("left_right", "right_1", "up_1")),  # one has two of the words
+    ],
+)
+def test_names_that_do_not_fit_are_not_guessed(names: tuple[str, ...], files: tuple[str, ...]) -> None:
+    with pytest.raises(CalibrationError, match="belongs to the pictures in take: the one names"):
+        filmed_by(calibration(names), dict.fromkeys(files, (WIDTH, HEIGHT)), root=ROOT)
+
+
+def test_a_camera_without_calibration_is_named() -> None:
+    sizes = dict.fromkeys(("cam0", "cam1", "cam2", "extra"), (WIDTH, HEIGHT))
+    with pytest.raises(CalibrationError, match="extra"):
+        filmed_by(calibration(("cam0", "cam1", "cam2")), sizes, root=ROOT)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_intrinsics_follow_the_size_of_the_pictures(factor: float) -> None:
+    given = calibration(("cam0", "cam1", "cam2"))
+    size = round(WIDTH * factor), round(HEIGHT * factor)
+    for name, camera in filmed_by(given, {own.name: size for own in given.cameras}, root=ROOT).items():
+        own = next(own for own in given.cameras if own.name == name)
+        np.testing.assert_allclose(camera.camera.K[:2], factor * own.K[:2])
+        assert (camera.camera.width, camera.camera.height) == size
+
+
+def test_a_calibration_without_sizes_is_of_the_pictures() -> None:
+    given = calibration(("cam0", "cam1", "cam2"), size=None)
+    found = filmed_by(given, {own.name: (99, 33) for own in given.cameras}, root=ROOT)
+    np.testing.assert_allclose(found["cam1"].camera.K, given.cameras[1].K)
+
+
+def test_a_crop_is_no_reduction() -> None:
+    given = calibration(("cam0", "cam1", "cam2"))
+    sizes = {own.name: (WIDTH, HEIGHT) for own in given.cameras} | {"cam1": (WIDTH, HEIGHT - 6)}
+    with pytest.raises(CalibrationError, match="'cam1' have 64x42 pixels, .*other proportions"):
+        filmed_by(given, sizes, root=ROOT)
+    rounded = sizes | {"cam1": (WIDTH // 2, HEIGHT // 2 + 1)}  # a tool that rounds up
+    assert filmed_by(given, rounded, root=ROOT)["cam1"].camera.height == HEIGHT // 2 + 1
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.005, False), (0.03, True)])
+def test_poses_of_one_camera_must_agree(share: float, moves: bool) -> None:
+    """Two pictures of one camera; the second is estimated a share of the rig's extent away."""
+    given = calibration(("a/1.png", "b/1.png", "c/1.png"))
+    centers = np.array([camera.center for camera in given.cameras])
+    again = given.cameras[0].viewmat.copy()
+    again[:3, 3] += again[:3, :3] @ [share * np.linalg.norm(np.ptp(centers, axis=0)), 0, 0]
+    given = replace(given, cameras=(*given.cameras, replace(given.cameras[0], name="a/2.png", viewmat=again)))
+    sizes = dict.fromkeys("abc", (WIDTH, HEIGHT))
+    if moves:
+        with pytest.raises(CalibrationError, match=r"'a' moves in rig\.json: 'a/1\.png' and 'a/2\.png'"):
+            filmed_by(given, sizes, root=ROOT)
+    else:
+        assert owners(filmed_by(given, sizes, root=ROOT), given)["a"] == "a/1.png"  # the first one's pose

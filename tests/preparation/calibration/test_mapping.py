@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""COLMAP's mappers and its adjustment on matches that are made, whose cameras are known."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from filmed import ring
+from structgstream.data.lenses import LensCamera
+from structgstream.preparation.calibration.colmap import colmap_camera
+from structgstream.preparation.calibration.comparison import calibration_errors
+from structgstream.preparation.calibration.mapping import Freedom, Mapper, adjust, cameras_of, filtered, mapped, size_of
+from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model
+from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
+from views_made import cloud, keypoints_of, matches_of
+
+RIG = ring(5, radius=2.6, arc_degrees=80)
+NOTHING, FOCAL = Freedom(False, False, False), Freedom(True, False, False)
+
+
+def graph_of(rig: Mapping[str, LensCamera], *, noise: float = 0.1) -> PosedGraph:
+    keypoints, matches = keypoints_of(rig, cloud(), noise=noise), matches_of(rig, cloud())
+    cameras = {name: colmap_camera(filmed, number) for number, (name, filmed) in enumerate(rig.items(), 1)}
+    geometries = verified_pairs(keypoints, matches, cameras, seed=0, workers=1)
+    return PosedGraph(keypoints, {pair: found.inlier_matches for pair, found in geometries.items()}, geometries)
+
+
+def zoomed(factor: float, *, center: float = 0.0) -> dict[str, LensCamera]:
+    """The rig with other focal lengths, and principal points moved to the right."""
+    found = {}
+    for name, filmed in RIG.items():
+        K = filmed.camera.K.clone()
+        K[[0, 1], [0, 1]] *= factor
+        K[0, 2] += center
+        found[name] = replace(filmed, camera=replace(filmed.camera, K=K))
+    return found
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_a_mapper_places_all_cameras(tmp_path: Path, mapper: Mapper) -> None:
+    graph = graph_of(RIG)
+    cameras = {name: colmap_camera(filmed, number) for number, (name, filmed) in enumerate(RIG.items(), 1)}
+    database = tmp_path / "database.db"
+    write_database(database, graph.keypoints, cameras, graph.geometries)
+    model = mapped(database, mapper=mapper, freedom=NOTHING, fixed=frozenset(), seed=0)
+    assert model is not None
+    assert size_of(model)[0] == 5
+    adjust(model, freedom=NOTHING)
+    for error in calibration_errors(cameras_of(model), RIG).values():
+        assert error.rotation_degrees < 0.05
+        assert error.position_percent < 0.2
+        assert error.focal_percent == 0
+
+
+def test_adjusting_finds_focal_lengths_only_where_they_are_free() -> None:
+    model = posed_model(graph_of(RIG), zoomed(1.03), pixels=20.0, slack_degrees=3.0)
+    adjust(model, freedom=FOCAL, fixed=frozenset({2}))
+    found = {name: float(camera.camera.K[0, 0]) for name, camera in cameras_of(model).items()}
+    assert {name for name, focal in found.items() if focal == pytest.approx(1.03 * 420, abs=1e-6)} == {"cam01"}
+    free = posed_model(graph_of(RIG), zoomed(1.03), pixels=20.0, slack_degrees=3.0)
+    adjust(free, freedom=FOCAL)
+    assert all(float(camera.camera.K[0, 0]) == pytest.approx(420, abs=2) for camera in cameras_of(free).values())
+
+
+def test_without_poses_only_points_move() -> None:
+    model = posed_model(graph_of(RIG, noise=1.0), RIG, pixels=5.0, slack_degrees=1.0)
+    places = np.array([model.point3D(number).xyz for number in sorted(model.point3D_ids())])
+    adjust(model, freedom=NOTHING, poses=False)
+    for name, filmed in cameras_of(model).items():
+        torch.testing.assert_close(filmed.camera.viewmat, RIG[name].camera.viewmat, rtol=0, atol=1e-12)
+    moved = np.array([model.point3D(number).xyz for number in sorted(model.point3D_ids())]) - places
+    assert np.linalg.norm(moved, axis=1).max() > 1e-4
+
+
+def test_principal_points_are_held_near_the_middle_and_the_model_is_as_before() -> None:
+    """The rig has them 3 and 2 pixels beside it; the pictures that hold them are gone afterwards."""
+    model = posed_model(graph_of(RIG), zoomed(1.0, center=15.0), pixels=20.0, slack_degrees=3.0)
+    before = sorted(model.reg_image_ids()), len(model.point3D_ids())
+    adjust(model, freedom=Freedom(True, True, False))
+    assert (sorted(model.reg_image_ids()), len(model.point3D_ids())) == before
+    for camera in cameras_of(model).values():
+        assert abs(float(camera.camera.K[0, 2]) - 240) < 8
+        assert abs(float(camera.camera.K[1, 2]) - 180) < 8
+
+
+def test_filtering_removes_what_is_far_off_or_seen_from_one_side() -> None:
+    graph = graph_of(RIG)
+    model = posed_model(graph, RIG, pixels=4.0, slack_degrees=1.0)
+    assert filtered(model, pixels=2.0, degrees=1.5) == 0
+    count = len(model.point3D_ids())
+    assert filtered(model, pixels=2.0, degrees=89.0) > 0
+    assert len(model.point3D_ids()) < count

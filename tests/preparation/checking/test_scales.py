@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
+from structgstream.data.matching import project
+from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
+from structgstream.preparation.checking.tracks import build_tracks
+
+WORLD = scattered(200)
+
+
+def depths_of(cameras: Cameras) -> np.ndarray:
+    return np.concatenate([project(camera, WORLD)[1] for camera in cameras.values()])
+
+
+def told(cameras: Cameras, points: np.ndarray | None = None, *, radius: float = 3.0, unit: str | None = None) -> str:
+    """The sentences of all findings, each of which is an error."""
+    findings = scale_findings(depths_of(wide_ring(4)), points, cameras, radius=radius, unit=unit)
+    assert all(finding.severity == "error" for finding in findings)
+    return "\n".join(finding.sentence for finding in findings)
+
+
+def test_depths_are_of_the_cameras_that_observed_and_are_not_off() -> None:
+    cameras = wide_ring(5)
+    stated = {**cameras, "cam2": turned(cameras["cam2"], 20)}
+    tracks = build_tracks(evidence_of(cameras, WORLD[:60]), stated, off=["cam2"])
+    found = observed_depths(tracks, stated, off=["cam2"])
+    true = np.concatenate([project(cameras[name], WORLD[:60])[1] for name in cameras if name != "cam2"])
+    np.testing.assert_allclose(np.sort(found), np.sort(true), atol=1e-5)
+
+
+def test_the_nearest_depth_is_that_of_few_points_and_needs_some() -> None:
+    depths = np.concatenate([np.linspace(2, 4, 1000), [-5.0] * 50])
+    assert nearest_depth(depths) == pytest.approx(2.01, abs=0.005)  # 0.5 % of those in front are nearer
+    assert nearest_depth(depths[:29]) is None
+
+
+def with_near(near: float) -> Cameras:
+    return {name: replace(camera, near=near) for name, camera in wide_ring(4).items()}
+
+
+def test_a_near_plane_in_front_of_nearly_all_points_is_fine() -> None:
+    at = float(np.percentile(depths_of(wide_ring(4)), 1))
+    assert told(with_near(at)) == ""
+
+
+def test_a_near_plane_that_cuts_gets_one_that_does_not() -> None:
+    depths = depths_of(wide_ring(4))
+    sentence = told(with_near(float(np.percentile(depths, 30))))
+    assert "beyond 30% of the points" in sentence
+    assert "units of length" not in sentence
+    proposed = float(sentence.split("--near ")[1].rstrip("."))
+    assert depths.min() / 3 < proposed < depths.min()
+    assert "look like different units of length" in told(with_near(3000.0))
+
+
+@pytest.mark.parametrize(
+    ("radius", "unit", "sentence"),
+    [
+        (3000.0, "metres", "look like millimetres or centimetres"),
+        (0.003, "metres", "look like kilometres"),
+        (3.0, "metres", ""),
+        (3000.0, None, ""),
+    ],
+)
+def test_a_rig_is_no_larger_than_a_stadium_and_no_smaller_than_a_hand(
+    radius: float, unit: str | None, sentence: str
+) -> None:
+    found = told(wide_ring(4), radius=radius, unit=unit)
+    assert sentence in found
+    assert bool(sentence) == bool(found)
+
+
+@pytest.mark.parametrize(
+    ("points", "sentence"),
+    [
+        (WORLD, ""),
+        (0.001 * WORLD + (0, 0, 0.4), ""),  # small and in sight: no unit can be told from that
+        (1000 * WORLD, "1000 times too large"),
+        (100 * WORLD, "100 times too large"),
+        (np.add(WORLD, (0, -40, 0)), "where two cameras see them: they are of other cameras"),
+        (WORLD[:20] * 1000, ""),  # too few to say anything
+    ],
+)
+def test_points_that_came_along_must_lie_where_cameras_look(points: np.ndarray, sentence: str) -> None:
+    found = told(wide_ring(4), points)
+    assert sentence in found
+    assert bool(sentence) == bool(found)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+
+from evidence_made import evidence_of, scattered, turned, wide_ring
+from structgstream.data.matching import project
+from structgstream.preparation.checking.evidence import Evidence
+from structgstream.preparation.checking.tracks import Tracks, build_tracks
+
+
+def truth_of(tracks: Tracks, evidence: Evidence, name: str) -> np.ndarray:
+    """Which point of the world each observation of a camera is of; keypoints are numbered as points are."""
+    apart = np.linalg.norm(tracks.pixels[tracks.of(name)][:, None] - evidence.keypoints[name][None], axis=2)
+    return apart.argmin(1)
+
+
+def test_points_are_where_they_are() -> None:
+    cameras, world = wide_ring(5), scattered(50)
+    evidence = evidence_of(cameras, world)
+    tracks = build_tracks(evidence, cameras)
+    assert len(tracks.points) == 50
+    assert tracks.views.tolist() == [5] * 50
+    assert tracks.residuals.max() < 1e-5
+    of_world = truth_of(tracks, evidence, "cam2")
+    np.testing.assert_allclose(tracks.points[tracks.point[tracks.of("cam2")]], world[of_world], atol=1e-6)
+
+
+def test_a_camera_that_is_off_moves_no_point_and_keeps_its_observations() -> None:
+    cameras, world = wide_ring(5), scattered(50)
+    evidence = evidence_of(cameras, world)
+    stated = {**cameras, "cam1": turned(cameras["cam1"], 2.0)}
+    tracks = build_tracks(evidence, stated, off=["cam1"])
+    assert tracks.residuals[~tracks.of("cam1")].max() < 1e-5
+    own = tracks.of("cam1")
+    of_world = truth_of(tracks, evidence, "cam1")
+    apart = np.linalg.norm(project(stated["cam1"], world)[0] - evidence.keypoints["cam1"], axis=1)
+    np.testing.assert_allclose(tracks.residuals[own], apart[of_world], atol=1e-3)
+    assert apart.min() > 20
+
+
+def test_a_point_with_two_keypoints_in_one_picture_is_left_out() -> None:
+    cameras = wide_ring(3)
+    evidence = evidence_of(cameras, scattered(20))
+    twice = np.concatenate([evidence.keypoints["cam1"], evidence.keypoints["cam1"][:1] + 0.1])
+    other = evidence.matches["cam1", "cam2"].copy()
+    other[0, 0] = 20  # cam0 has matched keypoint 0 of cam1, cam2 its twin
+    evidence = replace(
+        evidence,
+        keypoints={**evidence.keypoints, "cam1": twice},
+        matches={**evidence.matches, ("cam1", "cam2"): other},
+    )
+    assert len(build_tracks(evidence, cameras).points) == 19
+
+
+def test_a_wrong_match_along_its_line_spoils_no_point() -> None:
+    """Point 0 is seen by four cameras; the fifth has another thing on the same ray of the first camera."""
+    cameras, world = wide_ring(5), scattered(30)
+    evidence = evidence_of(cameras, world)
+    behind = world[:1] + 0.03 * (world[:1] - cameras["cam0"].center.numpy())
+    wrong = evidence.keypoints["cam4"].copy()
+    wrong[0] = project(cameras["cam4"], behind)[0][0]
+    matches = {pair: rows[rows[:, 0] > 0] if "cam4" in pair and "cam0" not in pair else rows for pair, rows in
+               evidence.matches.items()}  # fmt: skip
+    tracks = build_tracks(replace(evidence, keypoints={**evidence.keypoints, "cam4": wrong}, matches=matches), cameras)
+    of_world = truth_of(tracks, evidence, "cam1")
+    place = tracks.points[tracks.point[tracks.of("cam1")]][of_world == 0]
+    np.testing.assert_allclose(place, world[:1], atol=1e-5)
+    assert (tracks.residuals > 3).sum() == 1
+    assert tracks.names[int(tracks.camera[tracks.residuals.argmax()])] == "cam4"
+
+
+def test_without_matches_there_are_no_points() -> None:
+    cameras = wide_ring(3)
+    none = {pair: np.empty((0, 2), np.intp) for pair in (("cam0", "cam1"), ("cam1", "cam2"))}
+    tracks = build_tracks(replace(evidence_of(cameras, scattered(5)), matches=none), cameras)
+    assert tracks.points.shape == (0, 3)
+    assert len(tracks.residuals) == 0

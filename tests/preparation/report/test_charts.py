@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What charts show, read from the figures; that they are written is tried in ``test_write``."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from planes import room_frame, room_rig
+from structgstream.figure import COLORS
+from structgstream.preparation.checking.check import Examination, examine
+from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Coverage, PairCheck
+from structgstream.preparation.report import charts
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Calls a function that draws, and returns its figure."""
+
+    def draw(function: Callable[..., None], *arguments: Any, **keywords: Any) -> Any:
+        kept: list[Any] = []
+        monkeypatch.setattr(charts, "save_figure", lambda figure, path: kept.append(figure))
+        function(Path("unused.png"), *arguments, **keywords)
+        (figure,) = kept
+        return figure
+
+    return draw
+
+
+def report_of(cameras: dict[str, CameraCheck], pairs: tuple[PairCheck, ...] = ()) -> CheckReport:
+    return CheckReport("take", 0, cameras, pairs, Coverage(0, 0.0, 0.0), (), 1.0, 0.1, None)
+
+
+def test_the_matrix_has_every_pair_on_both_sides_of_its_diagonal(drawn: Callable[..., Any]) -> None:
+    plain = CameraCheck(None, None, 0, 0)
+    pairs = (PairCheck("a", "b", 40, 0.5, 0.0), PairCheck("c", "b", 30, 7.25, 0.9), PairCheck("a", "c", 0, None, None))
+    figure = drawn(charts.draw_matrix, report_of(dict.fromkeys("abc", plain), pairs), limit_pixels=2.0)
+    axis = figure.axes[0]
+    (shown,) = axis.images
+    values = np.ma.filled(shown.get_array().astype(float), np.nan)
+    nan = np.nan
+    np.testing.assert_array_equal(values, [[nan, 0.5, nan], [0.5, nan, 7.25], [nan, 7.25, nan]])
+    assert shown.get_clim() == (0, 4)
+    texts = {(int(text.get_position()[0]), int(text.get_position()[1])): text.get_text() for text in axis.texts}
+    assert texts == {(0, 1): "0.5", (1, 0): "0.5", (1, 2): "7.2", (2, 1): "7.2"}
+
+
+def test_colours_are_bars_of_the_cameras_that_were_compared(drawn: Callable[..., Any]) -> None:
+    cameras = {
+        "a": CameraCheck(None, None, 0, 0, exposure_stops=-1.5, red_stops=0.1, blue_stops=0.2),
+        "b": CameraCheck(None, None, 0, 0),
+        "c": CameraCheck(None, None, 0, 0, exposure_stops=0.0, red_stops=-0.3, blue_stops=0.0),
+    }
+    axis = drawn(charts.draw_colors, report_of(cameras)).axes[0]
+    heights = {bars.get_label(): [bar.get_height() for bar in bars] for bars in axis.containers}
+    assert heights == {"exposure": [-1.5, 0.0], "red / green": [0.1, -0.3], "blue / green": [0.2, 0.0]}
+    assert [label.get_text() for label in axis.get_xticklabels()] == ["a", "c"]
+    low, high = axis.get_ylim()
+    assert low < -1.5
+    assert high == -low
+
+
+def test_late_cameras_are_red_and_all_bars_fit(drawn: Callable[..., Any]) -> None:
+    late = {"a": 0.5, "b": -6.0, "c": 4.9, "d": 30.0}
+    cameras = {
+        name: CameraCheck(None, None, 0, 0, offset_ms=offset, offset_uncertainty_ms=2.0)
+        for name, offset in late.items()
+    } | {"e": CameraCheck(None, None, 0, 0)}
+    axis = drawn(charts.draw_times, report_of(cameras)).axes[0]
+    points = {
+        to_hex(container.lines[0].get_color()): dict(zip(*map(list, container.lines[0].get_data()), strict=True))
+        for container in axis.containers
+    }
+    assert points == {to_hex(COLORS[0]): {0: 0.5, 2: 4.9}, to_hex(COLORS[3]): {1: -6.0, 3: 30.0}}
+    low, high = axis.get_ylim()
+    assert high > 34
+    assert low == -high
+
+
+@pytest.fixture(scope="module")
+def examined() -> Examination:
+    rig = room_rig(5)
+    return examine(room_frame(rig), rig.cameras)
+
+
+def test_the_rig_is_drawn_upright_and_in_its_proportions(drawn: Callable[..., Any], examined: Examination) -> None:
+    """Cameras of the room stand at two heights that are 0.3 apart, on an arc of radius 2.5 over 0.8 radians."""
+    above, side, _ = drawn(charts.draw_coverage, examined, near=0.1, unit="metres").axes
+    places = []
+    for axis in (above, side):
+        squares = [line.get_xydata()[0] for line in axis.lines if line.get_marker() == "s"]
+        assert len(squares) == 5
+        places.append(np.array(squares))
+    across, height = places[0][:, 0], places[1][:, 1]
+    assert np.ptp(across) == pytest.approx(2 * 2.5 * np.sin(0.4), abs=0.02)
+    np.testing.assert_allclose(np.diff(height), [0.3, -0.3, 0.3, -0.3], atol=1e-6)
+    np.testing.assert_allclose(places[0][:, 1], places[1][:, 0], atol=1e-9)  # depth is in both
+    ahead = np.median(examined.tracks.points[:, 2])
+    assert 0.3 < ahead < 1.6  # the room lies in front of the cameras
+    (points,) = above.collections
+    assert np.median(np.asarray(points.get_offsets())[:, 1]) > places[0][:, 1].max()
+
+
+def test_names_are_told_once_each(drawn: Callable[..., Any], examined: Examination) -> None:
+    above, side, _ = drawn(charts.draw_coverage, examined, near=0.1, unit="metres").axes
+    told = [name for text in above.texts for name in text.get_text().split("\n") if name]
+    assert sorted(told) == sorted(examined.cameras)
+    assert not any(text.get_text() for text in side.texts)

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from structgstream.errors import CaptureError, StorageError
+from structgstream.preparation.claiming import SOURCE, claim
+from structgstream.preparation.steps import FOLDER
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    (tmp_path / "take").mkdir()
+    return tmp_path / "take"
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_new_or_an_empty_folder_is_claimed_for_good(tmp_path: Path, videos: Path, there: bool) -> None:
+    capture = tmp_path / "out" / "capture"
+    if there:
+        capture.mkdir(parents=True)
+    claim(capture, videos)
+    marker = capture / FOLDER / SOURCE
+    written = marker.read_bytes()
+    (capture / "capture.json").write_text("{}")
+    claim(capture, videos)
+    claim(tmp_path / "out" / ".." / "out" / "capture", tmp_path / "take" / ".." / "take")
+    assert marker.read_bytes() == written
+
+
+@pytest.mark.parametrize("broken", ["{", "[]", '{"other": 1}'])
+def test_a_capture_of_other_videos_is_left_alone(tmp_path: Path, videos: Path, broken: str) -> None:
+    claim(tmp_path / "capture", videos)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(CaptureError, match=rf"was prepared from {videos}, not from {tmp_path / 'other'}"):
+        claim(tmp_path / "capture", tmp_path / "other")
+    (tmp_path / "capture" / FOLDER / SOURCE).write_text(broken)
+    with pytest.raises(CaptureError, match="was prepared from None"):
+        claim(tmp_path / "capture", videos)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda folder: folder.write_text("notes"), "is a file"),
+        (lambda folder: (folder / "notes").mkdir(parents=True), "is not empty and was not made by prepare"),
+    ],
+)
+def test_what_was_made_by_hand_is_left_alone(
+    tmp_path: Path, videos: Path, make: Callable[[Path], object], told: str
+) -> None:
+    make(tmp_path / "capture")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(CaptureError, match=told):
+        claim(tmp_path / "capture", videos)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_videos_own_folder_is_no_capture(videos: Path) -> None:
+    with pytest.raises(CaptureError, match="cannot be the folder of the videos itself"):
+        claim(videos / ".." / "take", videos)
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, videos: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        claim(tmp_path / "file" / "capture", videos)
