@@ -12,8 +12,7 @@ from structgstream.data.pair_matches import Pair
 from structgstream.data.pose_check import MISTAKES, reinterpreted
 from structgstream.preparation.checking.evidence import Evidence, pair_error
 from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.suspects import Suspects
-from structgstream.preparation.checking.tracks import Tracks, moved_by
+from structgstream.preparation.checking.verdicts import Verdict
 
 EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
 LENGTHS = {
@@ -32,16 +31,17 @@ HOW = {
 Change = Callable[[Camera], Camera]
 
 
-def explain(evidence: Evidence, cameras: Mapping[str, Camera], suspects: Suspects, tracks: Tracks) -> list[Finding]:
-    """One finding for each mistake that explains cameras that are off."""
+def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> list[Finding]:
+    """One finding for each mistake that explains cameras that are off, and one for each that may be."""
+    suspects = verdict.suspects
     if suspects.everything:
         return [_explain_all(evidence, cameras)]
     findings, left = _exchanged(evidence, cameras, list(suspects.off))
     good = [name for name in cameras if name not in suspects.off]
     for name in left:
-        told = _single(evidence, cameras, name, good) or _moved(evidence, cameras, name, suspects, tracks)
+        told = _single(evidence, cameras, name, good) or _moved(evidence, cameras, name, verdict)
         findings.append(Finding("error", told, (name,)))
-    return findings
+    return findings + [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
 
 
 def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
@@ -129,25 +129,42 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: 
     return f"Camera {name!r} {told}." if shares[told] < EXPLAINED else None
 
 
-def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, suspects: Suspects, tracks: Tracks) -> str:
-    """How far a camera stands from where its pictures say that it does."""
-    errors = [
-        pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
-        for pair in evidence.overlapping()
-        if name in pair and not set(pair) & set(suspects.off) - {name}
-    ]
-    pixels = float(np.median([error.pixels for error in errors])) if errors else float("nan")
-    told = (
-        f"Camera {name!r} is off: its matches with {len(errors)} other cameras, which agree with each other, lie "
-        f"{pixels:.1f} pixels from the epipolar lines of its pose"
-    )
-    motion = moved_by(tracks, cameras[name], name)
-    if motion is not None:
-        told += (
-            f"; its pictures place it {motion.degrees:.2f} degrees and {motion.share_of_distance:.1%} of its distance "
-            "to the scene away"
+def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
+    """How far a camera stands from where its pictures say that it does, as far as they do say so."""
+    found = verdict.resections.get(name)
+    if found is not None:
+        told = (
+            f"Camera {name!r} is off: {found.points} points that other cameras agree on lie {found.given_pixels:.1f} "
+            "pixels (median) from where its picture shows them"
+        )
+        told += f"; its pictures {found.told}" if found.told else ""
+    else:
+        told = (
+            f"Camera {name!r} is off: its matches with {_pairs_told(evidence, cameras, name, verdict)}, which agree "
+            "with each other, do not lie on the epipolar lines of its pose"
         )
     return told + ". It was bumped or its calibration is another's: calibrate again, or leave it out."
+
+
+def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
+    """A camera that matches contradict which may be wrong ones."""
+    told = (
+        f"Camera {name!r} may be off: its matches with {_pairs_told(evidence, cameras, name, verdict)} do not lie on "
+        "the epipolar lines of its pose, but these are too few, or contradict each other too much, to tell; look at "
+        "its pictures in the report."
+    )
+    return Finding("warning", told, (name,))
+
+
+def _pairs_told(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
+    """Names, with errors in pixels, of the cameras whose matches a camera's pose does not explain."""
+    told = []
+    for pair in verdict.suspects.bad:
+        if name in pair and not set(pair) & set(verdict.suspects.off) - {name}:
+            (other,) = set(pair) - {name}
+            error = pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
+            told.append(f"{other!r} ({error.matches}, off by {error.pixels:.1f} pixels)")
+    return ", ".join(told[:4]) + (f" and {len(told) - 4} more" if len(told) > 4 else "")
 
 
 def _by_viewmat(change: Callable[[torch.Tensor], torch.Tensor]) -> Change:

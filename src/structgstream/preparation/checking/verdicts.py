@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cameras are off, and by how much: what pairs say, held against points of several cameras."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from structgstream.cameras import Camera
+from structgstream.preparation.checking.evidence import Evidence, PairError, pair_errors
+from structgstream.preparation.checking.resection import Resection, resected
+from structgstream.preparation.checking.suspects import Suspects, accused, find_suspects
+from structgstream.preparation.checking.tracks import Tracks, build_tracks
+
+LEAST_MATCHES = 60  # of a camera's pairs, from which on they condemn it where points cannot
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is off, and by what evidence.
+
+    Args:
+        suspects: the cameras that are off.
+        tracks: points of the others.
+        resections: corrections of cameras that are off, where there are points for that.
+        doubtful: cameras that matches contradict, but too few or too contradictory ones to call them off.
+    """
+
+    suspects: Suspects
+    tracks: Tracks
+    resections: Mapping[str, Resection] = field(default_factory=dict)
+    doubtful: tuple[str, ...] = ()
+
+
+def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
+    """Names the cameras that are off.
+
+    Pairs accuse; then points of the other cameras decide. A camera is off when another pose or focal length explains
+    these points much better than the given one, and it is not when none explains more of them.
+
+    Raises:
+        MissingExtraError: cv2 or scipy is not installed.
+    """
+    errors = pair_errors(evidence, cameras)
+    suspects = find_suspects(errors, cameras)
+    if suspects.everything:
+        return Verdict(suspects, build_tracks(evidence, cameras))
+    tracks = build_tracks(evidence, cameras, off=suspects.off)
+    resections = {name: resected(tracks, cameras[name], name) for name in suspects.off}
+    off, doubtful = [], []
+    for name, found in resections.items():
+        if found is not None and found.as_given:
+            continue
+        sure = found is not None and found.better and found.given_pixels > suspects.limit_pixels
+        (off if sure or _condemned(name, errors, suspects) else doubtful).append(name)
+    suspects = replace(suspects, off=tuple(off))
+    found = {name: one for name in off if (one := resections[name]) is not None and one.better}
+    return _with_accused(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful)))
+
+
+def _condemned(name: str, errors: Mapping[tuple[str, str], PairError], suspects: Suspects) -> bool:
+    """Whether all that a camera's pairs say is against it, and that is much."""
+    own = {
+        pair: error.matches
+        for pair, error in errors.items()
+        if name in pair and not set(pair) & (set(suspects.off) - {name})
+    }
+    against = sum(matches for pair, matches in own.items() if pair in suspects.bad)
+    return against >= LEAST_MATCHES and against == sum(own.values())
+
+
+def _with_accused(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> Verdict:
+    """The verdict with cameras whose pairs look well, but which see points elsewhere than the others do."""
+    suspects, resections, cleared = verdict.suspects, dict(verdict.resections), set(verdict.doubtful)
+    tracks = build_tracks(evidence, cameras, off=suspects.off)
+    while (name := accused(tracks, suspects, cleared=cleared)) is not None:
+        without = build_tracks(evidence, cameras, off=(*suspects.off, name))
+        found = resected(without, cameras[name], name)
+        if found is None or not found.better:
+            cleared.add(name)
+            continue
+        resections[name] = found
+        suspects, tracks = replace(suspects, off=(*suspects.off, name)), without
+    return replace(verdict, suspects=suspects, tracks=tracks, resections=resections)
