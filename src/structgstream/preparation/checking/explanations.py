@@ -15,6 +15,7 @@ from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.checking.verdicts import Verdict
 
 EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
+SLIGHT_PIXELS = 1.5  # of pictures up to 1000 pixels wide: blurs, but does not spoil
 LENGTHS = {
     1000.0: "millimetres among metres",
     100.0: "centimetres among metres",
@@ -40,7 +41,9 @@ def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict)
     good = [name for name in cameras if name not in suspects.off]
     for name in left:
         told = _single(evidence, cameras, name, good) or _moved(evidence, cameras, name, verdict)
-        findings.append(Finding("error", told, (name,)))
+        found = verdict.resections.get(name)
+        slight = found is not None and found.given_pixels < SLIGHT_PIXELS * max(cameras[name].width / 1000, 1)
+        findings.append(Finding("warning" if slight else "error", told, (name,)))
     return findings + [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
 
 

@@ -16,7 +16,7 @@ FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above
 MOST_WEIGHT = 100  # matches above which a pair is not trusted more
 OFF_SHARE = 0.5
 VIOLATING_SHARE = 0.5
-LEAST_ACCUSING, LEAST_CAMERAS = 15, 4
+LEAST_ACCUSING, LEAST_CAMERAS, ACCUSING_TIMES = 15, 4, 2.5
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
 
 
 def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
-    """The camera, if any, that sees points elsewhere than the others say, although its pairs look well.
+    """The camera, if any, that sees points farther from where the others say than these do, although its pairs look
+    well.
 
     Along an epipolar line a match may lie anywhere: in a row of cameras, no pair reveals one that was turned along it.
     Points of several cameras do.
@@ -83,7 +84,7 @@ def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()
         return None
     worst = max(named, key=lambda name: medians[name])
     others = float(np.median([median for name, median in medians.items() if name != worst]))
-    return worst if medians[worst] > max(2 * suspects.limit_pixels, TIMES_TYPICAL * others) else None
+    return worst if medians[worst] > ACCUSING_TIMES * others else None
 
 
 def _limit(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> float:

@@ -49,11 +49,14 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
     for name, found in resections.items():
         if found is not None and found.as_given:
             continue
-        sure = found is not None and found.better and found.given_pixels > suspects.limit_pixels
-        (off if sure or _condemned(name, errors, suspects) else doubtful).append(name)
+        (off if _is_off(found, suspects) or _condemned(name, errors, suspects) else doubtful).append(name)
     suspects = replace(suspects, off=tuple(off))
     found = {name: one for name in off if (one := resections[name]) is not None and one.better}
     return _with_accused(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful)))
+
+
+def _is_off(found: Resection | None, suspects: Suspects) -> bool:
+    return found is not None and found.better and found.given_pixels > suspects.limit_pixels
 
 
 def _condemned(name: str, errors: Mapping[tuple[str, str], PairError], suspects: Suspects) -> bool:
@@ -74,7 +77,7 @@ def _with_accused(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Ve
     while (name := accused(tracks, suspects, cleared=cleared)) is not None:
         without = build_tracks(evidence, cameras, off=(*suspects.off, name))
         found = resected(without, cameras[name], name)
-        if found is None or not found.better:
+        if found is None or not _is_off(found, suspects):
             cleared.add(name)
             continue
         resections[name] = found
