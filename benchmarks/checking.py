@@ -95,7 +95,10 @@ def exchanged(cameras: Cameras, name: str, radius: float) -> None:
     """The calibrations of two cameras; the other one is the first, or of that the second."""
     other = next(each for each in cameras if each != name)
     one, two = cameras[name], cameras[other]
-    cameras[name], cameras[other] = replace(one, viewmat=two.viewmat, K=two.K), replace(two, viewmat=one.viewmat, K=one.K)
+    cameras[name], cameras[other] = (
+        replace(one, viewmat=two.viewmat, K=two.K),
+        replace(two, viewmat=one.viewmat, K=one.K),
+    )
 
 
 def of_all(change: Callable[[Camera], Camera]) -> Callable[[Cameras, str, float], None]:
@@ -115,7 +118,9 @@ def inverted(camera: Camera) -> Camera:
 
 def opengl(camera: Camera) -> Camera:
     """y up and z backward."""
-    return replace(camera, viewmat=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ camera.viewmat)
+    return replace(
+        camera, viewmat=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ camera.viewmat
+    )
 
 
 def farther(camera: Camera) -> Camera:

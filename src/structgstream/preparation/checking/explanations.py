@@ -12,6 +12,7 @@ from structgstream.data.pair_matches import Pair
 from structgstream.data.pose_check import MISTAKES, reinterpreted
 from structgstream.preparation.checking.evidence import Evidence, pair_error
 from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.checking.resection import explained
 from structgstream.preparation.checking.verdicts import Verdict
 
 EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
@@ -37,10 +38,9 @@ def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict)
     suspects = verdict.suspects
     if suspects.everything:
         return [_explain_all(evidence, cameras)]
-    findings, left = _exchanged(evidence, cameras, list(suspects.off))
-    good = [name for name in cameras if name not in suspects.off]
+    findings, left = _exchanged(evidence, cameras, verdict)
     for name in left:
-        told = _single(evidence, cameras, name, good) or _moved(evidence, cameras, name, verdict)
+        told = _single(evidence, cameras, name, verdict) or _moved(evidence, cameras, name, verdict)
         found = verdict.resections.get(name)
         slight = found is not None and found.given_pixels < SLIGHT_PIXELS * max(cameras[name].width / 1000, 1)
         findings.append(Finding("warning" if slight else "error", told, (name,)))
@@ -70,17 +70,17 @@ def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
     )
 
 
-def _exchanged(
-    evidence: Evidence, cameras: Mapping[str, Camera], off: Sequence[str]
-) -> tuple[list[Finding], list[str]]:
-    """Cameras among ``off`` that agree with the others under each other's calibration, and those that are left."""
+def _exchanged(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> tuple[list[Finding], list[str]]:
+    """Cameras that are off and agree with the others under each other's calibration, and those that are left."""
+    off = verdict.suspects.off
     same = [name for name in off if (cameras[name].width, cameras[name].height) == _size(cameras, off)]
     if len(same) < 2:
         return [], list(off)
     from scipy.optimize import linear_sum_assignment
 
-    good = [name for name in cameras if name not in off]
-    costs = np.array([[_share_with(evidence, cameras, name, good, cameras[other]) for other in same] for name in same])
+    costs = np.array(
+        [[_share_with(evidence, cameras, name, cameras[other], verdict) for other in same] for name in same]
+    )
     rows, columns = linear_sum_assignment(np.nan_to_num(costs, nan=1.0))
     moved = [
         (same[row], same[column])
@@ -107,10 +107,10 @@ def _size(cameras: Mapping[str, Camera], off: Sequence[str]) -> tuple[int, int]:
     return max(sizes, key=sizes.count)
 
 
-def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: Sequence[str]) -> str | None:
+def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str | None:
     """A mistake of one camera that explains it."""
     own = cameras[name]
-    before = _share_with(evidence, cameras, name, good, own)
+    before = _share_with(evidence, cameras, name, own, verdict)
     if not before > UNEXPLAINED:
         return None
     changes: dict[str, Change] = {
@@ -127,7 +127,7 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: 
         f"{own.width}x{own.height}; scale them by {factor:g}": _scaled(factor)
         for factor in SIZES
     }
-    shares = {told: _share_with(evidence, cameras, name, good, change(own)) for told, change in changes.items()}
+    shares = {told: _share_with(evidence, cameras, name, change(own), verdict) for told, change in changes.items()}
     told = min(shares, key=lambda told: shares[told])
     return f"Camera {name!r} {told}." if shares[told] < EXPLAINED else None
 
@@ -153,8 +153,8 @@ def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verd
     """A camera that matches contradict which may be wrong ones."""
     told = (
         f"Camera {name!r} may be off: its matches with {_pairs_told(evidence, cameras, name, verdict)} do not lie on "
-        "the epipolar lines of its pose, but these are too few, or contradict each other too much, to tell; look at "
-        "its pictures in the report."
+        "the epipolar lines of its pose, but other matches do; wrong matches of repeated texture look like that, too: see "
+        "whether its dots lie where they should in the report."
     )
     return Finding("warning", told, (name,))
 
@@ -189,10 +189,17 @@ def _scaled(factor: float) -> Change:
 
 
 def _share_with(
-    evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: Sequence[str], camera: Camera
+    evidence: Evidence, cameras: Mapping[str, Camera], name: str, camera: Camera, verdict: Verdict
 ) -> float:
-    """Share of a camera's matches with good cameras that violate its pose when that is ``camera``; NaN without any."""
-    pairs = [pair for pair in evidence.overlapping() if name in pair and (set(pair) - {name}) <= set(good)]
+    """Share of what a camera should see that violates its pose when that is ``camera``; NaN without any.
+
+    Of the points that a corrected camera explains; of its matches with good cameras where there is none.
+    """
+    found = verdict.resections.get(name)
+    if found is not None:
+        return max(1 - explained(verdict.tracks, camera, name) / found.points, 0.0)
+    good = set(cameras) - set(verdict.suspects.off)
+    pairs = [pair for pair in evidence.overlapping() if name in pair and (set(pair) - {name}) <= good]
     return _shares(evidence, {**cameras, name: camera}, pairs)
 
 

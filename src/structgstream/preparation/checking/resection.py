@@ -149,6 +149,14 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     )
 
 
+def explained(tracks: Tracks, camera: Camera, name: str) -> int:
+    """Number of points that lie near their keypoints in a camera's picture if that is ``camera``."""
+    own = tracks.of(name)
+    seen, depths = project(camera, tracks.points[tracks.point[own]])
+    apart = np.linalg.norm(seen - tracks.pixels[own], axis=1)
+    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * max(camera.width / 1000, 1))).sum())
+
+
 def _view(camera: Camera) -> _View:
     K = camera.K.numpy()
     rotation = camera.viewmat.numpy()[:3, :3]

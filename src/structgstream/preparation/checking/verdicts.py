@@ -5,12 +5,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from structgstream.cameras import Camera
+from structgstream.data.pair_matches import Pair
 from structgstream.preparation.checking.evidence import Evidence, PairError, pair_errors
 from structgstream.preparation.checking.resection import Resection, resected
 from structgstream.preparation.checking.suspects import Suspects, accused, find_suspects
 from structgstream.preparation.checking.tracks import Tracks, build_tracks
 
-LEAST_MATCHES = 60  # of a camera's pairs, from which on they condemn it where points cannot
+LEAST_MATCHES = 60  # of a camera's pairs, from which on they tell something without points; chance makes 20 to 25
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Verdict:
         suspects: the cameras that are off.
         tracks: points of the others.
         resections: corrections of cameras that are off, where there are points for that.
-        doubtful: cameras that matches contradict, but too few or too contradictory ones to call them off.
+        doubtful: cameras that matches contradict, but others fit.
     """
 
     suspects: Suspects
@@ -49,7 +50,11 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
     for name, found in resections.items():
         if found is not None and found.as_given:
             continue
-        (off if _is_off(found, suspects) or _condemned(name, errors, suspects) else doubtful).append(name)
+        against, favouring = _matches(name, errors, suspects)
+        if _is_off(found, suspects) or (against >= LEAST_MATCHES and not favouring):
+            off.append(name)
+        elif against >= LEAST_MATCHES:
+            doubtful.append(name)
     suspects = replace(suspects, off=tuple(off))
     found = {name: one for name in off if (one := resections[name]) is not None and one.better}
     return _with_accused(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful)))
@@ -59,15 +64,12 @@ def _is_off(found: Resection | None, suspects: Suspects) -> bool:
     return found is not None and found.better and found.given_pixels > suspects.limit_pixels
 
 
-def _condemned(name: str, errors: Mapping[tuple[str, str], PairError], suspects: Suspects) -> bool:
-    """Whether all that a camera's pairs say is against it, and that is much."""
-    own = {
-        pair: error.matches
-        for pair, error in errors.items()
-        if name in pair and not set(pair) & (set(suspects.off) - {name})
-    }
+def _matches(name: str, errors: Mapping[Pair, PairError], suspects: Suspects) -> tuple[int, int]:
+    """Numbers of a camera's matches that lie in pairs against its pose and for it."""
+    others = set(suspects.off) - {name}
+    own = {pair: error.matches for pair, error in errors.items() if name in pair and not set(pair) & others}
     against = sum(matches for pair, matches in own.items() if pair in suspects.bad)
-    return against >= LEAST_MATCHES and against == sum(own.values())
+    return against, sum(own.values()) - against
 
 
 def _with_accused(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> Verdict:
