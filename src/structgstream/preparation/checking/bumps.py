@@ -107,8 +107,8 @@ def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
 def _untold(names: list[str], frames: tuple[int, int]) -> Finding:
     return Finding(
         "note",
-        f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly all "
-        "that their pictures show moved, and no other camera confirms it; let something with texture stand still in "
-        "the pictures.",
+        f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly "
+        "all that their pictures show moved, and no other camera confirms it; let something with texture stand still "
+        "in the pictures.",
         tuple(names),
     )
