@@ -201,6 +201,8 @@ def _confirm_points(
             head = np.tile([order[own], 0.0, order[other]], (len(match), 1))
             head[:, 1] = match[:, side]
             records.append(np.concatenate([head, depths[:, side : side + 1], points, seen], 1))
+    if not records:  # poses under which no two cameras see the same
+        return np.empty((0, 3)), np.empty(0, np.intp), np.empty((0, 2))
     table = np.concatenate(records)
     table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
     # Two matches of one keypoint that agree in depth are neighbours after the sort.

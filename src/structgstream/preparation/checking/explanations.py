@@ -153,8 +153,8 @@ def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verd
     """A camera that matches contradict which may be wrong ones."""
     told = (
         f"Camera {name!r} may be off: its matches with {_pairs_told(evidence, cameras, name, verdict)} do not lie on "
-        "the epipolar lines of its pose, but other matches do; wrong matches of repeated texture look like that, too: see in "
-        "the report whether its dots lie where they should."
+        "the epipolar lines of its pose, but other matches do; wrong matches of repeated texture look like that, too: "
+        "see in the report whether its dots lie where they should."
     )
     return Finding("warning", told, (name,))
 
