@@ -187,6 +187,13 @@ def test_videos_shorter_than_their_offset(tmp_path: Path) -> None:
         prepare_capture(tmp_path / "videos", tmp_path / "out")
 
 
+def test_a_broken_table_of_times_is_told_before_the_calibration(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["a", "b", "c"], frames=2)
+    (tmp_path / "timestamps.csv").write_text("camera,frame,seconds\na,zero,0\n")
+    with pytest.raises(CaptureError, match=r"Line 2 of .*timestamps\.csv is not a camera, a frame number and seconds"):
+        first_clocks(find_footage(tmp_path), PrepareOptions())
+
+
 def test_an_unknown_codec(tmp_path: Path) -> None:
     write_room(tmp_path / "videos", cameras=3)
     file = tmp_path / "videos" / "cam01.mp4"

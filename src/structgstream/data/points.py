@@ -245,7 +245,7 @@ def _depth_range(camera: Camera, points: Floats, distance: float, config: Points
     pixels, depths = project(camera, points)
     depths = depths[inside(camera, pixels, depths, near=near)]
     if len(depths) < 30:
-        return near, 3 * distance
+        return near, max(3 * distance, 2 * near)
     low, high = np.percentile(depths, [1, 99])
     return max(near, 0.6 * float(low)), max(1.3 * float(high), 2 * near)
 
@@ -302,7 +302,7 @@ def _random_points(
     for name, camera in cameras.items():
         near = max(config.near_share * distance, camera.near)
         pixels = rng.random((each, 2)) * (camera.width, camera.height)
-        inverse = rng.uniform(1 / (3 * distance), 1 / near, each)
+        inverse = rng.uniform(1 / max(3 * distance, 2 * near), 1 / near, each)
         if name in masks:
             counts = masks[name][tuple(pixels.astype(np.intp).T[::-1])]
             pixels, inverse = pixels[counts], inverse[counts]

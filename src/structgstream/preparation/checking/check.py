@@ -8,6 +8,7 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
@@ -35,6 +36,8 @@ from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
 from structgstream.preparation.checking.verdicts import Verdict, judge
 from structgstream.preparation.steps import Listener, Silent
 from structgstream.preparation.synchronization import SynchronizationCheck
+
+LEAST_TIMED = 3  # cameras, for times that can be compared
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,7 @@ def check_capture(
         findings += bump_findings(first.frame, last, first.evidence, first.cameras)
     findings += presence_findings(presence, source.fps)
     listener.progress(2, 3, "times")
-    times = None if first.suspects.off else measure_times(source)
+    times = _measured_times(source, first.suspects)
     findings += time_findings(times)
     listener.progress(3, 3, "")
     report = CheckReport(
@@ -153,6 +156,14 @@ def check_capture(
 def with_findings(checked: Checked, findings: list[Finding]) -> Checked:
     """The check with further findings."""
     return replace(checked, report=replace(checked.report, findings=worst_first([*checked.report.findings, *findings])))
+
+
+def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationCheck | None:
+    """Of the cameras whose poses hold: epipolar lines of a wrong pose tell nothing of time."""
+    good = tuple(name for name in source.rig if name not in suspects.off)
+    if suspects.everything or len(good) < LEAST_TIMED:
+        return None
+    return measure_times(select_cameras(source, good) if suspects.off else source)
 
 
 def _radius(cameras: Mapping[str, Camera], suspects: Suspects) -> float:
