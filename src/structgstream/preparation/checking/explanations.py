@@ -44,7 +44,8 @@ def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict)
         found = verdict.resections.get(name)
         slight = found is not None and found.given_pixels < SLIGHT_PIXELS * max(cameras[name].width / 1000, 1)
         findings.append(Finding("warning" if slight else "error", told, (name,)))
-    return findings + [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
+    findings += [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
+    return findings + [_unchecked(evidence, cameras, name, verdict) for name in verdict.unchecked]
 
 
 def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
@@ -157,6 +158,16 @@ def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verd
         "see in the report whether its dots lie where they should."
     )
     return Finding("warning", told, (name,))
+
+
+def _unchecked(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
+    """A camera with too few matches to tell wrong ones from a wrong pose."""
+    told = (
+        f"The pose of camera {name!r} could not be checked: its few matches, with "
+        f"{_pairs_told(evidence, cameras, name, verdict)}, do not lie on the epipolar lines, as wrong matches do not "
+        "either; move it closer to its neighbours, or add texture."
+    )
+    return Finding("note", told, (name,))
 
 
 def _pairs_told(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:

@@ -23,12 +23,14 @@ class Verdict:
         tracks: points of the others.
         resections: corrections of cameras that are off, where there are points for that.
         doubtful: cameras that matches contradict, but others fit.
+        unchecked: cameras that so few matches contradict that chance may have made them.
     """
 
     suspects: Suspects
     tracks: Tracks
     resections: Mapping[str, Resection] = field(default_factory=dict)
     doubtful: tuple[str, ...] = ()
+    unchecked: tuple[str, ...] = ()
 
 
 def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
@@ -46,7 +48,7 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
         return Verdict(suspects, build_tracks(evidence, cameras))
     tracks = build_tracks(evidence, cameras, off=suspects.off)
     resections = {name: resected(tracks, cameras[name], name) for name in suspects.off}
-    off, doubtful = [], []
+    off, doubtful, unchecked = [], [], []
     for name, found in resections.items():
         if found is not None and found.as_given:
             continue
@@ -55,9 +57,11 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
             off.append(name)
         elif against >= LEAST_MATCHES:
             doubtful.append(name)
+        elif against:
+            unchecked.append(name)
     suspects = replace(suspects, off=tuple(off))
     found = {name: one for name in off if (one := resections[name]) is not None and one.better}
-    return _with_accused(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful)))
+    return _with_accused(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful), tuple(unchecked)))
 
 
 def _is_off(found: Resection | None, suspects: Suspects) -> bool:
@@ -74,7 +78,7 @@ def _matches(name: str, errors: Mapping[Pair, PairError], suspects: Suspects) ->
 
 def _with_accused(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> Verdict:
     """The verdict with cameras whose pairs look well, but which see points elsewhere than the others do."""
-    suspects, resections, cleared = verdict.suspects, dict(verdict.resections), set(verdict.doubtful)
+    suspects, resections, cleared = verdict.suspects, dict(verdict.resections), {*verdict.doubtful, *verdict.unchecked}
     tracks = build_tracks(evidence, cameras, off=suspects.off)
     while (name := accused(tracks, suspects, cleared=cleared)) is not None:
         without = build_tracks(evidence, cameras, off=(*suspects.off, name))
