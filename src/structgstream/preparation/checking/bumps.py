@@ -61,7 +61,7 @@ def _judged(
     name: str, movement: Movement, instants: tuple[Evidence, Evidence], cameras: Mapping[str, Camera]
 ) -> Judgement:
     """What matches with other cameras say at both instants."""
-    back = np.linalg.inv(movement.homography)
+    back = np.asarray(np.linalg.inv(movement.homography), np.float64)
     votes = [
         _votes(name, change, evidence, cameras)
         for evidence, change in zip(instants, (movement.homography, back), strict=True)
