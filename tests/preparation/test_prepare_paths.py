@@ -172,7 +172,7 @@ def test_cameras_that_see_nothing_in_common(tmp_path: Path) -> None:
 
 def test_a_board_that_is_not_there(tmp_path: Path) -> None:
     write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
-    with pytest.raises(CalibrationError, match="board"):
+    with pytest.raises(CalibrationError, match=r"No camera shows the board .* in any of its"):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, calibration="board"))
     write_videos(tmp_path / "board", ["a", "b"], frames=2)
     with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
