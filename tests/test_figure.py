@@ -21,6 +21,13 @@ def test_a_figure_has_its_size_and_makes_its_folder(tmp_path: Path) -> None:
     assert pixels_of(tmp_path / "new" / "x.png").shape == (110, 220, 3)
 
 
+def test_a_letter_that_the_font_lacks_is_no_warning(tmp_path: Path) -> None:
+    figure = figure_of(1.0, 1.0)
+    figure.text(0.5, 0.5, "\N{CJK UNIFIED IDEOGRAPH-4E8C}")
+    save_figure(figure, tmp_path / "x.png")
+    assert (tmp_path / "x.png").is_file()
+
+
 def test_no_two_colours_are_alike() -> None:
     values = [[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in COLORS]
     apart = [max(abs(a - b) for a, b in zip(one, other)) for one in values for other in values if one is not other]

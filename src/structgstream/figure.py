@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common parts of the package's plots: figures, axes, colours, saving."""
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,6 +48,9 @@ def save_figure(figure: "Figure", path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
+        with warnings.catch_warnings():
+            # Names of cameras may have letters that the font lacks; a box stands for them then.
+            warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
+            figure.savefig(path)
     except OSError as error:
         raise StorageError(f"The picture {path} cannot be written ({error.strerror}).") from None

@@ -3,6 +3,7 @@
 
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,3 +177,11 @@ def test_random_points_lie_behind_pixels_that_count() -> None:
     found = initial_points(MultiViewFrame(0, 0.0, frame.images, masks), CLIP.rig, config=config)
     assert found.random
     assert 750 < len(found.positions) < 850  # one of nine cameras gives nearly none
+
+
+def test_cameras_that_look_away_from_each_other_give_random_points() -> None:
+    """As inverted poses do, of which the check tells afterwards."""
+    frame = next(iter(CLIP.frames()))
+    inverted = {name: replace(camera, viewmat=camera.viewmat.inverse()) for name, camera in CLIP.rig.cameras.items()}
+    config = PointsConfig(random_points=900, sweep_levels=())
+    assert initial_points(frame, CLIP.rig.mapped(inverted), config=config).random

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import logging
 from pathlib import Path
 
 import av
@@ -86,6 +87,32 @@ def test_what_is_no_footage_is_told(tmp_path: Path) -> None:
         find_footage(tmp_path)
     with pytest.raises(CaptureError, match="is a file"):
         find_footage(tmp_path / "notes.txt")
+    (tmp_path / "new").mkdir()
+    with pytest.raises(CaptureError, match=r"new is empty; expected CAMERA\.mp4"):
+        find_footage(tmp_path / "new")
+
+
+def test_a_folder_of_a_camera_is_not_lost_unnoticed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("a", "b"):
+        write_picture(tmp_path / name / "0.png", picture(0, 0))
+    (tmp_path / "masks").mkdir()
+    assert find_footage(tmp_path).cameras == ("a", "b")
+    assert not caplog.records
+    (tmp_path / "c").mkdir()
+    with pytest.raises(CaptureError, match=r"c is empty; copy what camera 'c' filmed into it"):
+        find_footage(tmp_path)
+    (tmp_path / "c" / "notes.txt").write_text("")
+    with caplog.at_level(logging.WARNING):
+        assert find_footage(tmp_path).cameras == ("a", "b")
+    assert "c is left out: it holds no picture" in caplog.text
+
+
+def test_pictures_of_another_size_are_named(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a" / "0.png", picture(0, 0))
+    write_picture(tmp_path / "a" / "1.png", picture(0, 0)[:-2])
+    footage = find_footage(tmp_path)
+    with pytest.raises(CaptureError, match=r"1\.png has \d+x\d+ pixels, the first one of camera 'a' \d+x\d+; expected"):
+        list(footage.pictures("a", [0, 1]))
 
 
 def test_ambiguous_files_are_told(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def test_cameras_that_see_nothing_in_common(tmp_path: Path) -> None:
 
 def test_a_board_that_is_not_there(tmp_path: Path) -> None:
     write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
-    with pytest.raises(CalibrationError, match="board"):
+    with pytest.raises(CalibrationError, match=r"No camera shows the board .* in any of its"):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, calibration="board"))
     write_videos(tmp_path / "board", ["a", "b"], frames=2)
     with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
@@ -185,6 +185,13 @@ def test_videos_shorter_than_their_offset(tmp_path: Path) -> None:
     (tmp_path / "videos" / "timestamps.csv").write_text("camera,frame,seconds\n" + rows)
     with pytest.raises(CaptureError, match=r"'cam00' \(0.10 s\) and 'cam01' \(0.10 s\) have no instant in common"):
         prepare_capture(tmp_path / "videos", tmp_path / "out")
+
+
+def test_a_broken_table_of_times_is_told_before_the_calibration(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["a", "b", "c"], frames=2)
+    (tmp_path / "timestamps.csv").write_text("camera,frame,seconds\na,zero,0\n")
+    with pytest.raises(CaptureError, match=r"Line 2 of .*timestamps\.csv is not a camera, a frame number and seconds"):
+        first_clocks(find_footage(tmp_path), PrepareOptions())
 
 
 def test_an_unknown_codec(tmp_path: Path) -> None:

@@ -202,6 +202,8 @@ def _confirm_points(
             head = np.tile([order[own], 0.0, order[other]], (len(match), 1))
             head[:, 1] = match[:, side]
             records.append(np.concatenate([head, depths[:, side : side + 1], points, seen], 1))
+    if not records:  # poses under which no two cameras see the same
+        return np.empty((0, 3)), np.empty(0, np.intp), np.empty((0, 2))
     table = np.concatenate(records)
     table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
     # Two matches of one keypoint that agree in depth are neighbours after the sort.
@@ -244,7 +246,7 @@ def _depth_range(camera: Camera, points: Floats, distance: float, config: Points
     pixels, depths = project(camera, points)
     depths = depths[inside(camera, pixels, depths, near=near)]
     if len(depths) < 30:
-        return near, 3 * distance
+        return near, max(3 * distance, 2 * near)
     low, high = np.percentile(depths, [1, 99])
     return max(near, 0.6 * float(low)), max(1.3 * float(high), 2 * near)
 
@@ -301,7 +303,7 @@ def _random_points(
     for name, camera in cameras.items():
         near = max(config.near_share * distance, camera.near)
         pixels = rng.random((each, 2)) * (camera.width, camera.height)
-        inverse = rng.uniform(1 / (3 * distance), 1 / near, each)
+        inverse = rng.uniform(1 / max(3 * distance, 2 * near), 1 / near, each)
         if name in masks:
             counts = masks[name][tuple(pixels.astype(np.intp).T[::-1])]
             pixels, inverse = pixels[counts], inverse[counts]

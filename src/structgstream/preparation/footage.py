@@ -9,6 +9,7 @@
     VIDEOS/CAMERA.jpg             one picture per camera
 """
 
+import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from structgstream.data.video import measured_fps
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
+
+_log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
@@ -92,8 +95,9 @@ class Footage:
             for run in _runs([int(index) for index in indices]):
                 yield from self._decoded(name, track, run)
         else:
+            size = self.size(name)
             for index in indices:
-                yield read_picture(self.stills[name][index])
+                yield _of_size(read_picture(self.stills[name][index]), size, name, self.stills[name][index])
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         def tell(lost: int, following: int | None, reason: str) -> None:
@@ -160,8 +164,24 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         if root.is_dir() and (files := _found(root)):
             ordered = {name: files[name] for name in sorted(files, key=natural)}
             return _footage(where, ordered, picture_fps or PICTURE_FPS)
-    held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6]) or "nothing"
-    raise CaptureError(f"{where} holds no videos and no pictures, but {held}; expected {LAYOUTS}.")
+    held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
+    found = f"holds no videos and no pictures, but {held}" if held else "is empty"
+    raise CaptureError(f"{where} {found}; expected {LAYOUTS}.")
+
+
+def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
+    """The picture itself.
+
+    Raises:
+        CaptureError: it has another size than the camera's first one.
+    """
+    height, width = picture.shape[:2]
+    if (width, height) != size:
+        raise CaptureError(
+            f"The picture {file} has {width}x{height} pixels, the first one of camera {name!r} {size[0]}x{size[1]}; "
+            "expected one size: export them again in one mode, or move the others out of the folder."
+        )
+    return picture
 
 
 def _runs(indices: Sequence[int]) -> list[list[int]]:
@@ -208,8 +228,30 @@ def _found(root: Path) -> dict[str, Path]:
                 )
             found[name] = file
         if found:
+            _check_left(root, entries, found)
             return found
     return {}
+
+
+def _check_left(root: Path, entries: Sequence[Path], found: Mapping[str, Path]) -> None:
+    """What is no camera, told, so that none is lost unnoticed.
+
+    Raises:
+        CaptureError: an empty folder beside those of cameras.
+    """
+    for entry in entries:
+        if not entry.is_dir() or entry.name in NO_CAMERAS or found.get(entry.name, root).is_relative_to(entry):
+            continue
+        if not any(entry.iterdir()):
+            raise CaptureError(
+                f"The folder {entry} is empty; copy what camera {entry.name!r} filmed into it, or remove it if it is "
+                "no camera."
+            )
+        _log.warning(
+            "The folder %s is left out: it holds no %s, as %s does. If it is a camera, give all of one kind.",
+            entry, "video" if next(iter(found.values())).suffix.lower() in VIDEO_SUFFIXES else "picture",
+            next(iter(found.values())),
+        )  # fmt: skip
 
 
 def _of_folder(folder: Path, suffixes: Collection[str]) -> Path | None:

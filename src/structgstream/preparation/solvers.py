@@ -113,7 +113,7 @@ def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
     try:
         return synchronized(footage, options)
     except CaptureError as error:
-        if options.synchronize not in ("auto", "motion"):
+        if options.synchronize not in ("auto", "motion") or (footage.where / TIMESTAMPS).is_file():
             raise
         told = f"motion: not without the calibration ({str(error).split('; ')[0].split('. ')[0].rstrip('.')})"
         return Clocks({name: Clock() for name in footage.cameras}, "motion", told, sure=False)

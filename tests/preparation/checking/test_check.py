@@ -14,6 +14,9 @@ from planes import room_frame, room_rig
 from structgstream.cameras import Camera, CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.check import Checked, check_capture
+from structgstream.preparation.checking.evidence import gather
+from structgstream.preparation.checking.explanations import explain
+from structgstream.preparation.checking.verdicts import judge
 
 Cameras = dict[str, Camera]
 TURNED = ("cam02", 1.0)
@@ -232,3 +235,20 @@ def test_cameras_without_a_frame_in_common_are_all_looked_at() -> None:
     told = [finding.sentence for finding in report.findings]
     assert any("Camera 'cam01' ends with frame" in sentence for sentence in told)
     assert any("Camera 'cam00'" in sentence and "no picture of frame 0" in sentence for sentence in told)
+
+
+def test_a_few_wrong_matches_are_a_note() -> None:
+    """As the check of a camera that shares hardly anything: chance makes 20 to 25 matches that fit some geometry."""
+    rig, frame = room()
+    found = gather(frame, rig.cameras)
+    rng = np.random.default_rng(0)
+    matches = {pair: rows for pair, rows in found.matches.items() if "cam02" not in pair}
+    some = rng.permutation(len(found.keypoints["cam03"]))[:25]
+    matches["cam02", "cam03"] = np.stack([np.arange(25), some], 1)
+    keypoints = {**found.keypoints, "cam02": rng.uniform([0, 0], [160, 120], (25, 2))}
+    evidence = replace(found, keypoints=keypoints, matches=matches)
+    verdict = judge(evidence, rig.cameras)
+    assert not verdict.suspects.off
+    (note,) = explain(evidence, rig.cameras, verdict)
+    assert (note.severity, note.cameras) == ("note", ("cam02",))
+    assert "could not be checked: its few matches, with 'cam03' (25, off by" in note.sentence

@@ -9,20 +9,16 @@ import torch
 
 from evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 from structgstream.cameras import Camera
-from structgstream.preparation.checking.evidence import pair_errors
 from structgstream.preparation.checking.explanations import explain
 from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.suspects import find_suspects
-from structgstream.preparation.checking.tracks import build_tracks
+from structgstream.preparation.checking.verdicts import judge
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 def explained(stated: Cameras, *, true: Cameras) -> list[Finding]:
     evidence = evidence_of(true, scattered(80), noise=0.2)
-    suspects = find_suspects(pair_errors(evidence, stated), stated)
-    tracks = build_tracks(evidence, stated, off=() if suspects.everything else suspects.off)
-    return explain(evidence, stated, suspects, tracks)
+    return explain(evidence, stated, judge(evidence, stated))
 
 
 def farther(camera: Camera, factor: float) -> Camera:

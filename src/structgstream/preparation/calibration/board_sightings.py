@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.calibration import listed
 from structgstream.data.images import opencv
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board, dictionaries
@@ -64,13 +63,24 @@ def board_sightings(
     _check_layout(board, found)
     few = [name for name in pictures if len(found[name]) < LEAST_SIGHTINGS]
     if few:
-        told = ", ".join(f"{name!r} in {len(found[name])} of {len(pictures[name])} pictures" for name in few)
-        raise CalibrationError(
-            f"The board ({board.text}) is seen well enough by {listed(few)} too rarely ({told}; {LEAST_SIGHTINGS} "
-            f"with {LEAST_CORNERS} corners each are needed): show it whole, closer and sharper to each camera, tilted "
-            "in several directions."
-        )
+        raise CalibrationError(_too_few(board, {name: (len(found[name]), len(pictures[name])) for name in few}, found))
     return {name: tuple(sights) for name, sights in found.items()}
+
+
+def _too_few(board: Board, seen: Mapping[str, tuple[int, int]], found: Mapping[str, Sequence[Sighting]]) -> str:
+    """The sentence for cameras with too few of their pictures that show the board."""
+    if not any(found.values()):
+        most = max(total for _, total in seen.values())
+        return (
+            f"No camera shows the board ({board.text}) in any of its {most} pictures that were looked at; show it "
+            f"whole, closer and sharper ({LEAST_CORNERS} corners are needed), name the board that was "
+            "filmed with --board, or the folder in which it was with --board-videos."
+        )
+    told = ", ".join(f"{name!r} in {count} of {total} pictures" for name, (count, total) in seen.items())
+    return (
+        f"The board ({board.text}) is seen too rarely: by {told}, where {LEAST_SIGHTINGS} with {LEAST_CORNERS} corners "
+        "each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
+    )
 
 
 def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.intp], NDArray[np.float64], set[int]]:

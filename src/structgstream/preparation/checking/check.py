@@ -8,11 +8,19 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
+from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
 from structgstream.preparation.checking.evidence import Evidence, gather, pair_errors
 from structgstream.preparation.checking.explanations import explain
-from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Finding, PairCheck
+from structgstream.preparation.checking.findings import (
+    CameraCheck,
+    CheckReport,
+    Finding,
+    PairCheck,
+    worst_first,
+)
 from structgstream.preparation.checking.overlap import coverage, overlap_findings, overlaps
 from structgstream.preparation.checking.presence import (
     Presence,
@@ -22,12 +30,14 @@ from structgstream.preparation.checking.presence import (
     whole_frame,
 )
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
-from structgstream.preparation.checking.stillness import stillness_findings
-from structgstream.preparation.checking.suspects import Suspects, accused, acquitted, find_suspects
+from structgstream.preparation.checking.suspects import Suspects
 from structgstream.preparation.checking.times import measure_times, time_findings
-from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks, build_tracks
+from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
+from structgstream.preparation.checking.verdicts import Verdict, judge
 from structgstream.preparation.steps import Listener, Silent
 from structgstream.preparation.synchronization import SynchronizationCheck
+
+LEAST_TIMED = 3  # cameras, for times that can be compared
 
 
 @dataclass(frozen=True)
@@ -41,10 +51,19 @@ class Examination:
     frame: MultiViewFrame
     cameras: Mapping[str, Camera]
     evidence: Evidence
-    suspects: Suspects
-    tracks: Tracks
+    verdict: Verdict
     colors: Mapping[str, Color]
     presence: Presence = field(default_factory=dict)
+
+    @property
+    def suspects(self) -> Suspects:
+        """Cameras that are off."""
+        return self.verdict.suspects
+
+    @property
+    def tracks(self) -> Tracks:
+        """Points of the cameras that are not off."""
+        return self.verdict.tracks
 
 
 @dataclass(frozen=True)
@@ -59,19 +78,11 @@ def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination
     """Matches one instant's pictures and holds them against the poses.
 
     Raises:
-        MissingExtraError: cv2 is not installed.
+        MissingExtraError: cv2 or scipy is not installed.
     """
     seen = {name: camera for name, camera in cameras.items() if name in frame.images}
     evidence = gather(frame, seen)
-    suspects = find_suspects(pair_errors(evidence, seen), seen)
-    tracks = build_tracks(evidence, seen, off=() if suspects.everything else suspects.off)
-    if suspects.off and not suspects.everything and (cleared := acquitted(tracks, suspects)):
-        suspects = replace(suspects, off=tuple(name for name in suspects.off if name not in cleared))
-        tracks = build_tracks(evidence, seen, off=suspects.off)
-    while not suspects.everything and (name := accused(tracks, suspects)) is not None:
-        suspects = replace(suspects, off=(*suspects.off, name))
-        tracks = build_tracks(evidence, seen, off=suspects.off)
-    return Examination(frame, seen, evidence, suspects, tracks, compare_colors(evidence))
+    return Examination(frame, seen, evidence, judge(evidence, seen), compare_colors(evidence))
 
 
 def examine_capture(source: FrameSource) -> Examination:
@@ -79,7 +90,7 @@ def examine_capture(source: FrameSource) -> Examination:
 
     Raises:
         CaptureError: a frame cannot be read.
-        MissingExtraError: cv2 is not installed.
+        MissingExtraError: cv2 or scipy is not installed.
     """
     presence = stated_presence(source)
     return replace(examine(whole_frame(source, presence), source.rig.cameras), presence=presence)
@@ -109,7 +120,7 @@ def check_capture(
     listener.progress(0, 3, "first frame")
     first = examination or examine_capture(source)
     presence = {name: present.copy() for name, present in first.presence.items()}
-    findings = explain(first.evidence, first.cameras, first.suspects, first.tracks) if first.suspects.off else []
+    findings = explain(first.evidence, first.cameras, first.verdict)
     findings += overlap_findings(first.evidence.overlapping(), list(first.cameras))
     depths = observed_depths(first.tracks, first.cameras, off=first.suspects.off)
     radius = _radius(first.cameras, first.suspects)
@@ -121,10 +132,10 @@ def check_capture(
     if (end := len(source) - 1) > first.frame.index:
         last = next(source.frames(end))
         note(last, presence)
-        findings += stillness_findings(first.frame.images, last.images, frames=(first.frame.index, end))
+        findings += bump_findings(first.frame, last, first.evidence, first.cameras)
     findings += presence_findings(presence, source.fps)
     listener.progress(2, 3, "times")
-    times = None if first.suspects.off else measure_times(source)
+    times = _measured_times(source, first.suspects)
     findings += time_findings(times)
     listener.progress(3, 3, "")
     report = CheckReport(
@@ -133,7 +144,7 @@ def check_capture(
         cameras=_camera_checks(first, source, times, presence),
         pairs=_pair_checks(first),
         coverage=coverage(_solid_points(first.tracks), first.cameras),
-        findings=tuple(sorted(findings, key=lambda finding: finding.severity)),
+        findings=worst_first(findings),
         rig_radius=radius,
         near=float(np.median([camera.near for camera in cameras.values()])),
         nearest=nearest_depth(depths),
@@ -144,8 +155,15 @@ def check_capture(
 
 def with_findings(checked: Checked, findings: list[Finding]) -> Checked:
     """The check with further findings."""
-    together = sorted([*checked.report.findings, *findings], key=lambda finding: finding.severity)
-    return replace(checked, report=replace(checked.report, findings=tuple(together)))
+    return replace(checked, report=replace(checked.report, findings=worst_first([*checked.report.findings, *findings])))
+
+
+def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationCheck | None:
+    """Of the cameras whose poses hold: epipolar lines of a wrong pose tell nothing of time."""
+    good = tuple(name for name in source.rig if name not in suspects.off)
+    if suspects.everything or len(good) < LEAST_TIMED:
+        return None
+    return measure_times(select_cameras(source, good) if suspects.off else source)
 
 
 def _radius(cameras: Mapping[str, Camera], suspects: Suspects) -> float:

@@ -12,10 +12,11 @@ from structgstream.data.matching import Pair
 from structgstream.data.pose_check import MISTAKES, reinterpreted
 from structgstream.preparation.checking.evidence import Evidence, pair_error
 from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.suspects import Suspects
-from structgstream.preparation.checking.tracks import Tracks, moved_by
+from structgstream.preparation.checking.resection import explained
+from structgstream.preparation.checking.verdicts import Verdict
 
 EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
+SLIGHT_PIXELS = 1.5  # of pictures up to 1000 pixels wide: blurs, but does not spoil
 LENGTHS = {
     1000.0: "millimetres among metres",
     100.0: "centimetres among metres",
@@ -32,16 +33,19 @@ HOW = {
 Change = Callable[[Camera], Camera]
 
 
-def explain(evidence: Evidence, cameras: Mapping[str, Camera], suspects: Suspects, tracks: Tracks) -> list[Finding]:
-    """One finding for each mistake that explains cameras that are off."""
+def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> list[Finding]:
+    """One finding for each mistake that explains cameras that are off, and one for each that may be."""
+    suspects = verdict.suspects
     if suspects.everything:
         return [_explain_all(evidence, cameras)]
-    findings, left = _exchanged(evidence, cameras, list(suspects.off))
-    good = [name for name in cameras if name not in suspects.off]
+    findings, left = _exchanged(evidence, cameras, verdict)
     for name in left:
-        told = _single(evidence, cameras, name, good) or _moved(evidence, cameras, name, suspects, tracks)
-        findings.append(Finding("error", told, (name,)))
-    return findings
+        told = _single(evidence, cameras, name, verdict) or _moved(evidence, cameras, name, verdict)
+        found = verdict.resections.get(name)
+        slight = found is not None and found.given_pixels < SLIGHT_PIXELS * max(cameras[name].width / 1000, 1)
+        findings.append(Finding("warning" if slight else "error", told, (name,)))
+    findings += [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
+    return findings + [_unchecked(evidence, cameras, name, verdict) for name in verdict.unchecked]
 
 
 def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
@@ -67,17 +71,17 @@ def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
     )
 
 
-def _exchanged(
-    evidence: Evidence, cameras: Mapping[str, Camera], off: Sequence[str]
-) -> tuple[list[Finding], list[str]]:
-    """Cameras among ``off`` that agree with the others under each other's calibration, and those that are left."""
+def _exchanged(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> tuple[list[Finding], list[str]]:
+    """Cameras that are off and agree with the others under each other's calibration, and those that are left."""
+    off = verdict.suspects.off
     same = [name for name in off if (cameras[name].width, cameras[name].height) == _size(cameras, off)]
     if len(same) < 2:
         return [], list(off)
     from scipy.optimize import linear_sum_assignment
 
-    good = [name for name in cameras if name not in off]
-    costs = np.array([[_share_with(evidence, cameras, name, good, cameras[other]) for other in same] for name in same])
+    costs = np.array(
+        [[_share_with(evidence, cameras, name, cameras[other], verdict) for other in same] for name in same]
+    )
     rows, columns = linear_sum_assignment(np.nan_to_num(costs, nan=1.0))
     moved = [
         (same[row], same[column])
@@ -104,10 +108,10 @@ def _size(cameras: Mapping[str, Camera], off: Sequence[str]) -> tuple[int, int]:
     return max(sizes, key=sizes.count)
 
 
-def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: Sequence[str]) -> str | None:
+def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str | None:
     """A mistake of one camera that explains it."""
     own = cameras[name]
-    before = _share_with(evidence, cameras, name, good, own)
+    before = _share_with(evidence, cameras, name, own, verdict)
     if not before > UNEXPLAINED:
         return None
     changes: dict[str, Change] = {
@@ -124,30 +128,57 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: 
         f"{own.width}x{own.height}; scale them by {factor:g}": _scaled(factor)
         for factor in SIZES
     }
-    shares = {told: _share_with(evidence, cameras, name, good, change(own)) for told, change in changes.items()}
+    shares = {told: _share_with(evidence, cameras, name, change(own), verdict) for told, change in changes.items()}
     told = min(shares, key=lambda told: shares[told])
     return f"Camera {name!r} {told}." if shares[told] < EXPLAINED else None
 
 
-def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, suspects: Suspects, tracks: Tracks) -> str:
-    """How far a camera stands from where its pictures say that it does."""
-    errors = [
-        pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
-        for pair in evidence.overlapping()
-        if name in pair and not set(pair) & set(suspects.off) - {name}
-    ]
-    pixels = float(np.median([error.pixels for error in errors])) if errors else float("nan")
-    told = (
-        f"Camera {name!r} is off: its matches with {len(errors)} other cameras, which agree with each other, lie "
-        f"{pixels:.1f} pixels from the epipolar lines of its pose"
-    )
-    motion = moved_by(tracks, cameras[name], name)
-    if motion is not None:
-        told += (
-            f"; its pictures place it {motion.degrees:.2f} degrees and {motion.share_of_distance:.1%} of its distance "
-            "to the scene away"
+def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
+    """How far a camera stands from where its pictures say that it does, as far as they do say so."""
+    found = verdict.resections.get(name)
+    if found is not None:
+        told = (
+            f"Camera {name!r} is off: {found.points} points that other cameras agree on lie {found.given_pixels:.1f} "
+            "pixels (median) from where its picture shows them"
+        )
+        told += f"; its pictures {found.told}" if found.told else ""
+    else:
+        told = (
+            f"Camera {name!r} is off: its matches with {_pairs_told(evidence, cameras, name, verdict)}, which agree "
+            "with each other, do not lie on the epipolar lines of its pose"
         )
     return told + ". It was bumped or its calibration is another's: calibrate again, or leave it out."
+
+
+def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
+    """A camera that matches contradict which may be wrong ones."""
+    told = (
+        f"Camera {name!r} may be off: its matches with {_pairs_told(evidence, cameras, name, verdict)} do not lie on "
+        "the epipolar lines of its pose, but other matches do; wrong matches of repeated texture look like that, too: "
+        "see in the report whether its dots lie where they should."
+    )
+    return Finding("warning", told, (name,))
+
+
+def _unchecked(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
+    """A camera with too few matches to tell wrong ones from a wrong pose."""
+    told = (
+        f"The pose of camera {name!r} could not be checked: its few matches, with "
+        f"{_pairs_told(evidence, cameras, name, verdict)}, do not lie on the epipolar lines, as wrong matches do not "
+        "either; move it closer to its neighbours, or add texture."
+    )
+    return Finding("note", told, (name,))
+
+
+def _pairs_told(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
+    """Names, with errors in pixels, of the cameras whose matches a camera's pose does not explain."""
+    told = []
+    for pair in verdict.suspects.bad:
+        if name in pair and not set(pair) & set(verdict.suspects.off) - {name}:
+            (other,) = set(pair) - {name}
+            error = pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
+            told.append(f"{other!r} ({error.matches}, off by {error.pixels:.1f} pixels)")
+    return ", ".join(told[:4]) + (f" and {len(told) - 4} more" if len(told) > 4 else "")
 
 
 def _by_viewmat(change: Callable[[torch.Tensor], torch.Tensor]) -> Change:
@@ -169,10 +200,17 @@ def _scaled(factor: float) -> Change:
 
 
 def _share_with(
-    evidence: Evidence, cameras: Mapping[str, Camera], name: str, good: Sequence[str], camera: Camera
+    evidence: Evidence, cameras: Mapping[str, Camera], name: str, camera: Camera, verdict: Verdict
 ) -> float:
-    """Share of a camera's matches with good cameras that violate its pose when that is ``camera``; NaN without any."""
-    pairs = [pair for pair in evidence.overlapping() if name in pair and (set(pair) - {name}) <= set(good)]
+    """Share of what a camera should see that violates its pose when that is ``camera``; NaN without any.
+
+    Of the points that a corrected camera explains; of its matches with good cameras where there is none.
+    """
+    found = verdict.resections.get(name)
+    if found is not None:
+        return max(1 - explained(verdict.tracks, camera, name) / found.points, 0.0)
+    good = set(cameras) - set(verdict.suspects.off)
+    pairs = [pair for pair in evidence.overlapping() if name in pair and (set(pair) - {name}) <= good]
     return _shares(evidence, {**cameras, name: camera}, pairs)
 
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a check says."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-Severity = Literal["error", "warning"]
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
@@ -13,7 +14,8 @@ class Finding:
     """One thing that is wrong, or worth knowing.
 
     Args:
-        severity: a stream made with an ``error`` is spoiled; a ``warning`` costs quality.
+        severity: a stream made with an ``error`` is spoiled; a ``warning`` costs quality; a ``note``
+            says what could not be checked.
         sentence: names camera or file, what was found and what to do.
         cameras: those concerned.
     """
@@ -21,6 +23,11 @@ class Finding:
     severity: Severity
     sentence: str
     cameras: tuple[str, ...] = ()
+
+
+def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The findings in the order of their severity."""
+    return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,8 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
     findings = []
     groups = _groups(pairs, names)
     whole = max(groups, key=len)
-    for group in groups:
+    alone = [name for group in groups if len(group) == 1 and group is not whole for name in group]
+    for group in ([alone] if alone else []) + [group for group in groups if len(group) > 1]:
         if group is not whole:
             findings.append(
                 Finding(

@@ -16,8 +16,7 @@ FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above
 MOST_WEIGHT = 100  # matches above which a pair is not trusted more
 OFF_SHARE = 0.5
 VIOLATING_SHARE = 0.5
-LEAST_FITTING, FITTING_SHARE = 5, 0.4
-LEAST_ACCUSING, LEAST_CAMERAS = 15, 4
+LEAST_ACCUSING, LEAST_CAMERAS, ACCUSING_TIMES = 15, 4, 2.5
 
 
 @dataclass(frozen=True)
@@ -61,31 +60,17 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
     return Suspects(tuple(off), tuple(pair for pair in errors if pair in bad), limit, everything)
 
 
-def acquitted(tracks: Tracks, suspects: Suspects) -> tuple[str, ...]:
-    """Cameras that are not off after all, because points of the others lie where they see them.
-
-    Repeating texture, as of a court or a facade, makes wrong matches that agree with some other geometry.
-
-    Args:
-        tracks: points of the cameras that are not off.
-        suspects: the verdict that they were built with.
-    """
-    cleared = []
-    for name in suspects.off:
-        if name not in tracks.names:
-            continue
-        seen = tracks.residuals[tracks.of(name)]
-        fits = int((seen < suspects.limit_pixels).sum())
-        if fits >= LEAST_FITTING and fits >= FITTING_SHARE * len(seen):
-            cleared.append(name)
-    return tuple(cleared)
-
-
-def accused(tracks: Tracks, suspects: Suspects) -> str | None:
-    """The camera, if any, that sees points elsewhere than the others say, although its pairs look well.
+def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
+    """The camera, if any, that sees points farther from where the others say than these do, although its pairs look
+    well.
 
     Along an epipolar line a match may lie anywhere: in a row of cameras, no pair reveals one that was turned along it.
     Points of several cameras do.
+
+    Args:
+        tracks: points of the cameras that are not off.
+        suspects: the verdict so far.
+        cleared: cameras that are not to be named.
     """
     medians = {}
     for name in tracks.names:
@@ -94,9 +79,12 @@ def accused(tracks: Tracks, suspects: Suspects) -> str | None:
             medians[name] = float(np.median(seen))
     if len(medians) < LEAST_CAMERAS:
         return None
-    worst = max(medians, key=lambda name: medians[name])
+    named = [name for name in medians if name not in cleared]
+    if not named:
+        return None
+    worst = max(named, key=lambda name: medians[name])
     others = float(np.median([median for name, median in medians.items() if name != worst]))
-    return worst if medians[worst] > max(2 * suspects.limit_pixels, TIMES_TYPICAL * others) else None
+    return worst if medians[worst] > ACCUSING_TIMES * others else None
 
 
 def _limit(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> float:

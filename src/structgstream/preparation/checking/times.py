@@ -22,9 +22,11 @@ def measure_times(source: FrameSource) -> SynchronizationCheck | None:
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
-    """An error for cameras that are off by a good part of a frame, a warning above 5 ms."""
-    if measured is None or not measured.conclusive:
+    """An error for cameras that are off by a good part of a frame, a warning above 5 ms; a note if none can be told."""
+    if measured is None:
         return []
+    if not measured.conclusive:
+        return [Finding("note", measured.message)]
     findings = []
     for name, late in measured.late_seconds.items():
         if abs(late) < max(WARNED_SECONDS, SIGMAS * measured.uncertainty_seconds[name]):

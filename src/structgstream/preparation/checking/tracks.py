@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import epipolar_errors, fundamental_matrix, load_cv2, project, rays
+from structgstream.data.matching import epipolar_errors, fundamental_matrix, project, rays
 from structgstream.preparation.checking.evidence import Evidence
 
 AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
 LEAST_VIEWS = 3
-LEAST_FOR_POSE = 12
 ROUNDS = 2
 
 
@@ -67,14 +66,6 @@ class _Table:
         return _Table(numbered.astype(np.intp), self.camera[kept], self.pixels[kept], self.used[kept])
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How far a camera's pictures place it from its pose."""
-
-    degrees: float
-    share_of_distance: float
-
-
 def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
     """Points from the matches of cameras that are not ``off``; observations of those that are are kept, too.
 
@@ -98,31 +89,6 @@ def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Coll
         table = replace(table, used=good[table.camera] & (residuals < 3 * limit)).solvable()
     points = _closest(table, in_order)
     return Tracks(names, points, table.point, table.camera, table.pixels, _residuals(points, table, in_order))
-
-
-def moved_by(tracks: Tracks, camera: Camera, name: str) -> Motion | None:
-    """How far a camera stands from where points of the others place it; None when they do not.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
-    """
-    own = tracks.of(name)
-    if own.sum() < LEAST_FOR_POSE:
-        return None
-    cv2 = load_cv2()
-    points = tracks.points[tracks.point[own]]
-    limit = AGREE_PIXELS * max(camera.width / 1000, 1)
-    found, turn, shift, inliers = cv2.solvePnPRansac(
-        points, tracks.pixels[own], camera.K.numpy(), None, reprojectionError=limit, iterationsCount=500
-    )
-    if not found or inliers is None or len(inliers) < max(LEAST_FOR_POSE, 0.4 * own.sum()):
-        return None
-    rotation, given = cv2.Rodrigues(turn)[0], camera.viewmat.numpy()[:3, :3]
-    cosine = (np.trace(rotation @ given.T) - 1) / 2
-    center = -rotation.T @ shift[:, 0]
-    distance = float(np.median(np.linalg.norm(points[inliers[:, 0]] - center, axis=1)))
-    moved = float(np.linalg.norm(center - camera.center.numpy()))
-    return Motion(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))), moved / max(distance, 1e-12))
 
 
 def _edges(

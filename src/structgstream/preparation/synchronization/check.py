@@ -22,6 +22,7 @@ from structgstream.preparation.synchronization.motion import (
 
 OFF_PERIODS = 0.25  # of a camera's frames, from which on it is off; true synchronous captures show up to 0.16
 OFF_SIGMAS = 3.0
+MOST_SIGMA_PERIODS = 0.25
 MOST_FRAMES = 300
 
 
@@ -91,10 +92,12 @@ def check_synchronization(source: FrameSource, *, frames: int = MOST_FRAMES) -> 
         return SynchronizationCheck({}, {}, (), tuple(source.rig), period)
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
-    late = {name: solution.offsets[name] - middle for name in group}
-    errors = {name: solution.sigmas[name] for name in group}
-    off = tuple(name for name in group if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
-    return SynchronizationCheck(late, errors, off, tuple(name for name in source.rig if name not in group), period)
+    # A clock that is unsure by a good part of a frame tells nothing, however far it is from the others.
+    told = tuple(name for name in group if solution.sigmas[name] <= MOST_SIGMA_PERIODS * period)
+    late = {name: solution.offsets[name] - middle for name in told}
+    errors = {name: solution.sigmas[name] for name in told}
+    off = tuple(name for name in told if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
+    return SynchronizationCheck(late, errors, off, tuple(name for name in source.rig if name not in told), period)
 
 
 def _changes(source: FrameSource, frames: int) -> dict[str, Changes]:

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cameras were bumped between two frames, and which only have something in their pictures that moved.
+
+The pictures of both look alike. But cameras that stood still see a thing that moved under their poses before and after,
+and the pose of one that was bumped fails at one of the two instants.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
+from structgstream.data.arrays import Floats
+from structgstream.data.calibration import listed
+from structgstream.data.matching import epipolar_errors, fundamental_matrix
+from structgstream.frames import MultiViewFrame
+from structgstream.preparation.checking.evidence import Evidence, gather
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.checking.stillness import Movement, picture_movement
+from structgstream.preparation.checking.tracks import AGREE_PIXELS
+
+CLEAR = 0.5  # largest ratio of the errors of two explanations at which a match speaks for the better one
+LEAST_VOTES = 15
+Judgement = Literal["bumped", "stood", "unknown"]
+
+
+def bump_findings(
+    first: MultiViewFrame, last: MultiViewFrame, evidence: Evidence, cameras: Mapping[str, Camera]
+) -> list[Finding]:
+    """Cameras that were bumped between two frames, and once those of which that cannot be told.
+
+    Args:
+        first: the frame of ``evidence``.
+        last: a later one.
+        evidence: matches of the first frame.
+        cameras: by name.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    names = [name for name in cameras if name in first.images and name in last.images]
+    movements = {name: picture_movement(first.images[name], last.images[name]) for name in names}
+    moved = {name: movement for name, movement in movements.items() if movement is not None and not movement.stayed}
+    if not moved:
+        return []
+    later = gather(last, {name: cameras[name] for name in names})
+    stayed = sum(movement is not None and movement.stayed for movement in movements.values())
+    background = stayed > len(moved)  # most cameras see what stands still, so the others would see it too
+    findings, unknown = [], []
+    for name, movement in moved.items():
+        judged = _judged(name, movement, (evidence, later), cameras)
+        if judged == "bumped" or (judged == "unknown" and background):
+            findings.append(_bumped(name, movement, (first.index, last.index)))
+        elif judged == "unknown":
+            unknown.append(name)
+    return findings + ([_untold(unknown, (first.index, last.index))] if unknown else [])
+
+
+def _judged(
+    name: str, movement: Movement, instants: tuple[Evidence, Evidence], cameras: Mapping[str, Camera]
+) -> Judgement:
+    """What matches with other cameras say at both instants."""
+    back = np.asarray(np.linalg.inv(movement.homography), np.float64)
+    votes = [
+        _votes(name, change, evidence, cameras)
+        for evidence, change in zip(instants, (movement.homography, back), strict=True)
+    ]
+    enough = [(stood, bumped) for stood, bumped in votes if stood + bumped >= LEAST_VOTES]
+    if any(bumped > stood for stood, bumped in enough):
+        return "bumped"
+    # By its calibration at the first instant alone a camera that was bumped later would stand, too.
+    return "stood" if enough and votes[1] in enough else "unknown"
+
+
+def _votes(name: str, change: Floats, evidence: Evidence, cameras: Mapping[str, Camera]) -> tuple[int, int]:
+    """Numbers of matches that fit a camera's pose as they are, and as they would be at the other instant."""
+    stood = bumped = 0
+    limit = AGREE_PIXELS * max(cameras[name].width / 1000, 1)
+    for pair in evidence.overlapping():
+        if name not in pair:
+            continue
+        pixels = evidence.pixels(pair)
+        matrix = fundamental_matrix(cameras[pair[0]], cameras[pair[1]])
+        own = pair.index(name)
+        elsewhere = tuple(_moved(each, change) if number == own else each for number, each in enumerate(pixels))
+        here, there = epipolar_errors(matrix, *pixels), epipolar_errors(matrix, *elsewhere)
+        stood += int(((here < limit) & (here < CLEAR * there)).sum())
+        bumped += int(((there < limit) & (there < CLEAR * here)).sum())
+    return stood, bumped
+
+
+def _moved(pixels: Floats, homography: NDArray[np.float64]) -> Floats:
+    moved = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ homography.T
+    return moved[:, :2] / moved[:, 2:]
+
+
+def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
+    return Finding(
+        "error",
+        f"Camera {name!r} was bumped between frame {frames[0]} and frame {frames[1]}: its picture is shifted by "
+        f"{movement.pixels:.1f} pixels; use the frames before, or film again with the camera fixed.",
+        (name,),
+    )
+
+
+def _untold(names: list[str], frames: tuple[int, int]) -> Finding:
+    return Finding(
+        "note",
+        f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly "
+        "all that their pictures show moved, and no other camera confirms it; let something with texture stand still "
+        "in the pictures.",
+        tuple(names),
+    )

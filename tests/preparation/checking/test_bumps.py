@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A thing that moves before a plain background, and cameras that are bumped."""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from filmed import Film, Plane, noise_texture, ring, room, turned
+from structgstream.cameras import Camera
+from structgstream.frames import MultiViewFrame
+from structgstream.preparation.checking.bumps import bump_findings
+from structgstream.preparation.checking.evidence import gather
+from structgstream.preparation.checking.findings import Finding
+from structgstream.preparation.checking.stillness import picture_movement
+
+Pictures = dict[str, NDArray[np.uint8]]
+
+
+@cache
+def rig() -> dict[str, Film]:
+    return {
+        name: Film(filmed) for name, filmed in ring(4, radius=2.6, arc_degrees=30, focal=290, size=(320, 240)).items()
+    }
+
+
+def cameras() -> dict[str, Camera]:
+    return {name: film.filmed.camera for name, film in rig().items()}
+
+
+def sheet(yaw: float, middle: tuple[float, float, float], texture: int = 5) -> Plane:
+    """A picture of a metre and a half that is held into the room."""
+    pose = np.eye(4)
+    pose[:3, :3] = turned(yaw, axis=1)
+    pose[:3, 3] = np.array(middle) - pose[:3, :3] @ [0.75, 0.75, 0.0]
+    return Plane(noise_texture(texture), pose, (1.5, 1.5))
+
+
+def filmed(planes: list[Plane], seed: int) -> Pictures:
+    return {
+        name: film.picture(planes, noise=1, seed=seed + number) for number, (name, film) in enumerate(rig().items())
+    }
+
+
+def findings(before: Pictures, after: Pictures) -> list[Finding]:
+    first, last = (MultiViewFrame(index, index / 30, images) for index, images in ((0, before), (9, after)))
+    return bump_findings(first, last, gather(first, cameras()), cameras())
+
+
+def test_a_thing_that_moves_is_no_bump() -> None:
+    before, after = filmed([sheet(0, (0, 0, 0))], 0), filmed([sheet(12, (0.25, 0.1, 0.1))], 10)
+    movement = picture_movement(before["cam01"], after["cam01"])
+    assert movement is not None
+    assert movement.pixels > 10  # which looks like a bump to each camera alone
+    assert findings(before, after) == []
+
+
+def test_what_no_other_camera_confirms_is_said_once() -> None:
+    """Each camera sees another sheet, so that nothing tells a moving sheet from a bumped camera."""
+    both = [
+        {
+            name: film.picture([sheet(yaw, middle, texture=20 + number)], noise=1, seed=seed + number)
+            for number, (name, film) in enumerate(rig().items())
+        }
+        for yaw, middle, seed in ((0, (0, 0, 0), 0), (12, (0.25, 0.1, 0.1), 10))
+    ]
+    (found,) = findings(both[0], both[1])
+    assert found.severity == "note"
+    assert found.cameras == tuple(rig())
+    assert "stood still between frame 0 and frame 9 cannot be told" in found.sentence
+
+
+def test_bumped_cameras_of_a_room_are_named() -> None:
+    before, after = filmed(room(), 0), filmed(room(), 10)
+    after["cam02"] = np.roll(after["cam02"], (4, 9), axis=(0, 1))
+    (found,) = findings(before, after)
+    assert (found.severity, found.cameras) == ("error", ("cam02",))
+    assert "shifted by 9.8 pixels" in found.sentence
+
+
+def test_a_bumped_camera_is_named_before_a_moving_thing() -> None:
+    before, after = filmed([sheet(0, (0, 0, 0))], 0), filmed([sheet(12, (0.25, 0.1, 0.1))], 10)
+    after["cam02"] = np.roll(after["cam02"], (9, 0), axis=(0, 1))
+    found = findings(before, after)
+    assert [each.cameras for each in found] == [("cam02",)]
+
+
+def test_cameras_that_stood_have_nothing_to_say() -> None:
+    assert findings(filmed(room(), 0), filmed(room(), 10)) == []
+    blank = {name: np.full((240, 320, 3), 127, np.uint8) for name in rig()}
+    assert picture_movement(blank["cam00"], blank["cam01"]) is None
+    assert findings(blank, blank) == []
