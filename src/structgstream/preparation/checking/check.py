@@ -12,7 +12,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
 from structgstream.preparation.checking.evidence import Evidence, gather, pair_errors
 from structgstream.preparation.checking.explanations import explain
-from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Finding, PairCheck
+from structgstream.preparation.checking.findings import SEVERITIES, CameraCheck, CheckReport, Finding, PairCheck
 from structgstream.preparation.checking.overlap import coverage, overlap_findings, overlaps
 from structgstream.preparation.checking.presence import (
     Presence,
@@ -133,7 +133,7 @@ def check_capture(
         cameras=_camera_checks(first, source, times, presence),
         pairs=_pair_checks(first),
         coverage=coverage(_solid_points(first.tracks), first.cameras),
-        findings=tuple(sorted(findings, key=lambda finding: finding.severity)),
+        findings=tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))),
         rig_radius=radius,
         near=float(np.median([camera.near for camera in cameras.values()])),
         nearest=nearest_depth(depths),
@@ -144,7 +144,7 @@ def check_capture(
 
 def with_findings(checked: Checked, findings: list[Finding]) -> Checked:
     """The check with further findings."""
-    together = sorted([*checked.report.findings, *findings], key=lambda finding: finding.severity)
+    together = sorted([*checked.report.findings, *findings], key=lambda finding: SEVERITIES.index(finding.severity))
     return replace(checked, report=replace(checked.report, findings=tuple(together)))
 
 
