@@ -14,7 +14,8 @@ h1 { font-size: 1.5rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 2.
 p.sub { color: #666; margin: 0 0 1rem; }
 ul.findings { list-style: none; padding: 0; }
 ul.findings li { border-left: 4px solid; padding: .5rem .8rem; margin: .5rem 0; background: #fafafa; }
-li.error { border-color: #d55e00; } li.warning { border-color: #e69f00; } li.note { border-color: #56b4e9; } li.fine { border-color: #009e73; }
+li.error { border-color: #d55e00; } li.warning { border-color: #e69f00; } li.note { border-color: #56b4e9; }
+li.fine { border-color: #009e73; }
 table { border-collapse: collapse; font-size: .86rem; }
 th, td { text-align: right; padding: .25rem .7rem; border-bottom: 1px solid #e4e4e4; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } th { color: #666; font-weight: 600; }

@@ -110,7 +110,8 @@ def solve_by_motion(
     """
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=slack_seconds)
     if coarse is None or len(group) < len(takes):
-        raise CaptureError(_apart([name for name in takes if name not in group], group))
+        seconds = min(end - start for start, end in takes.values())
+        raise CaptureError(_apart([name for name in takes if name not in group], group, seconds))
     ties = motion_ties(good, near=coarse)
     if len(connected(list(takes), ties)) > 1:  # too little is left near the clocks of the first round
         ties = motion_ties(good)
@@ -162,14 +163,13 @@ def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
     return True
 
 
-def _apart(apart: Sequence[str], group: Sequence[str]) -> str:
+def _apart(apart: Sequence[str], group: Sequence[str], seconds: float) -> str:
     names = ", ".join(repr(name) for name in apart)
     others = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
     return (
         f"What moves before {names} cannot be recognised in the motion before {others}, so their clocks are not "
-        "connected; film motion that all see (a person who walks and claps), give the calibration, or synchronise "
-        "by audio or "
-        "timestamps.csv."
+        f"connected; the shortest take has {seconds:.1f} s: film ten seconds of motion that all see (a person who "
+        "walks and claps), give the calibration, or synchronise by audio or timestamps.csv."
     )
 
 
