@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.timeline import Clock
-from structgstream.preparation.synchronization.audio import audio_ties, sound_of
-from structgstream.preparation.synchronization.solving import connected, solve_clocks
+from structgstream.preparation.synchronization.audio import audio_lags, connected_by, solve_by_audio, sound_of
 
 HERTZ = 96_000  # of the made sound
 DECAY_SECONDS = 0.004  # of a clap
-SLACK_SECONDS = 0.02  # as in synchronize
 
 
 @dataclass(frozen=True)
@@ -69,12 +67,12 @@ def main() -> None:
         recorded, truth = made(case)
         begun = time.process_time()
         sounds = {name: sound_of(name, sound) for name, sound in recorded.items()}
-        ties = audio_ties(sounds)
+        lags = audio_lags(sounds)
         takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
-        if len(connected(list(takes), ties)) > 1:
+        if len(connected_by(list(takes), lags)) > 1:
             print(f"{case.title:30} not connected")
             continue
-        found = solve_clocks(takes, ties, drift=case.drift_ppm > 0, slack_seconds=SLACK_SECONDS)
+        found = solve_by_audio(takes, lags, drift=case.drift_ppm > 0)
         clocks = {name: Clock(found.offsets[name], found.rates[name]) for name in takes}
         error = largest_error(clocks, truth, takes)
         sigma = float(np.mean(list(found.sigmas.values())))

@@ -39,3 +39,23 @@ def test_all_and_nothing(present: list[bool]) -> None:
             "Camera 'a' has no picture of any frame that can be read; leave it out, or restore its files."
         ]
     )  # fmt: skip
+
+
+def test_cameras_that_are_stopped_by_hand_are_told_of_once() -> None:
+    """Three of four end 2 to 14 frames of 300 early; one ends 30 early, which costs a second."""
+    presence = {name: np.arange(300) < end for name, end in (("a", 300), ("b", 298), ("c", 286), ("d", 270))}
+    note, warning = presence_findings(presence, 30.0)
+    assert (note.severity, note.cameras) == ("note", ("b", "c"))
+    assert "end up to 0.47 s before the last camera" in note.sentence
+    assert "up to frame 285 (9.50 s)" in note.sentence
+    assert (warning.severity, warning.cameras) == ("warning", ("d",))
+    assert "ends with frame 269" in warning.sentence
+
+
+def test_what_is_dropped_is_told_of_a_camera_that_ends_a_little_early() -> None:
+    present = np.arange(300) < 295
+    present[100:103] = False
+    note, warning = presence_findings({"a": np.ones(300, bool), "b": present}, 30.0)
+    assert note.severity == "note"
+    assert "lacks 3 of 295 frames" in warning.sentence
+    assert "ends with" not in warning.sentence

@@ -98,3 +98,31 @@ def test_drift_within_the_noise_is_no_drift() -> None:
 def test_groups_of_connected_cameras() -> None:
     ties = [Tie("a", "b", 0, 0, 1), Tie("d", "c", 0, 0, 1), Tie("b", "e", 0, 0, 1)]
     assert connected("abcdef", ties) == (("a", "b", "e"), ("c", "d"), ("f",))
+
+
+def test_a_rate_that_is_not_known_widens_what_is_stated() -> None:
+    """One tie a pair, in the middle of the takes: rates are not observed, and the ends may be far off."""
+    ties = ties_of(TRUTH, sigma=1e-3, each=1)
+    ties = [
+        replace(tie, first_seconds=30.0, second_seconds=30.0 + tie.second_seconds - tie.first_seconds) for tie in ties
+    ]
+    unknown, none = (solve_clocks(TAKES, ties, drift=drift, slack_seconds=0.01) for drift in (True, False))
+    assert set(unknown.rates.values()) == {1.0}
+    assert max(none.sigmas.values()) < 2e-3
+    assert min(unknown.sigmas.values()) > 5e-3
+
+
+def test_errors_that_ties_of_a_camera_share_are_told_by_its_blocks() -> None:
+    """All ties of b are off alike; what they change by without each of ten blocks tells by how much."""
+    scores = []
+    for seed in range(40):
+        errors_of_blocks = np.random.default_rng(1000 + seed).normal(0, 3e-3, 10)
+        own, without = errors_of_blocks.mean(), (errors_of_blocks.sum() - errors_of_blocks) / 9
+        ties = []
+        for tie in ties_of(TRUTH, sigma=1e-5, each=1, seed=seed):
+            side = {tie.first: -1.0, tie.second: 1.0}.get("b", 0.0)
+            shifted = replace(tie, second_seconds=tie.second_seconds + side * own)
+            ties.append(replace(shifted, changes=tuple(side * (without - own))))
+        solution = solve_clocks(TAKES, ties, drift=False, slack_seconds=0.01)
+        scores.append(errors(solution, TRUTH, 0.0)[1] / solution.sigmas["b"])
+    assert 0.5 < np.mean(np.square(scores)) < 1.6

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the worst first
 
 
 @dataclass(frozen=True)
@@ -14,8 +14,8 @@ class Finding:
     """One thing that is wrong, or worth knowing.
 
     Args:
-        severity: a stream made with an ``error`` is spoiled; a ``warning`` costs quality; a ``note``
-            says what could not be checked.
+        severity: a stream made with an ``error`` is spoiled; a ``warning`` costs quality; a ``note`` is worth
+            knowing.
         sentence: names camera or file, what was found and what to do.
         cameras: those concerned.
     """

@@ -16,6 +16,7 @@ from structgstream.preparation.checking.findings import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
 MOST_TRIED = 4  # frames, where pictures that should be there cannot be decoded
+LOST_SECONDS, LOST_SHARE, MOST_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of the take
 
 
 def stated_presence(source: FrameSource) -> Presence:
@@ -68,8 +69,16 @@ def note(frame: MultiViewFrame, presence: Presence) -> None:
 
 
 def presence_findings(presence: Presence, fps: float) -> list[Finding]:
-    """A warning for each camera that ends early, lacks frames, or has no picture of frame 0."""
-    findings = []
+    """A warning for each camera that ends early, lacks frames, or has no picture of frame 0.
+
+    Cameras are never stopped in the same instant: those that end within :func:`_slack` of the last one are told of in
+    one note, which says what all have.
+    """
+    ends = {name: int(np.flatnonzero(own)[-1]) + 1 for name, own in presence.items() if own.any()}
+    slack = _slack(max(map(len, presence.values()), default=0), fps)
+    early = {name: end for name, end in ends.items() if 0 < len(presence[name]) - end <= slack}
+    findings = [_stopped(early, max(ends.values()), fps)] if early else []
+    presence = {name: own[: early.get(name, len(own))] for name, own in presence.items()}
     for name, present in presence.items():
         if present.all():
             continue
@@ -78,6 +87,26 @@ def presence_findings(presence: Presence, fps: float) -> list[Finding]:
             told = " ".join(_told(name, present, fps))
         findings.append(Finding("warning", told, (name,)))
     return findings
+
+
+def _slack(frames: int, fps: float) -> int:
+    """Frames that a camera may lack at the end: half a second or 5 % of the take, whichever is more, and never more
+    than a quarter of it."""
+    return round(min(max(LOST_SECONDS * fps, LOST_SHARE * frames), MOST_LOST_SHARE * frames))
+
+
+def _stopped(ends: Mapping[str, int], last: int, fps: float) -> Finding:
+    """What cameras that end a little early leave, by the number of frames at which each ends."""
+    names = list(ends)
+    listed = ", ".join(repr(name) for name in names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+    first = min(ends.values())
+    return Finding(
+        "note",
+        f"{listed} {'end' if len(names) > 1 else 'ends'} up to {(last - first) / fps:.2f} s before the last camera, as "
+        f"cameras do that are stopped by hand; all of these have pictures up to frame {first - 1} "
+        f"({(first - 1) / fps:.2f} s).",
+        tuple(names),
+    )
 
 
 def _told(name: str, present: NDArray[np.bool_], fps: float) -> list[str]:

@@ -2,15 +2,16 @@
 """Instants that pairs of cameras share, from what their microphones hear.
 
 Coarse: increases of energy in a few bands (onsets) are correlated over all lags; levels and tone of microphones do
-not matter. Fine: in windows with many onsets, cross-correlation of the phases of both spectra (GCC-PHAT: Knapp and
-Carter, 1976), whose peak is the direct path even where a room echoes. Spectra are compared at the same frequencies in
-hertz, so sample rates may differ.
+not matter. Onsets are smoothed, so that sounds from several places agree on one lag although their ways differ. Fine:
+in windows with many onsets phases are compared (``phases.py``), at the same frequencies in hertz, so that sample rates
+may differ. Windows that agree give the lag; where they do not, because each hears another place, the coarse one holds.
 
-Sound needs 2.9 ms a metre: a camera that stands a metre farther from it seems that much late.
+Sound needs 2.9 ms a metre: a camera that stands a metre farther from it seems that much late. Rooms may be louder than
+the direct sound: what the other peaks of a pair leave open is part of its error, less so where lags close loops.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -21,32 +22,41 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal, best_lag
-from structgstream.preparation.synchronization.solving import Tie
+from structgstream.preparation.synchronization.loops import PairLag, doubts
+from structgstream.preparation.synchronization.phases import (
+    HIGH_HERTZ,
+    LOW_HERTZ,
+    WINDOW_SECONDS,
+    Recording,
+    Window,
+    ambiguity_seconds,
+    phase_window,
+)
+from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
 
 SPEED_OF_SOUND = 343.0  # metres a second, at 20 degrees Celsius
 STEP_SECONDS = 0.004  # of onsets
-BANDS_HERTZ = (150.0, 600.0, 1500.0, 3500.0, 8000.0)
+SMOOTHING_STEPS = 1.0  # standard deviation; ways of sound that differ by a metre are apart by less than a step
+BANDS_HERTZ = (LOW_HERTZ, 600.0, 1500.0, 3500.0, HIGH_HERTZ)
 LEAST_OVERLAP_SECONDS = 1.0
 RIVAL_RATIO = 0.8  # of the second best lag to the best one
-COARSE_RIVAL_RATIO = 0.5  # the same, where phases do not confirm the lag
+SINGLE_RIVAL_RATIO = 0.5  # the same where one bang alone agrees, which any other may do
+SEVERAL_SHARE, SEVERAL_SECONDS = 0.3, 0.15  # of a second bang: its share of the first one, and its distance
 CHANCE_DEVIATIONS = 7.0  # that a coarse peak exceeds: the largest of 300000 normal numbers is at 4.5
-WINDOW_SECONDS, MOST_WINDOWS = 2, 16
-GRID_HERTZ = 96000  # of the fine correlation
+COARSE_SIGMA_SECONDS = 2.5e-3  # of a lag by onsets: claps from several places, echoes
+MOST_WINDOWS = 16
+SLACK_SECONDS = 0.02  # what drift may make of a lag before rates are known
 FINE_SIGMA_SECONDS = 1e-4  # of a window's peak in a room that echoes
-LEAST_STANDING_OUT = 6.0  # of a fine peak, over the root mean square of the correlation
 AGREEING_SECONDS, MOST_DRIFT = 1.5e-4, 2e-4  # between windows
 LEAST_AGREEING, LEAST_AGREEING_SHARE = 4, 0.4
-SMOOTHING_BINS = 101  # over which spectra are made white
 STRIDES = (1, 2, 3, 5)  # between partners, where there are more cameras than the next number
 ALL_PAIRS = 12
 
 
 @dataclass(frozen=True)
-class Sound:
-    """Mono samples ``[N]`` at ``rate`` hertz and their onsets."""
+class Sound(Recording):
+    """A recording and its onsets."""
 
-    samples: NDArray[np.float32]
-    rate: float
     onsets: Signal
 
 
@@ -76,18 +86,48 @@ def distances_from(position: Floats, cameras: Mapping[str, LensCamera]) -> dict[
     return {name: float(np.linalg.norm(own.camera.center.numpy() - position)) for name, own in cameras.items()}
 
 
-def audio_ties(sounds: Mapping[str, Sound], *, distances: Mapping[str, float] | None = None) -> list[Tie]:
-    """Ties of the pairs of cameras that hear the same; pairs whose best lag is ambiguous have none.
+def audio_lags(sounds: Mapping[str, Sound]) -> list[PairLag]:
+    """Lags of the pairs of cameras that hear the same; pairs whose best lag is ambiguous have none."""
+    return [lag for pair in _pairs(list(sounds)) if (lag := _pair_lag(*pair, sounds)) is not None]
+
+
+def solve_by_audio(
+    takes: Mapping[str, tuple[float, float]],
+    lags: Sequence[PairLag],
+    *,
+    drift: bool = True,
+    distances: Mapping[str, float] | None = None,
+) -> Solution:
+    """Clocks by sound.
 
     Args:
-        sounds: camera to what it recorded.
+        takes: camera to the first and last second of its take.
+        lags: what :func:`audio_lags` gives; they must connect all cameras (:func:`connected_by`).
+        drift: whether rates other than 1 are considered.
         distances: camera to its distance from the source of the sound in metres, where it is known.
     """
-    delays = {name: (distances[name] / SPEED_OF_SOUND if distances else 0.0) for name in sounds}
-    ties = []
-    for first, second in _pairs(list(sounds)):
-        ties += _pair_ties(first, second, sounds, delays)
-    return ties
+    delays = {name: (distances[name] / SPEED_OF_SOUND if distances else 0.0) for name in takes}
+    left = doubts(lags)
+    # A wrong peak is off by as much in all windows of a pair, so drift is told by windows, and offsets by pairs.
+    sharp = solve_clocks(takes, _ties(lags, [0.0] * len(lags), delays), drift=drift, slack_seconds=SLACK_SECONDS)
+    rates = sharp.rates
+    ties = [
+        replace(
+            tie,
+            first_seconds=rates[tie.first] * tie.first_seconds,
+            second_seconds=rates[tie.second] * tie.second_seconds,
+        )
+        for tie in _ties(lags, left, delays)
+    ]
+    spans = {name: (rates[name] * start, rates[name] * end) for name, (start, end) in takes.items()}
+    found = solve_clocks(spans, ties, drift=False, slack_seconds=SLACK_SECONDS)
+    sigmas = {name: float(np.hypot(found.sigmas[name], sharp.sigmas[name])) for name in takes}
+    return replace(found, rates=rates, sigmas=sigmas)
+
+
+def connected_by(cameras: Sequence[str], lags: Sequence[PairLag]) -> tuple[tuple[str, ...], ...]:
+    """Groups of cameras that lags connect, the largest first."""
+    return connected(cameras, _ties(lags, [0.0] * len(lags), dict.fromkeys(cameras, 0.0)))
 
 
 def _pairs(names: list[str]) -> list[Pair]:
@@ -96,40 +136,67 @@ def _pairs(names: list[str]) -> list[Pair]:
     return [(names[i], names[(i + stride) % len(names)]) for stride in STRIDES for i in range(len(names))]
 
 
-def _pair_ties(first: str, second: str, sounds: Mapping[str, Sound], delays: Mapping[str, float]) -> list[Tie]:
+def _pair_lag(first: str, second: str, sounds: Mapping[str, Sound]) -> PairLag | None:
     one, other = sounds[first], sounds[second]
     least = round(LEAST_OVERLAP_SECONDS / STEP_SECONDS)
     coarse = best_lag(one.onsets, other.onsets, least_overlap=least)
+    # The right lag is the one at which all sounds agree; another one has a clap agree with another clap.
     if coarse is None or coarse.rival > RIVAL_RATIO * coarse.judged:
-        return []
+        return None
     if coarse.judged < CHANCE_DEVIATIONS * coarse.deviation:
-        return []
+        return None
     confidence = coarse.judged / max(coarse.rival, 0.01)
     found = [
-        (middle, lag)
+        window
         for middle in _windows(one.onsets, other.onsets, coarse.seconds)
-        if (lag := _phase_lag(one, other, middle, coarse.seconds)) is not None
+        if (window := phase_window(one, other, middle, coarse.seconds)) is not None
     ]
     agreeing = _on_a_line(found)
-    if not agreeing and coarse.rival > COARSE_RIVAL_RATIO * coarse.judged:
-        return []  # a bang of one place agrees with a bang of another
     if not agreeing:
-        agreeing, sigma, confidence = [(coarse.middle, coarse.seconds)], STEP_SECONDS, confidence / 4
-    else:
-        sigma = FINE_SIGMA_SECONDS
-    return [
-        Tie(first, second, at - delays[first], at + lag - delays[second], sigma, confidence) for at, lag in agreeing
-    ]
+        if coarse.rival > SINGLE_RIVAL_RATIO * coarse.judged and not _several(one.onsets, other.onsets, coarse.seconds):
+            return None
+        whole = ((coarse.middle, coarse.seconds),)
+        return PairLag(first, second, whole, COARSE_SIGMA_SECONDS, COARSE_SIGMA_SECONDS, confidence / 4, fine=False)
+    instants = tuple((window.middle, window.seconds) for window in agreeing)
+    return PairLag(first, second, instants, FINE_SIGMA_SECONDS, ambiguity_seconds(agreeing), confidence)
 
 
-def _on_a_line(found: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The windows (time, lag) that agree with most others on a lag and a drift; none if too few do.
+def _several(one: Signal, other: Signal, lag: float) -> bool:
+    """Whether more than one bang of both agrees at a lag."""
+    times = np.arange(max(one.start, other.start - lag), min(one.end, other.end - lag), one.step)
+    both = np.zeros(len(times))
+    for x, y in zip(one.values.T, other.values.T, strict=True):
+        at_one = one.start + one.step * np.arange(len(x)), other.start - lag + other.step * np.arange(len(y))
+        both += np.interp(times, at_one[0], x) * np.interp(times, at_one[1], y)
+    first = int(both.argmax())
+    apart = np.abs(times - times[first]) > SEVERAL_SECONDS
+    return bool(apart.any()) and float(both[apart].max()) > SEVERAL_SHARE * float(both[first])
+
+
+def _ties(lags: Sequence[PairLag], left: Sequence[float], delays: Mapping[str, float]) -> list[Tie]:
+    """Ties whose errors are those of windows, and that of the peak that all windows of a pair share, as far as it is
+    ``left`` open."""
+    ties = []
+    for lag, doubt in zip(lags, left, strict=True):
+        shared = lag.ambiguity_seconds * doubt * len(lag.instants) ** 0.5 if lag.fine else 0.0
+        sigma = float(np.hypot(lag.sigma_seconds, shared))
+        one, other = delays[lag.first], delays[lag.second]
+        ties += [
+            Tie(lag.first, lag.second, at - one, at + apart - other, sigma, lag.confidence)
+            for at, apart in lag.instants
+        ]
+    return ties
+
+
+def _on_a_line(found: list[Window]) -> list[Window]:
+    """The windows that agree with most others on a lag and a drift; none if too few do.
 
     Echoes and noise give lags that are spread over the range that is searched, so a few that agree are right.
     """
     if len(found) < LEAST_AGREEING:
         return []
-    times, lags = np.array(found).T
+    times = np.array([window.middle for window in found])
+    lags = np.array([window.seconds for window in found])
     best = np.zeros(len(found), bool)
     for i, j in combinations(range(len(found)), 2):
         slope = (lags[j] - lags[i]) / (times[j] - times[i]) if times[i] != times[j] else np.inf
@@ -139,11 +206,12 @@ def _on_a_line(found: list[tuple[float, float]]) -> list[tuple[float, float]]:
                 best = on if on.sum() > best.sum() else best
     if best.sum() < max(LEAST_AGREEING, LEAST_AGREEING_SHARE * len(found)):
         return []
-    return [pair for pair, agrees in zip(found, best, strict=True) if agrees]
+    return [window for window, agrees in zip(found, best, strict=True) if agrees]
 
 
 def _onsets(samples: NDArray[np.float32], rate: float) -> Signal:
-    """Increases ``[T, B]`` of the logarithm of the energy in each band, above the band's usual energy."""
+    """Smoothed increases ``[T, B]`` of the logarithm of the energy in each band, above the band's usual energy."""
+    from scipy.ndimage import gaussian_filter1d
     from scipy.signal import butter, sosfilt
 
     count = int(len(samples) / rate / STEP_SECONDS)
@@ -157,7 +225,8 @@ def _onsets(samples: NDArray[np.float32], rate: float) -> Signal:
         energy = np.add.reduceat(power, bounds[:-1])[:count] / np.diff(bounds)
         level = np.log(energy + max(float(np.median(energy)), 1e-12 * float(energy.max()), 1e-30))
         channels.append(np.maximum(np.diff(level, prepend=level[0]), 0.0))
-    return Signal(np.stack(channels, axis=1), STEP_SECONDS / 2, STEP_SECONDS)
+    onsets = gaussian_filter1d(np.stack(channels, axis=1), SMOOTHING_STEPS, axis=0)
+    return Signal(onsets, STEP_SECONDS / 2, STEP_SECONDS)
 
 
 def _windows(one: Signal, other: Signal, lag: float) -> list[float]:
@@ -176,49 +245,3 @@ def _windows(one: Signal, other: Signal, lag: float) -> list[float]:
         loudness *= total[high] - total[low]
     parts = np.array_split(np.arange(len(times)), min(count, len(times)) or 1)
     return [float(times[part[loudness[part].argmax()]]) for part in parts if len(part)]
-
-
-def _phase_lag(one: Sound, other: Sound, middle: float, lag: float) -> float | None:
-    """The lag in seconds near ``lag`` where the phases of a window agree best; None if no lag stands out."""
-    from scipy.fft import irfft
-
-    spectra = [_spectrum(one, middle), _spectrum(other, middle + lag)]
-    if any(spectrum is None for spectrum in spectra):
-        return None
-    (first, shift_first), (second, shift_second) = (spectrum for spectrum in spectra if spectrum is not None)
-    bins = min(len(first), len(second))
-    hertz = np.arange(bins) / (2 * WINDOW_SECONDS)
-    cross = np.conj(_whitened(first[:bins])) * _whitened(second[:bins])
-    cross[(hertz < BANDS_HERTZ[0]) | (hertz > BANDS_HERTZ[-1])] = 0
-    curve = np.asarray(irfft(cross, 2 * WINDOW_SECONDS * GRID_HERTZ))
-    reach = round(2 * STEP_SECONDS * GRID_HERTZ)
-    near = np.concatenate([curve[-reach:], curve[: reach + 1]])
-    best = int(near.argmax())
-    if not 0 < best < len(near) - 1 or near[best] < LEAST_STANDING_OUT * float(np.sqrt(np.mean(curve**2))):
-        return None
-    left, top, right = near[best - 1 : best + 2]
-    vertex = (left - right) / (2 * (left - 2 * top + right))
-    return lag + (best - reach + vertex) / GRID_HERTZ + shift_second - shift_first
-
-
-def _whitened(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """A spectrum divided by its smooth magnitude, so that narrow bands of noise keep their small weight."""
-    from scipy.ndimage import uniform_filter1d
-
-    magnitude = np.sqrt(uniform_filter1d(np.abs(spectrum) ** 2, SMOOTHING_BINS))
-    return spectrum / np.maximum(magnitude, 1e-9 * float(magnitude.max()) + 1e-300)
-
-
-def _spectrum(sound: Sound, middle: float) -> tuple[NDArray[np.complex128], float] | None:
-    """Spectrum, zero padded to twice the window, and by how many seconds the window starts later than asked for."""
-    from scipy.fft import rfft
-
-    length = round(WINDOW_SECONDS * sound.rate)
-    wanted = (middle - WINDOW_SECONDS / 2) * sound.rate
-    first = round(wanted)
-    window = np.zeros(length)
-    low, high = max(first, 0), min(first + length, len(sound.samples))
-    if high - low < 0.4 * length:
-        return None
-    window[low - first : high - first] = sound.samples[low:high]
-    return np.asarray(rfft(window * np.hanning(length), 2 * length)), (first - wanted) / sound.rate

@@ -3,8 +3,8 @@
 
 Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With
 epipolar geometry signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame
-for one pair. A first round considers all lags; the second one looks, near those that most pairs agree on, in each
-part of the take.
+for one pair. A first round considers all lags; the second one looks near those that most pairs agree on, and, in takes
+that are long enough, for drift.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,12 +12,14 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.changes import Changes
 from structgstream.preparation.synchronization.correlation import Signal, best_lag, chance_deviation, resampled
 from structgstream.preparation.synchronization.epipolar import line_signals
 from structgstream.preparation.synchronization.geometry import Geometry
+from structgstream.preparation.synchronization.lines import Line, fitted_line
 from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
 from structgstream.preparation.synchronization.streams import period_seconds
 
@@ -29,8 +31,10 @@ CHANCE_DEVIATIONS = 4.5
 ESTIMATED_PEAK, CONTROL_RATIO = 0.5, 1.2
 RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
 LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
-PART_SECONDS, MOST_PARTS = 8.0, 12
+LEAST_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
+BLOCK_SECONDS, MOST_BLOCKS = 1.0, 12
 NEAR_PERIODS = 2.0
+LEAST_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
 # Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
 # in periods, with a known geometry, with one from static features, and by activities.
 BIAS_PERIODS, ESTIMATED_BIAS_PERIODS, ACTIVITY_BIAS_PERIODS = 0.06, 0.3, 1.0
@@ -75,12 +79,19 @@ def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -
 
     Args:
         pairs: what :func:`pair_signals` gives.
-        near: clocks near which lags are looked for, in each part of the take; None looks at all lags of the whole take.
+        near: clocks near which lags and drift are looked for; None looks at all lags.
     """
-    ties = []
-    for pair in pairs:
-        ties += _whole(pair) if near is None else _parts(pair, near)
-    return ties
+    if near is None:
+        return [tie for pair in pairs for tie in _whole(pair)]
+    bounds = [
+        (near.offsets[pair.first] + pair.signals[0].start, near.offsets[pair.first] + pair.signals[0].end)
+        for pair in pairs
+    ]
+    low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
+    if high - low < LEAST_DRIFT_SECONDS:
+        return [tie for pair in pairs for tie in _near(pair, near)]
+    edges = np.linspace(low, high, min(int((high - low) / BLOCK_SECONDS), MOST_BLOCKS) + 1)
+    return [tie for pair in pairs for tie in _along(pair, near, edges)]
 
 
 def solve_by_motion(
@@ -99,9 +110,10 @@ def solve_by_motion(
     """
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=slack_seconds)
     if coarse is None or len(group) < len(takes):
-        raise CaptureError(_apart([name for name in takes if name not in group], group))
+        seconds = min(end - start for start, end in takes.values())
+        raise CaptureError(_apart([name for name in takes if name not in group], group, seconds))
     ties = motion_ties(good, near=coarse)
-    if len(connected(list(takes), ties)) > 1:  # parts of the take are too short or too still
+    if len(connected(list(takes), ties)) > 1:  # too little is left near the clocks of the first round
         ties = motion_ties(good)
     solution = solve_clocks(takes, ties, drift=drift, slack_seconds=slack_seconds)
     errors = {
@@ -151,14 +163,13 @@ def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
     return True
 
 
-def _apart(apart: Sequence[str], group: Sequence[str]) -> str:
+def _apart(apart: Sequence[str], group: Sequence[str], seconds: float) -> str:
     names = ", ".join(repr(name) for name in apart)
     others = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
     return (
         f"What moves before {names} cannot be recognised in the motion before {others}, so their clocks are not "
-        "connected; film motion that all see (a person who walks and claps), give the calibration, or synchronise "
-        "by audio or "
-        "timestamps.csv."
+        f"connected; the shortest take has {seconds:.1f} s: film ten seconds of motion that all see (a person who "
+        "walks and claps), give the calibration, or synchronise by audio or timestamps.csv."
     )
 
 
@@ -184,29 +195,48 @@ def _control(pair: PairSignals, least: int) -> float:
     return max((lag.judged for lag in lags if lag is not None), default=0.0)
 
 
-def _parts(pair: PairSignals, near: Solution) -> list[Tie]:
+def _near(pair: PairSignals, near: Solution) -> list[Tie]:
+    """The tie of a whole take near known clocks."""
     one, other = pair.signals
-    step = one.step
-    rates, offsets = near.rates, near.offsets
-    # By the first camera's clock; rates differ so little that a constant lag holds within a part.
-    ratio = rates[pair.first] / rates[pair.second]
-    shift = (offsets[pair.first] - offsets[pair.second]) / rates[pair.second]
-    start = max(one.start, (other.start - shift) / ratio)
-    end = min(one.end, (other.end - shift) / ratio)
-    count = max(min(int((end - start) / PART_SECONDS), MOST_PARTS), 1)
-    ties = []
-    for part in range(count):
-        low, high = start + (end - start) * part / count, start + (end - start) * (part + 1) / count
-        expected = shift + (ratio - 1) * (low + high) / 2
-        reach = NEAR_PERIODS * step
-        cut = one.cut(low, high), other.cut(low + expected - reach, high + expected + reach)
-        least = max(LEAST_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
-        if min(len(signal.values) for signal in cut) < LEAST_SAMPLES:
-            continue
-        lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
-        if lag is not None and lag.peak >= LEAST_PEAK and abs(lag.seconds - expected) < reach - step / 2:
-            ties.append(_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak))
-    return ties
+    expected = _expected(pair, near)
+    reach = NEAR_PERIODS * one.step
+    start, end = max(one.start, other.start - expected), min(one.end, other.end - expected)
+    cut = one.cut(start, end), other.cut(start + expected - reach, end + expected + reach)
+    if min(len(signal.values) for signal in cut) < LEAST_SAMPLES:
+        return []
+    least = max(LEAST_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
+    lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
+    if lag is None or lag.peak < LEAST_PEAK or abs(lag.seconds - expected) >= reach - one.step / 2:
+        return []
+    return [_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak)]
+
+
+def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list[Tie]:
+    """Two ties that say what a line of lags over the take says: they are apart by as much as its blocks, so that their
+    errors are independent; one where the take does not tell the drift."""
+    one, other = pair.signals
+    line = fitted_line(one, other, expected_seconds=_expected(pair, near), edges=edges - near.offsets[pair.first])
+    if line is None:
+        return []
+    least = LEAST_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
+    sigma = max(line.lag_sigma, least)
+    if line.rate is None:
+        return [_line_tie(pair, line, 0.0, sigma)]
+    sigma = max(sigma, line.rate_sigma * line.spread_seconds)
+    return [_line_tie(pair, line, side * line.spread_seconds, 2**0.5 * sigma) for side in (-1.0, 1.0)]
+
+
+def _line_tie(pair: PairSignals, line: Line, after: float, sigma: float) -> Tie:
+    at = line.middle + after
+    changes = line.lag_changes + after * line.rate_changes
+    lag = line.lag_seconds + after * (line.rate or 0.0)
+    weight = 4.0 if pair.epipolar else 1.0
+    return Tie(pair.first, pair.second, at, at + lag, sigma, weight, tuple(changes.tolist()))
+
+
+def _expected(pair: PairSignals, near: Solution) -> float:
+    """The lag by known clocks whose rates are 1."""
+    return near.offsets[pair.first] - near.offsets[pair.second]
 
 
 def _tie(pair: PairSignals, middle: float, seconds: float, sigma: float, confidence: float) -> Tie:

@@ -17,7 +17,8 @@ from structgstream.data.arrays import Floats
 
 TREES = 200
 ITERATIONS = 30
-RATE_PRIOR = 1e-4  # standard deviation of rates of quartz clocks
+# Standard deviation of rates: quartz clocks are within 1e-4, but 29.97 and 30 frames a second are 1e-3 apart.
+RATE_PRIOR = 5e-4
 RATE_SIGMAS, RATE_EFFECT_SECONDS = 3.0, 1e-3  # a rate other than 1 is kept if it exceeds both
 SIGMAS = 5.0  # ties further off than this many standard deviations are wrong
 
@@ -33,6 +34,8 @@ class Tie:
         second_seconds: the same instant by the second camera's.
         sigma_seconds: standard error of their difference.
         confidence: how distinct the match is, larger is better; only orders ties.
+        changes: by how much the second camera's second grows without each block of the take, the same blocks for all
+            ties; empty where it is not known. They tell errors that ties of a camera share.
     """
 
     first: str
@@ -41,6 +44,7 @@ class Tie:
     second_seconds: float
     sigma_seconds: float
     confidence: float = 1.0
+    changes: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,8 @@ class Solution:
     Args:
         offsets: camera to seconds; the first camera's is 0.
         rates: camera to rate; the first camera's is 1.
-        sigmas: camera to the standard error of its common time, relative to the mean of all cameras.
+        sigmas: camera to the standard error of its common time at the ends of its take, relative to the mean of all
+            cameras.
         agreeing: for each tie whether it agrees.
         residuals: for each tie the difference of its two common times, seconds.
     """
@@ -64,7 +69,8 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Graph:
-    """Ties as arrays; ``times`` are relative to the middle of each camera's take."""
+    """Ties as arrays; ``times`` are relative to the middle of each camera's take, ``changes`` ``[K, ties]`` are those
+    of the differences without each block."""
 
     first: NDArray[np.intp]
     second: NDArray[np.intp]
@@ -72,6 +78,7 @@ class _Graph:
     second_times: Floats
     differences: Floats
     sigmas: Floats
+    changes: Floats
     cameras: int
 
 
@@ -111,12 +118,13 @@ def solve_clocks(
     offsets = _consensus(graph, [tie.confidence for tie in ties], slack_seconds)
     corrections = np.zeros(len(names))
     free = np.zeros(len(names), bool)
+    unknown = np.zeros(len(names))
     offsets, _, weights, covariance = _reweighted(graph, offsets, corrections, free, slack_seconds)
     if drift and len(names) > 1:
-        offsets, corrections, weights, covariance = _with_rates(graph, offsets, halves, slack_seconds)
+        offsets, corrections, weights, covariance, unknown = _with_rates(graph, offsets, halves, slack_seconds)
     residuals = _residuals(graph, offsets, corrections)
     variances = _relative_variances(covariance, len(names))
-    spread = np.sqrt(variances[0] + halves**2 * variances[1])
+    spread = np.sqrt(variances[0] + halves**2 * (variances[1] + unknown))
     rates = (1 + corrections) / (1 + corrections[0])
     at_zero = offsets - middles * corrections
     at_zero = (at_zero - at_zero[0]) / (1 + corrections[0])
@@ -136,6 +144,9 @@ def _graph(names: list[str], ties: Sequence[Tie], middles: Floats) -> _Graph:
     at_first = np.array([tie.first_seconds for tie in ties])
     at_second = np.array([tie.second_seconds for tie in ties])
     sigmas = np.array([tie.sigma_seconds for tie in ties])
+    changes = np.zeros((max((len(tie.changes) for tie in ties), default=0), len(ties)))
+    for number, tie in enumerate(ties):
+        changes[: len(tie.changes), number] = np.negative(tie.changes)
     return _Graph(
         first,
         second,
@@ -143,6 +154,7 @@ def _graph(names: list[str], ties: Sequence[Tie], middles: Floats) -> _Graph:
         at_second - middles[second],
         at_first - at_second,
         sigmas,
+        changes,
         len(names),
     )
 
@@ -240,8 +252,18 @@ def _step(
     inverse = np.linalg.pinv(normal[np.ix_(kept, kept)], rcond=1e-13, hermitian=True)
     moved, covariance = np.zeros(2 * count), np.zeros((2 * count, 2 * count))
     moved[kept] = inverse @ right[kept]
-    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights, scale)
+    shared = _shared(inverse @ (design * weights[:, None]).T[kept] @ graph.changes.T)
+    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights, scale) + shared
     return moved, covariance
+
+
+def _shared(changes: Floats) -> Floats:
+    """Covariance ``[N, N]`` by the jackknife of numbers whose changes without each of K blocks are ``[N, K]``."""
+    count = changes.shape[1]
+    if count < 2:
+        return np.zeros((len(changes), len(changes)))
+    centred = changes - changes.mean(1, keepdims=True)
+    return (count - 1) / count * centred @ centred.T
 
 
 def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> float:
@@ -271,11 +293,11 @@ def _pair_numbers(graph: _Graph) -> NDArray[np.intp]:
 
 def _with_rates(
     graph: _Graph, offsets: Floats, halves: Floats, slack_seconds: float
-) -> tuple[Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """The solution with rates of the cameras whose rate matters: significant, and more than a millisecond in the
-    take."""
+    take; and the mean squares that the rates of the others may have."""
     free = np.ones(graph.cameras, bool)
-    zeros = np.zeros(graph.cameras)
+    zeros, unknown = np.zeros((2, graph.cameras))
     start = offsets
     while True:
         offsets, corrections, weights, covariance = _reweighted(graph, start, zeros, free, slack_seconds)
@@ -283,10 +305,14 @@ def _with_rates(
         # Rates are relative: compared with the median, cameras of one kind of clock keep rate 1 together.
         relative = corrections - (np.median(corrections) if free.all() else 0.0)
         effect = np.abs(relative) * 2 * halves * (2 if graph.cameras == 2 else 1)
-        weak = (np.abs(relative) < RATE_SIGMAS * errors) | (effect < RATE_EFFECT_SECONDS)
-        if not (weak & free).any():
-            return offsets, corrections, weights, covariance
-        free &= ~weak
+        strength = np.minimum(np.abs(relative) / (RATE_SIGMAS * errors + 1e-300), effect / RATE_EFFECT_SECONDS)
+        weak = np.flatnonzero(free & (strength < 1))
+        if not len(weak):
+            return offsets, corrections, weights, covariance, unknown
+        # Half of them at a time: fixed to 1, a rate that is nearly significant would bend those of its partners.
+        fixed = weak[np.argsort(strength[weak])][: (len(weak) + 1) // 2]
+        unknown[fixed] = relative[fixed] ** 2 + errors[fixed] ** 2
+        free[fixed] = False
 
 
 def _relative_variances(covariance: Floats, count: int) -> tuple[Floats, Floats]:

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError, ConfigError
-from structgstream.preparation.synchronization.audio import SPEED_OF_SOUND, audio_ties, sound_of
+from structgstream.preparation.synchronization.audio import (
+    SPEED_OF_SOUND,
+    audio_lags,
+    connected_by,
+    solve_by_audio,
+    sound_of,
+)
 from structgstream.preparation.synchronization.changes import Changes, picture_changes
 from structgstream.preparation.synchronization.correlation import demand_scipy
 from structgstream.preparation.synchronization.geometry import (
@@ -26,7 +32,6 @@ from structgstream.preparation.synchronization.motion import (
     solve_by_motion,
 )
 from structgstream.preparation.synchronization.result import Synchronization, synchronization
-from structgstream.preparation.synchronization.solving import connected, solve_clocks
 from structgstream.preparation.synchronization.streams import StatesMetadata, Streams, period_seconds
 from structgstream.preparation.synchronization.timestamps import read_timestamps
 from structgstream.preparation.synchronization.wall_clocks import wall_clocks
@@ -36,7 +41,6 @@ _log = logging.getLogger(__name__)
 Method = Literal["auto", "csv", "stamps", "audio", "motion", "none"]
 METHODS: tuple[Method, ...] = ("auto", "csv", "stamps", "audio", "motion", "none")
 
-AUDIO_SLACK_SECONDS = 0.02  # what drift may make of a lag before rates are known
 SOUND_SPREAD_METRES = 1.0  # standard deviation of the cameras' distances from the sound, where these are not known
 STATIC_PICTURES = 9
 
@@ -146,9 +150,9 @@ def _by_audio(
     if mute is not None:
         raise CaptureError(f"Camera {mute!r} has no sound; synchronise by motion or timestamps.csv.")
     sounds = {name: sound_of(name, sound) for name, sound in recorded.items() if sound is not None}
-    ties = audio_ties(sounds, distances=distances)
+    lags = audio_lags(sounds)
     takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
-    groups = connected(list(takes), ties)
+    groups = connected_by(list(takes), lags)
     if len(groups) > 1:
         apart = ", ".join(repr(name) for group in groups[1:] for name in group)
         raise CaptureError(
@@ -156,7 +160,7 @@ def _by_audio(
             "videos are shorter "
             "than the time between their starts; film a clap that all hear, or synchronise by motion or timestamps.csv."
         )
-    solution = solve_clocks(takes, ties, drift=True, slack_seconds=AUDIO_SLACK_SECONDS)
+    solution = solve_by_audio(takes, lags, distances=distances)
     way = 0.0 if distances else SOUND_SPREAD_METRES / SPEED_OF_SOUND
     warnings = () if distances else (
         f"Sound takes {1e3 / SPEED_OF_SOUND:.1f} ms a metre, and the distances of the cameras from it are not known: "
