@@ -58,10 +58,12 @@ def _from_first(scene: Scene) -> Scene:
     """In the axes of the first camera."""
     turn, move = scene.rotations[0], scene.translations[0]
     rotations = scene.rotations @ turn.T
+    translations = scene.translations - rotations @ move
+    rotations[0], translations[0] = np.eye(3), 0.0  # exactly
     return replace(
         scene,
         rotations=rotations,
-        translations=scene.translations - rotations @ move,
+        translations=translations,
         turns=turn @ scene.turns,
         places=scene.places @ turn.T + move,
     )
