@@ -30,7 +30,7 @@ def test_how_far_lenses_differ_is_estimated() -> None:
         found, own = prior, rows(0.01, differences)
         for _ in range(20):
             found = found.updated(own, np.zeros((2 * LENSES, 2 * LENSES)), start=0, free=FREE)
-        usual = 0.003  # and counts as two lenses
+        usual = 0.002  # and counts as two lenses
         expected = np.sqrt((2 * usual**2 + LENSES * differences**2) / (2 + LENSES))
         assert found.differences[0, 0] == pytest.approx(expected, rel=0.25)
 

@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 # far cameras of it usually are from that.
 USUAL: Mapping[int, tuple[float, float]] = {
     ASPECT: (0.005, 0.0005),
-    ACROSS: (0.015, 0.003),
-    DOWN: (0.015, 0.003),
+    ACROSS: (0.01, 0.002),
+    DOWN: (0.01, 0.002),
     K1: (0.3, 0.005),
     K2: (1.0, 0.01),
     P1: (0.002, 0.0003),
@@ -33,8 +33,8 @@ USUAL: Mapping[int, tuple[float, float]] = {
 }
 USUAL_FISHEYE: Mapping[int, tuple[float, float]] = {
     ASPECT: (0.005, 0.0005),
-    ACROSS: (0.015, 0.003),
-    DOWN: (0.015, 0.003),
+    ACROSS: (0.01, 0.002),
+    DOWN: (0.01, 0.002),
     4: (0.2, 0.005),
     5: (0.1, 0.005),
     6: (0.1, 0.005),
