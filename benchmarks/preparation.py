@@ -66,11 +66,16 @@ class Run:
 
 OPTIONS: Mapping[str, Mapping[str, PrepareOptions]] = {
     "mild": {"sfm": PrepareOptions(), "sfm, shared": PrepareOptions(intrinsics="shared")},
-    "phone": {"sfm": PrepareOptions(), "sfm, opencv": PrepareOptions(lens="opencv")},
+    "phone": {"sfm": PrepareOptions(), "sfm, brown": PrepareOptions(lens="brown")},
     "fisheye": {"sfm, fisheye": PrepareOptions(lens="fisheye")},
     "bumped": {"sfm": PrepareOptions(), "sfm, without cam04": PrepareOptions(without=("cam04",))},
 }
 """What is asked for beside size, field of view and the held-out camera, by rig and in a few words."""
+
+BOARD_OPTIONS: Mapping[str, Mapping[str, PrepareOptions]] = {
+    "phone-board": {"board, brown": PrepareOptions(lens="brown")},
+}
+"""The same for rigs with a board, beside the board itself."""
 
 
 def runs(folder: Path, rigs: list[str]) -> list[Run]:
@@ -84,7 +89,8 @@ def runs(folder: Path, rigs: list[str]) -> list[Run]:
         elif truth.board is not None:
             videos = here / "board" if truth.held_out is not None else None
             options = PrepareOptions(calibration="board", board=Board(**truth.board), board_videos=videos)
-            asked = {"board": options}
+            asked = {"board": options} | BOARD_OPTIONS.get(rig, {})
+            asked = {name: replace(options, lens=other.lens) for name, other in asked.items()}
         else:
             asked = OPTIONS.get(rig, {"sfm": PrepareOptions()})
         how = synchronization(truth)

@@ -108,6 +108,11 @@ VARIANTS: Mapping[str, Variant] = {
     "sound": Variant("half frames apart, with sound: three claps", _begun(HALF), frames=150, claps=CLAPS),
     "board": Variant("one good lens, own focal lengths; a board is filmed first",
                      _own(Filming(), focal=0.03, pixels=8, seed=3), board_frames=120),
+    "phone-board": Variant(
+        "the phones; a board is filmed first",
+        _own(Filming(lens="phone"), focal=0.02, pixels=6, seed=1),
+        board_frames=120,
+    ),
     "ring": Variant(
         "eight cameras around, of which neighbours alone see one side of the board",
         {f"cam{number:02d}": Filming() for number in range(8)}, take="ring", board_frames=160,

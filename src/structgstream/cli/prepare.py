@@ -48,10 +48,10 @@ class Prepare:
     calibration: Annotated[str, tyro.conf.arg(metavar="auto|sfm|board|PATH", help_behavior_hint="")] = "auto"
     """Structure from motion, a board, or the calibration of another tool (file or folder). Default: such a file beside
     the videos, else sfm."""
-    lens: Annotated[Literal["pinhole", "radial", "opencv", "fisheye"] | None, tyro.conf.arg(help_behavior_hint="")] = (
-        None
-    )
-    """Distortion to estimate. Default: radial by sfm, opencv by board."""
+    lens: Annotated[
+        Literal["pinhole", "radial", "opencv", "brown", "fisheye"] | None, tyro.conf.arg(help_behavior_hint="")
+    ] = None
+    """Distortion to estimate; brown for phones. Default: radial by sfm, opencv by board."""
     intrinsics: Literal["own", "shared"] = "own"
     """Whether cameras share focal length and lens (sfm)."""
     refine: bool = False

@@ -32,8 +32,8 @@ class PrepareOptions:
     Args:
         calibration: ``sfm``, ``board``, ``auto`` (a file of another tool beside the videos, else ``sfm``), or a
             calibration file or the folder that holds one.
-        lens: distortion that is estimated: ``pinhole``, ``radial``, ``opencv`` or ``fisheye``; None for ``radial`` by
-            structure from motion and ``opencv`` by a board.
+        lens: distortion that is estimated: ``pinhole``, ``radial``, ``opencv``, ``brown`` or ``fisheye``; None for
+            ``radial`` by structure from motion and ``opencv`` by a board.
         intrinsics: ``shared`` for cameras of one make and zoom, else ``own``.
         refine: adjust a given calibration to the pictures.
         board: what was printed.

@@ -22,7 +22,7 @@ from structgstream.data.tone import IDENTITY, basis
 Indices = NDArray[np.int64]
 
 ROUNDS = 20
-SETTLED = 1e-4
+CONVERGED = 1e-4
 CURVATURE, DEPARTURE = 2.0, 0.5
 """Prior standard deviations of a curve's second derivative and of its distance from the identity."""
 LEAST_SLOPE = 0.1
@@ -73,7 +73,7 @@ def common_curves(point: Indices, camera: Indices, values: Floats, *, free: Floa
         normal = (design.T @ weighted - sums.T @ diags(1 / (of_point @ weights)) @ sums).toarray() / scale**2
         before = theta
         theta = _solved(normal, np.zeros(len(normal)), free, count=count)
-        if np.abs(theta - before).max() < SETTLED:
+        if np.abs(theta - before).max() < CONVERGED:
             break
     return theta @ free.T
 
@@ -87,7 +87,7 @@ def curve_towards(values: Floats, targets: Floats, *, free: Floats) -> Floats:
         weighted = rows * (weights / scale**2)[:, None]
         before = theta
         theta = _solved(weighted.T @ rows, weighted.T @ targets, free, count=1, gauged=False)[0]
-        if np.abs(theta - before).max() < SETTLED:
+        if np.abs(theta - before).max() < CONVERGED:
             break
     return free @ theta
 

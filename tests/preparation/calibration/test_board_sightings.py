@@ -67,7 +67,7 @@ def test_a_row_of_corners_is_no_sighting() -> None:
 
 def test_too_few_sightings_are_told_with_their_number() -> None:
     pictures = {**filmed(), "cam01": [*filmed()["cam01"][:3], *[np.full((270, 360, 3), 127, np.uint8)] * 2]}
-    with pytest.raises(CalibrationError, match=r"'cam01' in 3 of 5 pictures; 4 with 6 corners each are needed"):
+    with pytest.raises(CalibrationError, match=r"'cam01' in 3 of 5 pictures, where 4 with 6 corners each are needed"):
         board_sightings(pictures, BOARD)
 
 

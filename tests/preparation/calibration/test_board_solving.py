@@ -20,6 +20,7 @@ INSTANTS = 16
 LENSES: dict[LensModel, tuple[Lens, float, tuple[int, int]]] = {
     "pinhole": (Pinhole(), 300.0, (360, 270)),
     "radial": (RadialTangential(k1=-0.2, k2=0.04), 280.0, (360, 270)),
+    "brown": (RadialTangential(k1=0.2, k2=-0.8, p1=0.0012, p2=-0.0009, k3=0.8), 340.0, (360, 270)),
     "fisheye": (Fisheye(0.02, -0.005, 0.001), 480 / np.radians(120), (480, 360)),
 }
 Pictures = dict[str, list[NDArray[np.uint8]]]

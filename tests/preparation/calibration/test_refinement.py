@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from filmed import Film, noise_texture, ring, room
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CalibrationError, CaptureError, ConfigError
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.triangulation import triangulated
@@ -104,6 +104,12 @@ def test_a_camera_that_is_far_off_is_named() -> None:
     away = perturbed(rig, degrees=25.0, percent=0.0)["cam03"]
     with pytest.raises(CalibrationError, match="agree with the given poses of 'cam03' to refine them"):
         refine(pictures, rig | {"cam03": away})
+
+
+def test_a_lens_that_cannot_be_refined_is_refused() -> None:
+    rig, pictures = filmed()
+    with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
+        refine(pictures, rig, free="lens", lens="brown")
 
 
 def test_points_lie_on_the_room_and_cameras_stay() -> None:

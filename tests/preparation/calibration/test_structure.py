@@ -19,12 +19,12 @@ Pictures = dict[str, list[NDArray[np.uint8]]]
 
 
 @cache
-def filmed() -> tuple[dict[str, LensCamera], Pictures]:
-    """Five cameras with mild lenses, principal points in the middle, one instant."""
+def filmed(*, across: float = 0.0, down: float = 0.0) -> tuple[dict[str, LensCamera], Pictures]:
+    """Five cameras with mild lenses, principal points so many pixels from the middle, one instant."""
     lens = RadialTangential(k1=-0.12, k2=0.02)
     rig = ring(5, radius=2.6, arc_degrees=60, focal=290, lens=lens, size=(320, 240))
     for camera in rig.values():
-        camera.camera.K[0, 2], camera.camera.K[1, 2] = 160, 120
+        camera.camera.K[0, 2], camera.camera.K[1, 2] = 160 + across, 120 + down
     return rig, {
         name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
     }
@@ -36,7 +36,7 @@ def noise(seed: int) -> NDArray[np.uint8]:
 
 def test_a_rig_is_found_from_its_pictures() -> None:
     rig, pictures = filmed()
-    found = solve_structure(pictures, lens="radial")
+    found = solve_structure(pictures, lens="radial", centers=False)
     assert found.missing == ()
     assert list(found.cameras) == list(rig)
     assert not found.metres
@@ -48,6 +48,18 @@ def test_a_rig_is_found_from_its_pictures() -> None:
         assert error.position_percent < 1
         assert abs(error.focal_percent) < 1.5
         assert error.lens_pixels < 1.5
+
+
+def test_principal_points_that_all_cameras_have_off_the_middle_are_found() -> None:
+    rig, pictures = filmed(across=4, down=-3)
+    found, middle = (
+        calibration_errors(solve_structure(pictures, lens="radial", centers=centers).cameras, rig).values()
+        for centers in (True, False)
+    )
+    assert sum(error.rotation_degrees for error in found) < sum(error.rotation_degrees for error in middle)
+    assert sum(error.lens_pixels for error in found) < sum(error.lens_pixels for error in middle)
+    assert np.median([error.rotation_degrees for error in found]) < 0.2  # half as much as the middle is off
+    assert max(error.rotation_degrees for error in found) < 0.3
 
 
 def test_known_intrinsics_stay() -> None:

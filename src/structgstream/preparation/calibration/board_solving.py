@@ -13,6 +13,7 @@ from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.calibration.board_adjustment import adjust_board
 from structgstream.preparation.calibration.board_model import (
     Sightings,
     board_model,
@@ -31,6 +32,7 @@ FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
     "pinhole": (30.0, 50.0, 70.0, 90.0),
     "radial": (30.0, 50.0, 70.0, 90.0),
     "opencv": (30.0, 50.0, 70.0, 90.0),
+    "brown": (30.0, 50.0, 70.0, 90.0),
     "fisheye": (60.0, 90.0, 120.0, 150.0, 175.0),
 }
 MOST_SIGHTINGS_ALONE = 24
@@ -49,7 +51,8 @@ def solve_board(
     """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
 
     The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
-    share, and all of them, with the board's pose at each instant, are then adjusted together.
+    share, and all of them, with the board's pose at each instant, are then adjusted together, at last with what alike
+    lenses share (lens_prior.py, Note [Alike lenses]).
 
     Args:
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
@@ -84,9 +87,10 @@ def solve_board(
         adjust(model, freedom=free, fixed=fixed, constant_points=True)
         cameras = {name: model.camera(camera.camera_id) for name, camera in cameras.items()}
         sensors, poses = sensor_poses(model, cameras), rig_poses(model)
-        solved = _solved(board, kept, cameras, sensors, poses)
-        kept = _without_outliers(kept, solved)
-    return _solved(board, kept, cameras, sensors, poses)
+        filmed = _filmed(cameras, sensors)
+        kept = _without_outliers(kept, _solved(board, kept, filmed, poses))
+    filmed, poses = adjust_board(board, kept, filmed, poses, lens=lens, known=frozenset(known))
+    return _solved(board, kept, filmed, poses)
 
 
 @dataclass(frozen=True)
@@ -208,21 +212,20 @@ def _rig_poses(views: Mapping[str, _View], sensors: Mapping[str, Floats], sighti
     return {instant: best[instant][1] for instant in sorted(best)}
 
 
+def _filmed(cameras: Mapping[str, Any], sensors: Mapping[str, Floats]) -> dict[str, LensCamera]:
+    pose = pycolmap_module().Rigid3d
+    return {name: filmed_camera(camera, pose(sensors[name][:3])) for name, camera in cameras.items()}
+
+
 def _solved(
-    board: Board,
-    sightings: Sightings,
-    cameras: Mapping[str, Any],
-    sensors: Mapping[str, Floats],
-    poses: Mapping[int, Floats],
+    board: Board, sightings: Sightings, filmed: Mapping[str, LensCamera], poses: Mapping[int, Floats]
 ) -> SolvedCalibration:
-    pycolmap = pycolmap_module()
-    filmed = {name: filmed_camera(camera, pycolmap.Rigid3d(sensors[name][:3])) for name, camera in cameras.items()}
     number = {instant: index for index, instant in enumerate(poses)}
     corners = board.corners
     points = [corners @ pose[:3, :3].T + pose[:3, 3] for pose in poses.values()]
     rows = [
         (number[sight.instant] * len(corners) + corner, index, sight.instant, *pixel)
-        for index, name in enumerate(cameras)
+        for index, name in enumerate(filmed)
         for sight in sightings[name]
         for corner, pixel in zip(sight.corners, sight.pixels, strict=True)
     ]
@@ -230,7 +233,7 @@ def _solved(
     which, owner, instant = (table[:, column].astype(np.intp) for column in range(3))
     seen, point = np.unique(which, return_inverse=True)
     observations = Observations(point.astype(np.intp), owner, table[:, 3:], instant)
-    return SolvedCalibration(filmed, np.concatenate(points)[seen], observations, metres=True)
+    return SolvedCalibration(dict(filmed), np.concatenate(points)[seen], observations, metres=True)
 
 
 def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sightings:

@@ -18,13 +18,14 @@ from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.errors import MissingExtraError
 
-LensModel = Literal["pinhole", "radial", "opencv", "fisheye"]
-"""What is estimated of a lens: nothing; k1, k2; k1, k2, p1, p2; k1 to k4 of a fisheye."""
+LensModel = Literal["pinhole", "radial", "opencv", "brown", "fisheye"]
+"""What is estimated of a lens: nothing; k1, k2; k1, k2, p1, p2; the same and k3; k1 to k4 of a fisheye."""
 
 MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",
     "radial": "RADIAL",
     "opencv": "OPENCV",
+    "brown": "OPENCV",  # none of COLMAP's ends at k3, which is added after its models (bundle.py)
     "fisheye": "OPENCV_FISHEYE",
 }
 QUIET = 2  # COLMAP tells every step; errors of its own are raised anyway

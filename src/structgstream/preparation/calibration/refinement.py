@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
-from structgstream.errors import CalibrationError
+from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.comparison import rig_alignment
 from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
@@ -91,8 +91,13 @@ def refine(
 
     Raises:
         CalibrationError: too few matches agree with the given poses, or not all cameras are connected by them.
+        ConfigError: the model ``brown``.
         MissingExtraError: pycolmap or cv2 is not installed.
     """
+    if lens == "brown":
+        raise ConfigError(
+            "Lenses of the model brown cannot be refined; take opencv, or leave the lens out to keep the given model."
+        )
     graph = posed_graph(pictures, cameras, masks=masks, seed=seed, config=_widened(config))
     _check_connected(cameras, graph)
     judging = _held_back(graph)

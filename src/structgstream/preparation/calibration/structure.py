@@ -21,11 +21,13 @@ from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, pycolmap_module
 from structgstream.preparation.calibration.coordinates import normalized
 from structgstream.preparation.calibration.intrinsics import guessed_camera
 from structgstream.preparation.calibration.keypoint_matches import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
+from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import (
     Freedom,
     adjust,
@@ -55,6 +57,7 @@ FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
     "pinhole": (60.0, 40.0, 85.0),
     "radial": (60.0, 40.0, 85.0),
     "opencv": (60.0, 85.0, 40.0),
+    "brown": (60.0, 85.0, 40.0),
     "fisheye": (120.0, 150.0, 90.0, 170.0),
 }
 """Degrees across the longer side that are tried where none is given, until one places all cameras."""
@@ -100,8 +103,8 @@ def solve_structure(
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
         field_of_view: degrees across the longer side, for all cameras or by name, to begin with; by default some are
             tried.
-        centers: whether principal points are estimated, held near the pictures' centres (mapping.py, Note [Principal
-            points]); otherwise they are the centres.
+        centers: whether principal points are estimated, as those of cameras that are alike (lens_prior.py, Note [Alike
+            lenses]); otherwise they are the centres.
         known: cameras whose intrinsics and lens are known and stay; their poses are not read.
         masks: camera name to a mask ``[H, W]`` per picture, True where it counts.
         seed: of the robust estimation; equal input and seed give equal output.
@@ -133,7 +136,7 @@ def solve_structure(
     assert best is not None
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
-    solved = _finished(best, keypoints, pictures, centers=centers, config=config)
+    solved = _finished(best, keypoints, pictures, lens=lens, centers=centers, config=config)
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
     return solved
@@ -218,7 +221,7 @@ def _attempt(
     pairs = verified_pairs(keypoints, matches, cameras, seed=seed, workers=workers, config=config.pairs)
     fixed = frozenset(cameras[name].camera_id for name in known)
     every = len(known) == len(keypoints)
-    freedom = Freedom(focal=not every, center=not every, lens=not every)
+    freedom = Freedom(focal=not every, center=False, lens=not every)
     attempt = _Attempt(None, pairs, freedom, fixed)
     if not pairs:
         return attempt
@@ -240,6 +243,7 @@ def _finished(
     keypoints: Mapping[str, Keypoints],
     pictures: Pictures,
     *,
+    lens: LensModel,
     centers: bool,
     config: StructureConfig,
 ) -> SolvedCalibration:
@@ -248,19 +252,31 @@ def _finished(
     assert model is not None
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
     limit = max(1.0, config.pixels * longest / 1000)
-    steady = replace(attempt.freedom, center=False)
-    adjust(model, freedom=steady, fixed=attempt.fixed)
-    filtered(model, pixels=limit, degrees=config.degrees)
-    full = replace(attempt.freedom, center=centers and attempt.freedom.center)
     for _ in range(2):
-        adjust(model, freedom=full, fixed=attempt.fixed)
+        adjust(model, freedom=attempt.freedom, fixed=attempt.fixed)
         filtered(model, pixels=limit, degrees=config.degrees)
-    adjust(model, freedom=full, fixed=attempt.fixed)
     found = cameras_of(model)
     cameras = {name: found[name] for name in pictures if name in found}
     points, observations = observed(model, keypoints, {name: index for index, name in enumerate(cameras)})
     missing = tuple(name for name in pictures if name not in found)
-    return normalized(SolvedCalibration(cameras, points, observations, missing))
+    rough = SolvedCalibration(cameras, points, observations, missing)
+    numbers = {image.name: image.camera_id for image in map(model.image, model.reg_image_ids())}
+    lenses = sorted(set(numbers.values()))
+    return normalized(
+        adjust_together(
+            rough,
+            lens=[lenses.index(numbers[name]) for name in cameras],
+            free=_free_terms(lens, freedom=attempt.freedom, centers=centers),
+            held=np.array([number in attempt.fixed for number in lenses]),
+            limits=Limits(limit, config.degrees),
+        )
+    )
+
+
+def _free_terms(lens: LensModel, *, freedom: Freedom, centers: bool) -> tuple[int, ...]:
+    if not freedom.any:
+        return ()
+    return (FOCAL, ASPECT, *((ACROSS, DOWN) if centers else ()), *DISTORTION[lens])
 
 
 def _agreeing(pair: Pair, matches: Matches, pairs: Mapping[Pair, Any]) -> tuple[int, int]:

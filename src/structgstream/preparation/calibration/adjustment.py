@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last adjustment of structure from motion: all cameras together, with what alike lenses share."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.arrays import Floats
+from structgstream.data.lenses import Fisheye, LensCamera
+from structgstream.preparation.calibration.bundle import Bundle, Scene, Sights, linearized, solved
+from structgstream.preparation.calibration.lens_prior import usual_prior
+from structgstream.preparation.calibration.lens_terms import row_of, with_row
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+
+_log = logging.getLogger(__name__)
+
+
+ROUNDS, STEPS, SAME = 8, 2, 0.05
+NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Which observations stay.
+
+    Args:
+        pixels: largest reprojection error.
+        degrees: least angle between the rays of a point.
+    """
+
+    pixels: float
+    degrees: float
+
+
+def adjust_together(
+    found: SolvedCalibration,
+    *,
+    lens: Sequence[int],
+    free: Sequence[int],
+    held: NDArray[np.bool_],
+    limits: Limits,
+) -> SolvedCalibration:
+    """``found`` with poses, points and the free terms of its lenses adjusted, without the observations that are off.
+
+    Args:
+        lens: number of the lens of each camera; cameras with shared intrinsics have one.
+        free: the terms of ``lens_terms.py`` that are estimated.
+        held: by lens, whether it stays.
+    """
+    bundle, scene = _problem(found, np.asarray(lens, np.intp), tuple(free), held)
+    bundle, scene = estimated(bundle, scene)
+    adjusted = _result(found, bundle, scene)
+    kept = cleaned(adjusted, limits)
+    _tell(adjusted, kept, bundle)
+    again, scene = _problem(kept, bundle.lens, bundle.free, held)
+    again = replace(again, prior=bundle.prior, noise=bundle.noise)
+    return cleaned(_result(kept, again, solved(again, scene)), limits)
+
+
+def cleaned(found: SolvedCalibration, limits: Limits) -> SolvedCalibration:
+    """Without observations that are too far off, and without points whose rays then have too small an angle."""
+    seen = found.observations
+    with np.errstate(invalid="ignore"):
+        good = found.errors() <= limits.pixels
+    wide = _angles(found, good) >= np.radians(limits.degrees)
+    return chosen(found, good & wide[seen.point])
+
+
+def chosen(found: SolvedCalibration, good: NDArray[np.bool_]) -> SolvedCalibration:
+    """With some of its observations ``[M]`` alone; points without any are left out."""
+    seen = found.observations
+    kept, point = np.unique(seen.point[good], return_inverse=True)
+    observations = Observations(point.astype(np.intp), seen.camera[good], seen.pixels[good], seen.instant[good])
+    return replace(found, points=found.points[kept], observations=observations)
+
+
+def _problem(
+    found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...], held: NDArray[np.bool_]
+) -> tuple[Bundle, Scene]:
+    cameras, seen = list(found.cameras.values()), found.observations
+    sights = Sights(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
+    turns = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
+    return posed_problem(cameras, sights, (turns, found.points), lens=lens, free=free, held=held, turning=False)
+
+
+def posed_problem(
+    cameras: Sequence[LensCamera],
+    sights: Sights,
+    bodies: tuple[Floats, Floats],
+    *,
+    lens: NDArray[np.intp],
+    free: tuple[int, ...],
+    held: NDArray[np.bool_],
+    turning: bool,
+) -> tuple[Bundle, Scene]:
+    """The problem of cameras that see bodies, with the usual prior of their lenses.
+
+    Args:
+        bodies: rotations ``[B, 3, 3]`` and places ``[B, 3]``.
+    """
+    first = [int(np.flatnonzero(lens == number)[0]) for number in range(len(held))]
+    rows = np.stack([row_of(cameras[index]) for index in first])
+    sizes = np.array([[filmed.camera.width, filmed.camera.height] for filmed in cameras], np.float64)
+    fisheye = np.array([isinstance(filmed.lens, Fisheye) for filmed in cameras])
+    alike = np.full(len(held), -1, np.intp)
+    _, groups = np.unique(sizes[first][~held], axis=0, return_inverse=True)
+    alike[~held] = groups.ravel()
+    prior = usual_prior(alike, free, fisheye=bool(fisheye[first][~held].any()))
+    views = np.stack([filmed.camera.viewmat.numpy() for filmed in cameras])
+    bundle = Bundle(sights, lens, sizes, fisheye, free, held, turning, prior)
+    return bundle, Scene(views[:, :3, :3], views[:, :3, 3], rows, *bodies)
+
+
+def estimated(bundle: Bundle, scene: Scene) -> tuple[Bundle, Scene]:
+    """Adjusted, with the noise and the differences of lenses that fit best."""
+    poses = bundle.columns[0]
+    bundle = _with_noise(bundle, scene)
+    for _ in range(ROUNDS if bundle.free else 1):
+        scene = solved(bundle, scene, most=STEPS)
+        covariance = linearized(bundle, scene).covariance()
+        prior = bundle.prior.updated(scene.rows, covariance, start=poses, free=bundle.free)
+        change = np.abs(prior.differences / bundle.prior.differences - 1).max(initial=0.0)
+        bundle = _with_noise(replace(bundle, prior=prior), scene)
+        if change < SAME:
+            break
+    return bundle, solved(bundle, scene)
+
+
+def _with_noise(bundle: Bundle, scene: Scene) -> Bundle:
+    misses = np.linalg.norm(bundle.misses(scene), axis=1)
+    poses, lenses, size = bundle.columns
+    left = max(0.1, 1 - (poses + lenses + size * len(scene.places)) / (2 * len(misses)))
+    return replace(bundle, noise=max(float(np.median(misses)) / NORMAL_MEDIAN / np.sqrt(left), 1e-3))
+
+
+def _result(found: SolvedCalibration, bundle: Bundle, scene: Scene) -> SolvedCalibration:
+    return replace(found, cameras=cameras_in(scene, found.cameras, bundle.lens), points=scene.places)
+
+
+def cameras_in(scene: Scene, cameras: Mapping[str, LensCamera], lens: NDArray[np.intp]) -> dict[str, LensCamera]:
+    """``cameras`` with the poses and lenses of a scene."""
+    adjusted = {}
+    for index, (name, filmed) in enumerate(cameras.items()):
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = scene.rotations[index], scene.translations[index]
+        adjusted[name] = with_row(filmed, scene.rows[lens[index]], viewmat)
+    return adjusted
+
+
+def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:
+    """Largest angle ``[P]`` between a point's rays, radians; zero for points that less than two cameras see."""
+    seen = found.observations
+    centers = np.stack([filmed.camera.center.numpy() for filmed in found.cameras.values()])
+    rays = centers[seen.camera[good]] - found.points[seen.point[good]]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    order = np.argsort(seen.point[good], kind="stable")
+    rays, points = rays[order], seen.point[good][order]
+    widest = np.zeros(len(found.points))
+    for apart in range(1, int(np.bincount(points).max(initial=0))):
+        same = points[apart:] == points[:-apart]
+        sine = np.linalg.norm(np.cross(rays[apart:], rays[:-apart]), axis=1)
+        angle = np.arctan2(sine, (rays[apart:] * rays[:-apart]).sum(1))
+        np.maximum.at(widest, points[apart:][same], angle[same])
+    return widest
+
+
+def _tell(before: SolvedCalibration, after: SolvedCalibration, bundle: Bundle) -> None:
+    counts = [np.bincount(own.observations.camera, minlength=len(own.cameras)) for own in (before, after)]
+    lost = {name: int(count) for name, count in zip(before.cameras, counts[0] - counts[1], strict=True) if count}
+    _log.info(
+        "Adjusted: noise %.2f pixels, %d of %d observations removed (%s), lenses of a group differ by %s.",
+        bundle.noise, int(sum(lost.values())), len(before.observations),
+        ", ".join(f"{name} {count}" for name, count in lost.items()) or "none",
+        dict(zip(bundle.prior.terms, bundle.prior.differences.round(5).T.tolist(), strict=True)),
+    )  # fmt: skip

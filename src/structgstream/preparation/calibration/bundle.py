@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bundle adjustment of cameras that are alike, which COLMAP's has no terms for.
+
+What is adjusted beside cameras are bodies: points, or poses of a board whose corners are known. They are eliminated
+from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
+Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
+(``lens_prior.py``).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.arrays import Floats
+from structgstream.data.posed import rotation_matrix
+from structgstream.preparation.calibration.lens_prior import LensPrior
+from structgstream.preparation.calibration.lens_terms import derivatives, projected
+
+Indices = NDArray[np.intp]
+
+HUBER = 1.345  # standard deviations of the noise: 95 % as exact as least squares if there are no outliers
+RIDGE = 1e-10  # of the diagonal: the equations do not fix where the world's axes are
+MOST_STEPS = 50
+SMALL = 1e-6
+
+
+@dataclass(frozen=True)
+class Sights:
+    """What was observed.
+
+    Args:
+        camera: ``[M]``.
+        body: ``[M]``.
+        place: ``[M, 3]``, where on the body; zeros for points.
+        pixels: ``[M, 2]``.
+    """
+
+    camera: Indices
+    body: Indices
+    place: Floats
+    pixels: Floats
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that is adjusted.
+
+    Args:
+        rotations: ``[C, 3, 3]``, world to camera.
+        translations: ``[C, 3]``.
+        rows: ``[L, TERMS]`` of the lenses.
+        turns: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
+        places: ``[B, 3]`` of the bodies.
+    """
+
+    rotations: Floats
+    translations: Floats
+    rows: Floats
+    turns: Floats
+    places: Floats
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A problem of bundle adjustment.
+
+    Args:
+        sights: what was observed.
+        lens: ``[C]``, which row of lenses a camera has.
+        sizes: ``[C, 2]``, width and height of the pictures.
+        fisheye: ``[C]``, whether a camera's terms are a fisheye's.
+        free: the terms of the rows that are estimated.
+        held: ``[L]``, lenses that stay.
+        turning: whether bodies have rotations.
+        prior: of the terms.
+        noise: standard deviation of the pixels.
+    """
+
+    sights: Sights
+    lens: Indices
+    sizes: Floats
+    fisheye: NDArray[np.bool_]
+    free: tuple[int, ...]
+    held: NDArray[np.bool_]
+    turning: bool
+    prior: LensPrior
+    noise: float = 0.5
+
+    @property
+    def columns(self) -> tuple[int, int, int]:
+        """Number of parameters of poses, of lenses, and of a body."""
+        return 6 * len(self.lens), len(self.held) * len(self.free), 6 if self.turning else 3
+
+    def misses(self, scene: Scene) -> Floats:
+        """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
+        own, local = self.sights.camera, self._local(scene)
+        ahead = local[:, 2] > 0
+        safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
+        found = projected(safe, scene.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
+        return np.where(ahead[:, None], found - self.sights.pixels, np.inf)
+
+    def cost(self, scene: Scene) -> float:
+        """Huber's loss of the misses, and what the prior adds."""
+        off = np.linalg.norm(self.misses(scene), axis=1) / self.noise
+        if not np.isfinite(off).all():
+            return float("inf")
+        loss = np.where(off <= HUBER, off**2 / 2, HUBER * off - HUBER**2 / 2)
+        return float(loss.sum()) + self.prior.cost(scene.rows)
+
+    def _local(self, scene: Scene) -> Floats:
+        seen = self.sights
+        world = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place) + scene.places[seen.body]
+        return np.einsum("mab,mb->ma", scene.rotations[seen.camera], world) + scene.translations[seen.camera]
+
+
+def solved(bundle: Bundle, scene: Scene, *, most: int = MOST_STEPS) -> Scene:
+    """The scene of least cost near ``scene``, or after ``most`` steps."""
+    damping, cost = 1e-4, bundle.cost(scene)
+    for _ in range(most):
+        system = linearized(bundle, scene)
+        for _ in range(10):
+            tried = system.stepped(bundle, scene, damping)
+            new = bundle.cost(tried)
+            if new <= cost:
+                break
+            damping *= 10
+        else:
+            return scene
+        gained, scene, cost, damping = cost - new, tried, new, max(damping / 10, 1e-9)
+        if gained < SMALL * cost:
+            break
+    return scene
+
+
+@dataclass(frozen=True)
+class System:
+    """Normal equations: ``[[A, W], [W^T, V]]`` of cameras, with lenses and prior, and of bodies."""
+
+    A: Floats
+    V: Floats
+    W: Any
+    gradient: Floats
+    body_gradient: Floats
+
+    def reduced(self, damping: float) -> tuple[Floats, Floats, Floats]:
+        """Equations of cameras alone and their right side; and the inverses ``[B, q, q]`` of the bodies' own."""
+        from scipy.sparse import bsr_array
+
+        diagonal = np.einsum("bii->bi", self.V)
+        inverse = np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12))
+        count, size = len(inverse), inverse.shape[1]
+        blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size))
+        weighed = self.W @ blocks.tocsr()
+        own = np.diag(self.A)
+        left = self.A + np.diag((damping + RIDGE) * own) - (weighed @ self.W.T).toarray()
+        return left, self.gradient - weighed @ self.body_gradient.ravel(), inverse
+
+    def stepped(self, bundle: Bundle, scene: Scene, damping: float) -> Scene:
+        """The scene after one damped step."""
+        left, right, inverse = self.reduced(damping)
+        step = -np.linalg.solve(left, right)
+        rest = self.body_gradient + (self.W.T @ step).reshape(self.body_gradient.shape)
+        return _moved(bundle, scene, step, -np.einsum("bij,bj->bi", inverse, rest))
+
+    def covariance(self) -> Floats:
+        """Of poses and lenses, in that order."""
+        left, _, _ = self.reduced(0.0)
+        scale = np.sqrt(np.diag(left)) + 1e-300
+        return np.linalg.inv(left / np.outer(scale, scale)) / np.outer(scale, scale)
+
+
+def linearized(bundle: Bundle, scene: Scene) -> System:
+    """The normal equations at ``scene``."""
+    poses, lenses, size = bundle.columns
+    by_camera, by_body, columns = _derivatives(bundle, scene)
+    misses = bundle.misses(scene)
+    off = np.linalg.norm(misses, axis=1) / bundle.noise
+    weight = np.where(off <= HUBER, 1.0, HUBER / np.maximum(off, HUBER)) / bundle.noise**2
+    total = poses + lenses
+    A, gradient = np.zeros((total, total)), np.zeros(total)
+    for camera in range(len(bundle.lens)):
+        own = np.flatnonzero(bundle.sights.camera == camera)
+        if len(own):
+            J, w = by_camera[own], weight[own]
+            where = columns[own[0]]
+            A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
+            gradient[where] += np.einsum("m,mai,ma->i", w, J, misses[own])
+    bundle.prior.add(A, gradient, scene.rows, start=poses, free=bundle.free)
+    stuck = np.diag(A) == 0  # what is held, or seen by nobody
+    A[stuck, stuck] = 1.0
+    count = len(scene.places)
+    V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
+    np.add.at(V, bundle.sights.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
+    np.add.at(body_gradient, bundle.sights.body, np.einsum("m,mai,ma->mi", weight, by_body, misses))
+    return System(
+        A, V, _crossed(bundle, weight, by_camera, by_body, columns, (total, count * size)), gradient, body_gradient
+    )
+
+
+def _derivatives(bundle: Bundle, scene: Scene) -> tuple[Floats, Floats, Indices]:
+    """Of the misses by their camera's parameters ``[M, 2, 6 + F]`` and by their body's, and the former's unknowns."""
+    seen, (poses, _, _) = bundle.sights, bundle.columns
+    own, lens = seen.camera, bundle.lens[seen.camera]
+    on_body = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place)
+    turned = np.einsum("mab,mb->ma", scene.rotations[own], on_body + scene.places[seen.body])
+    local = turned + scene.translations[own]
+    by_point, by_row = derivatives(local, scene.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
+    by_row[bundle.held[lens]] = 0.0
+    by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
+    by_world = by_point @ scene.rotations[own]
+    by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.turning else by_world
+    free = len(bundle.free)
+    columns = np.concatenate([6 * own[:, None] + np.arange(6), poses + free * lens[:, None] + np.arange(free)], 1)
+    return by_camera, by_body, columns
+
+
+def _crossed(
+    bundle: Bundle, weight: Floats, by_camera: Floats, by_body: Floats, columns: Indices, shape: tuple[int, int]
+) -> Any:
+    from scipy.sparse import csr_array
+
+    size = bundle.columns[2]
+    blocks = np.einsum("m,mai,maj->mij", weight, by_camera, by_body)
+    rows = np.broadcast_to(columns[:, :, None], blocks.shape)
+    bodies = size * bundle.sights.body[:, None, None] + np.arange(size)
+    return csr_array((blocks.ravel(), (rows.ravel(), np.broadcast_to(bodies, blocks.shape).ravel())), shape=shape)
+
+
+def _moved(bundle: Bundle, scene: Scene, step: Floats, body_step: Floats) -> Scene:
+    poses, lenses, _ = bundle.columns
+    by_pose = step[:poses].reshape(-1, 6)
+    rows = scene.rows.copy()
+    rows[:, bundle.free] += step[poses : poses + lenses].reshape(len(rows), -1)
+    turns = scene.turns
+    if bundle.turning:
+        turns = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ turns
+    return replace(
+        scene,
+        rotations=np.stack([rotation_matrix(w) for w in by_pose[:, :3]]) @ scene.rotations,
+        translations=scene.translations + by_pose[:, 3:],
+        rows=rows,
+        turns=turns,
+        places=scene.places + body_step[:, -3:],
+    )
+
+
+def _crosses(vectors: Floats) -> Floats:
+    """Matrices ``[M, 3, 3]`` of the cross product from the left."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+
+
+def _diagonals(values: Floats) -> Floats:
+    return values[:, :, None] * np.eye(values.shape[1])
