@@ -89,7 +89,7 @@ def runs(folder: Path, rigs: list[str]) -> list[Run]:
         elif truth.board is not None:
             videos = here / "board" if truth.held_out is not None else None
             options = PrepareOptions(calibration="board", board=Board(**truth.board), board_videos=videos)
-            asked = {"board": options} | BOARD_OPTIONS.get(rig, {})
+            asked = {"board": options, **BOARD_OPTIONS.get(rig, {})}
             asked = {name: replace(options, lens=other.lens) for name, other in asked.items()}
         else:
             asked = OPTIONS.get(rig, {"sfm": PrepareOptions()})

@@ -81,6 +81,7 @@ def solve_board(
     cameras = {name: view.camera for name, view in views.items()}
     fixed = frozenset(cameras[name].camera_id for name in known)
     free = Freedom(*[len(known) < len(pictures)] * 3)
+    filmed = _filmed(cameras, sensors)
     kept: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
     for _ in range(2):
         model = board_model(board, kept, cameras, sensors, poses)

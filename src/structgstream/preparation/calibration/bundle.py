@@ -149,7 +149,7 @@ class System:
         from scipy.sparse import bsr_array
 
         diagonal = np.einsum("bii->bi", self.V)
-        inverse = np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12))
+        inverse: Floats = np.asarray(np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12)), np.float64)
         count, size = len(inverse), inverse.shape[1]
         blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size))
         weighed = self.W @ blocks.tocsr()
@@ -160,7 +160,7 @@ class System:
     def stepped(self, bundle: Bundle, scene: Scene, damping: float) -> Scene:
         """The scene after one damped step."""
         left, right, inverse = self.reduced(damping)
-        step = -np.linalg.solve(left, right)
+        step: Floats = np.asarray(-np.linalg.solve(left, right), np.float64)
         rest = self.body_gradient + (self.W.T @ step).reshape(self.body_gradient.shape)
         return _moved(bundle, scene, step, -np.einsum("bij,bj->bi", inverse, rest))
 
