@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -113,9 +114,8 @@ def test_killed_at_any_operation_it_goes_on_to_the_same_bytes(tmp_path: Path) ->
             store = folder(tmp_path / f"{at}-{done}")
             reported: list[int] = []
             for place in (at, at // 2 + 1):
-                with pytest.raises(Killed):
+                with suppress(Killed):  # The second run may end before its place.
                     written(KilledStore(store, place, done), SENT, options=options, after=reported.append)
-                    raise Killed  # The second run may end before its place.
                 store.prepare()
                 found = find(store)
                 edge = -1 if found is None else found.manifest.edge.frame
@@ -149,8 +149,8 @@ def test_a_torn_or_damaged_last_part_is_as_one_that_was_never_written(tmp_path: 
         store = folder(tmp_path / f"{number}")
         manifest = read_manifest(store)
         if number == 3:
+            _flip(store, manifest.parts[0].file)
             with pytest.raises(StreamError, match="Continuing would lose the frames after it"):
-                _flip(store, manifest.parts[0].file)
                 find(store)
             continue
         _flip(store, manifest.parts[-1].file)

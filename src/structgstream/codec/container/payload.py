@@ -2,15 +2,13 @@
 """The payload of a packet's record: frame index, presentation time, field blocks."""
 
 import math
-import struct
 from collections.abc import Mapping
 
 from structgstream.codec.container.blocks import iterate_blocks
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
-
-FRAME = struct.Struct("<Id")  # index, presentation time in seconds
 
 
 def packet_from_blocks(
