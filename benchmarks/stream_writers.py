@@ -142,7 +142,9 @@ def edge_of(path: Path) -> int:
         with suppress(StreamError):
             return len(open_stream(path)) - 1
         return -1
-    found = find(FolderStore(path)) if path.is_dir() else None
+    found = None
+    with suppress(StreamError):
+        found = find(FolderStore(path)) if path.is_dir() else None
     return -1 if found is None else found.manifest.edge.frame
 
 

@@ -125,6 +125,27 @@ def test_killed_at_any_operation_it_goes_on_to_the_same_bytes(tmp_path: Path) ->
             assert not [name for name in os.listdir(store.folder) if name.startswith(".")]
 
 
+@pytest.mark.parametrize("more", [0, 1, 5])
+def test_what_a_killed_run_wrote_too_early_stays_when_it_comes_again(tmp_path: Path, more: int) -> None:
+    """Killed while closing: the short segment is there and no manifest names it, so that it counts as stale."""
+    store, options, hands = folder(tmp_path / "out"), SegmentsOptions(grace_seconds=3.0), Hands()
+    counter = KilledStore(folder(tmp_path / "count"), at=10**9, done=True)
+    written(counter, SENT[:2], options=options)
+    assert counter.operations[-2].startswith("put segment-00000000")
+    with pytest.raises(Killed):
+        written(KilledStore(store, len(counter.operations) - 2, True), SENT[:2], options=options)
+    sink, resumed = resume_segments(store, options=options, clocks=hands.clocks())
+    assert resumed is not None
+    sink.open(resumed.header)
+    for packet in SENT[2 : 2 + more]:
+        hands.wait(1.0)
+        sink.write(packet)
+    hands.wait(10.0)
+    sink.close()
+    written(store, SENT, options=options, hands=hands)
+    assert archived(store) == as_file(SENT)
+
+
 def test_an_orderly_stop_in_the_middle_of_a_group_goes_on_to_the_same_segments(tmp_path: Path) -> None:
     whole = folder(tmp_path / "whole")
     written(whole, SENT)
