@@ -12,17 +12,16 @@ Moments are drawn with a seed; where in a write they fall is not.
 """
 
 import argparse
-import io
 import json
 import os
 import random
 import shutil
 import signal
 import statistics
-import sys
 import tempfile
 import threading
 import time
+import traceback
 from dataclasses import asdict
 from pathlib import Path
 
@@ -54,9 +53,10 @@ def started(writer: Writer, path: Path) -> tuple[int, int]:
     os.close(reading)
     status = 1
     try:
-        sys.stderr = sys.stdout = io.StringIO()
         writer(path, lambda frame: os.write(writing, bytes([frame])))
         status = 0
+    except Exception:
+        traceback.print_exc()
     finally:
         os._exit(status)
 

@@ -129,16 +129,16 @@ def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
     """The folder of a stream of segments, made if it is not there, checked before frame 0 is fitted for minutes.
 
     Raises:
-        StorageError: it holds a stream, cannot be made, or there is no permission to write.
+        StorageError: it holds a stream, cannot be made or written, or another process writes to it.
     """
     store = FolderStore(path)
+    store.make()
+    store.lock()
     store.prepare()
     if MANIFEST in store.names() and not may_exist:
         raise StorageError(
             f"{path} holds a stream; continue it with --resume, replace it with --overwrite, or choose another name."
         )
-    if not os.access(path, os.W_OK):
-        raise StorageError(f"{path} cannot be written (no permission).")
     return store
 
 

@@ -13,10 +13,13 @@ from pathlib import Path
 import pytest
 
 from backends import QUICKEST
+from s3_emulator import BUCKET, emulator
 from small_presets import few_points
-from structgstream.cli import main
+from structgstream.cli import main, segment_options
 from structgstream.cli.termination import Terminated, Termination
 from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.archive import write_archive
+from structgstream.codec.segments.cloud_store import CloudStore
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.data.clip import bundled_clip_path
@@ -129,3 +132,28 @@ def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
         with pytest.raises(Terminated, match="was given up"):
             os.kill(os.getpid(), signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_publishing_to_s3(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is missing after a run is copied by the next, also if there is nothing to fit."""
+    out = tmp_path / "out"
+    with emulator() as server:
+        options = server.options
+        monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
+        monkeypatch.setenv("AWS_ACCESS_KEY_ID", options["key"])
+        monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", options["secret"])
+        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 0.0)
+        url = f"s3://{BUCKET}/out"
+        command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUICK, "--sink", "segments", "--publish", url]
+        assert main(command) == 0
+        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
+        assert main([*command, "--resume"]) == 0
+        remote = CloudStore(url, **options)
+        assert remote.names() == FolderStore(out).names()
+        write_archive(remote, tmp_path / "a.sgs")
+    assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
+    assert main(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs"), "--publish", url]) == 2
+    assert "--publish is for --sink segments" in capsys.readouterr().err
