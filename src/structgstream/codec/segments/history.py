@@ -36,7 +36,7 @@ def paged(history: Sequence[HistoryEntry], segments: Sequence[SegmentEntry]) -> 
         history = (*history, _page(older, 0, pages))
         segments = segments[len(older) :]
     level = 0
-    while sum(entry.level == level for entry in history) >= PAGE_SEGMENTS + LISTED_SEGMENTS:
+    while sum(entry.level == level for entry in history) >= PAGE_SEGMENTS:
         start = next(i for i, entry in enumerate(history) if entry.level == level)
         end = start + PAGE_SEGMENTS
         history = (*history[:start], _page(history[start:end], level + 1, pages), *history[end:])
