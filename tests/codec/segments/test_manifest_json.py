@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A manifest comes back as it was written, and what a hostile host sends is refused in words."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from structgstream.codec.packets import PacketKind
+from structgstream.codec.segments.manifest import (
+    Edge,
+    HistoryEntry,
+    Manifest,
+    PartEntry,
+    PeriodEntry,
+    SegmentEntry,
+    Window,
+    history_name,
+    init_name,
+    part_name,
+    segment_name,
+    sha256_of,
+)
+from structgstream.codec.segments.manifest_json import (
+    MOST_MANIFEST_BYTES,
+    manifest_from_json,
+    manifest_to_json,
+    page_from_json,
+    page_to_json,
+)
+from structgstream.errors import StreamError
+
+SHA = sha256_of(b"something")
+
+
+def segment(number: int, frames: int = 3) -> SegmentEntry:
+    """A segment of as many frames as each before it."""
+    first = number * frames
+    sizes = (100, *[10] * (frames - 1))
+    name = segment_name(number, SHA)
+    return SegmentEntry(
+        number, name, 0, first, frames, (first / 30, (first + frames - 1) / 30), sum(sizes), 100, sizes, SHA
+    )
+
+
+def manifest() -> Manifest:
+    """One page of two segments, two segments, two parts."""
+    page = page_to_json([segment(0), segment(1)])
+    name = history_name(0, sha256_of(page))
+    return Manifest(
+        sequence=12,
+        live=True,
+        fps=30.0,
+        name="studio, ä",
+        target_latency_seconds=12.0,
+        frame_seconds=None,
+        edge=Edge(13, 13 / 30, None, 1.7e9 + 0.1),
+        window=Window(0, 0, None),
+        periods=(PeriodEntry(0, init_name(0, SHA), 812_345, SHA, 0, 0),),
+        history=(HistoryEntry(name, 0, 0, 2, 0, 6, (0.0, 5 / 30), len(page), sha256_of(page)),),
+        segments=(segment(2), segment(3)),
+        parts=(
+            PartEntry(part_name(12, SHA), 12, 0, PacketKind.KEY, 12 / 30, 90, SHA),
+            PartEntry(part_name(13, SHA), 13, 0, PacketKind.DELTA, 13 / 30, 9, SHA),
+        ),
+    )
+
+
+def read(data: bytes) -> Manifest:
+    return manifest_from_json(data, name="manifest.json")
+
+
+def test_a_manifest_comes_back_and_equal_ones_are_equal_bytes() -> None:
+    data = manifest_to_json(manifest())
+    assert read(data) == manifest()
+    assert manifest_to_json(read(data)) == data
+    plain = json.loads(data)
+    assert (plain["format"], plain["version"], plain["parts"][1]["kind"]) == ("structgstream-segments", 1, "delta")
+    assert data.startswith(b'{"edge":')
+
+
+def test_pages_come_back_and_pages_of_pages() -> None:
+    first, second = [segment(0), segment(1)], [segment(2)]
+    pages = []
+    for entries in (first, second):
+        data, frames = page_to_json(entries), sum(entry.frames for entry in entries)
+        pages.append(
+            HistoryEntry(
+                "h.json", 0, entries[0].segment, len(entries), entries[0].first_frame, frames,
+                (entries[0].pts_seconds[0], entries[-1].pts_seconds[1]), len(data), SHA,
+            )
+        )  # fmt: skip
+        assert page_from_json(data, pages[-1]) == tuple(entries)
+    data = page_to_json(pages)
+    above = HistoryEntry("hh.json", 1, 0, 3, 0, 9, (0.0, 8 / 30), len(data), SHA)
+    assert page_from_json(data, above) == tuple(pages)
+    with pytest.raises(StreamError, match="hh.json has 3 segments of 9 frames; expected 4 of 9"):
+        page_from_json(data, replace(above, segments=4))
+    with pytest.raises(StreamError, match="other levels than 1"):
+        page_from_json(data, replace(above, level=2))
+    with pytest.raises(StreamError, match="has no 'segments'"):
+        page_from_json(data, replace(above, level=0))
+    with pytest.raises(StreamError, match="begins with frame 0 and segment 0, where frame 3 and segment 1 belong"):
+        page_from_json(page_to_json(first), replace(pages[0], first_segment=1, first_frame=3))
+
+
+BAD: list[tuple[tuple[Any, ...], Any, str]] = [
+    (("format",), "mp4", "is no manifest of segments: its format is 'mp4'"),
+    (("version",), 2, "has version 2; this program reads 1"),
+    (("sequence",), -1, "'sequence' -1; expected a whole number"),
+    (("sequence",), True, "'sequence' true; expected a whole number"),
+    (("sequence",), 1.0, "'sequence' 1.0; expected a whole number"),
+    (("live",), 1, "'live' 1; expected true or false"),
+    (("fps",), 0, "'fps' 0; expected a positive number"),
+    (("fps",), "30", "'fps' \"30\"; expected a number from 0"),
+    (("name",), "x" * 1001, "expected a text of at most 1000 characters"),
+    (("edge", "frame"), 14, "lists frames 0 to 13, and its edge is frame 14"),
+    (("edge", "pts_seconds"), 1e300, "expected a finite number"),
+    (("window", "first_frame"), 14, "window that begins after its edge"),
+    (("window", "first_segment"), 5, "window that begins after its edge"),
+    (("window",), [], r"window is \[\]; expected an object"),
+    (("periods",), [], "names no init record of the first frame of its window"),
+    (("periods", 0, "file"), "../init.sgs", "expected the plain name of a file beside it"),
+    (("periods", 0, "file"), "http://elsewhere/init", "expected the plain name"),
+    (("periods", 0, "file"), "", "expected the plain name"),
+    (("periods", 0, "file"), ".hidden", "expected the plain name"),
+    (("periods", 0, "file"), "a" * 200, "expected the plain name"),
+    (("periods", 0, "file"), "init\n", "expected the plain name"),
+    (("periods", 0, "file"), "ïnit", "expected the plain name"),
+    (("periods", 0, "sha256"), "00", "expected 64 hex digits"),
+    (("segments", 0, "frames"), 10**9, "whole number from 1 to 65536"),
+    (("segments", 0, "bytes"), 2**60, "expected a whole number"),
+    (("segments", 0, "bytes"), 121, "lengths of frames that are not those of the segment"),
+    (("segments", 0, "key_bytes"), 99, "lengths of frames that are not those of the segment"),
+    (("segments", 0, "frame_bytes"), [1, 2], "expected a list of 3 whole numbers"),
+    (("segments", 0, "first_frame"), 7, "begins with frame 7 and segment 2, where frame 6 and segment 2 belong"),
+    (("segments", 1, "segment"), 2, "where frame 9 and segment 3 belong"),
+    (("segments", 0, "pts_seconds"), [1.0, 0.5], "two numbers that do not fall"),
+    (("segments", 0, "period"), 1, "names no init record of period 1"),
+    (("segments",), {}, "expected a list of at most 4096 objects"),
+    (("segments",), [None] * 5000, "expected a list of at most 4096 objects"),
+    (("parts", 1, "frame"), 15, "has a part of frame 15 where one of frame 13 belongs"),
+    (("parts", 0, "kind"), "index", "'kind' 'index'; expected key or delta"),
+    (("history", 0, "level"), 9, "from 0 to 8"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "value", "message"), BAD, ids=[f"{path}={str(v)[:12]}" for path, v, _ in BAD])
+def test_what_contradicts_the_format_is_refused_in_words(path: tuple[Any, ...], value: Any, message: str) -> None:
+    plain = json.loads(manifest_to_json(manifest()))
+    place = plain
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    with pytest.raises(StreamError, match=message):
+        read(json.dumps(plain).encode())
+
+
+def test_a_manifest_that_has_ended_has_no_parts_and_what_is_missing_is_named() -> None:
+    plain = json.loads(manifest_to_json(manifest()))
+    with pytest.raises(StreamError, match="has parts although its run has ended"):
+        read(json.dumps(plain | {"live": False}).encode())
+    for name in plain:
+        with pytest.raises(StreamError, match=f"has no '{name}'"):
+            read(json.dumps({key: value for key, value in plain.items() if key != name}).encode())
+    assert read(json.dumps(plain | {"later": [1, {"unknown": None}]}).encode()) == manifest()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"[]", b"null", b"{", b"\xff\xfe", b'{"fps": NaN}', b"[" * 100_000, b" " * (MOST_MANIFEST_BYTES + 1)],
+    ids=["empty", "list", "null", "cut", "no UTF-8", "NaN", "deep", "long"],
+)
+def test_what_is_no_manifest_is_refused(data: bytes) -> None:
+    with pytest.raises(StreamError, match=r"manifest.json "):
+        read(data)
+
+
+def test_numbers_without_a_value_are_refused() -> None:
+    for text in ("NaN", "Infinity", "-Infinity", "1e999"):
+        data = manifest_to_json(manifest()).replace(b'"fps":30.0', f'"fps":{text}'.encode())
+        with pytest.raises(StreamError, match="'fps'"):
+            read(data)
+
+
+@given(st.data())
+def test_no_changed_byte_does_more_than_raise_our_error(data: st.DataObject) -> None:
+    whole = bytearray(manifest_to_json(manifest()))
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(0, len(whole) - 1))
+        whole[place] = data.draw(st.integers(0, 255))
+    try:
+        found = read(bytes(whole))
+    except StreamError:
+        return
+    assert all("/" not in name for name in found.files)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A file of a store is the old one or the new one, whatever happens while it is written."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from structgstream.codec.segments.store import FolderStore, is_ours
+from structgstream.errors import StorageError, StreamError
+
+
+def test_files_are_written_replaced_listed_and_removed(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path / "new" / "folder")
+    assert store.names() == frozenset()
+    store.prepare()
+    store.put("manifest.json", b"1")
+    store.put("manifest.json", b"22")
+    (store.folder / "notes.txt").write_text("mine")
+    assert store.get("manifest.json") == b"22"
+    assert store.names() == {"manifest.json"}
+    store.delete("manifest.json")
+    store.delete("manifest.json")
+    assert sorted(os.listdir(store.folder)) == ["notes.txt"]
+    with pytest.raises(StreamError, match=r"Cannot read .*manifest\.json \(No such file"):
+        store.get("manifest.json")
+    room = store.free_bytes()
+    assert room is not None
+    assert room > 0
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = FolderStore(tmp_path)
+    store.put("manifest.json", b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match=r"Cannot write 3 bytes to .*manifest\.json \(No space left on device\)"):
+        store.put("manifest.json", b"new")
+    assert os.listdir(tmp_path) == ["manifest.json"]
+    assert store.get("manifest.json") == b"old"
+
+
+def test_content_and_folder_are_synced_before_and_after_the_rename(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the first a file may be empty after a power cut, without the second it may be gone."""
+    steps: list[str] = []
+    fsync, replace = os.fsync, Path.replace
+
+    def synced(descriptor: int) -> None:
+        steps.append("sync " + ("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file"))
+        fsync(descriptor)
+
+    def replaced(self: Path, target: Path) -> Path:
+        steps.append("rename")
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(Path, "replace", replaced)
+    FolderStore(tmp_path).put("manifest.json", b"x")
+    assert steps == ["sync file", "rename", "sync folder"]
+
+
+def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / ".new-manifest.json").write_bytes(b"half")
+    (tmp_path / ".new").write_bytes(b"not ours")
+    FolderStore(tmp_path).prepare()
+    assert os.listdir(tmp_path) == [".new"]
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "stream").write_text("x")
+    with pytest.raises(StorageError, match="stream cannot be made"):
+        FolderStore(tmp_path / "stream").prepare()
+    with pytest.raises(StreamError, match="Cannot list"):
+        FolderStore(tmp_path / "stream").names()
+
+
+def test_names_of_the_sink_are_known() -> None:
+    sixteen = "0123456789abcdef"
+    ours = [f"part-00000012-{sixteen}.sgs", f"init-0000-{sixteen}.sgs", f"history-00000000-{sixteen}.json"]
+    assert all(map(is_ours, [*ours, f"segment-123456789-{sixteen}.sgs", "manifest.json"]))
+    assert not any(map(is_ours, ["notes.txt", "part-1.sgs", f"x{ours[0]}", f"{ours[0]}x", f"{ours[0]}\n", ".new-x"]))
