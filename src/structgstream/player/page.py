@@ -29,9 +29,11 @@ _POLICY: Final = {
     "base-uri": "'none'",
     "form-action": "'none'",
 }
-_PLAYER_STYLE: Final = (
-    "<style>html,body{margin:0;height:100%;color-scheme:light dark}structgstream-player{width:100%;height:100%}</style>\n"
-)
+_PLAYER_STYLE: Final = """<style>
+html,body{margin:0;height:100%;color-scheme:light dark}
+structgstream-player{width:100%;height:100%}
+</style>
+"""
 _NO_SCRIPT: Final = "<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>"
 
 

@@ -29,7 +29,7 @@ class StreamKind(Enum):
 
 @dataclass(frozen=True)
 class ServedStream:
-    """A stream in the folder ``root``: the folder of segments ``name``, or the file ``name``, which ends in ``.sgs``."""
+    """A stream in the folder ``root``: the folder of segments ``name``, or the file ``name``, with its suffix."""
 
     root: Path
     name: str
@@ -52,7 +52,7 @@ class ServedStream:
         return open_below(self.root, self.name)
 
     def open_beside(self, suffix: str) -> OpenedFile | None:
-        """A file beside the stream, as ``studio.metrics.json`` beside ``studio`` and ``ball.sgs``'s; None without. Blocks.
+        """A file beside the stream: ``studio`` and ``suffix``, ``ball`` and ``suffix`` for ``ball.sgs``. Blocks.
 
         Raises:
             OSError: the system cannot open files now.

@@ -47,9 +47,7 @@ class FileCache:
         most_file_bytes: larger files are read from the disk each time.
     """
 
-    def __init__(
-        self, *, most_bytes: int = MOST_CACHED_BYTES, most_file_bytes: int = MOST_CACHED_FILE_BYTES
-    ) -> None:
+    def __init__(self, *, most_bytes: int = MOST_CACHED_BYTES, most_file_bytes: int = MOST_CACHED_FILE_BYTES) -> None:
         self._most_bytes = most_bytes
         self._most_file_bytes = most_file_bytes
         self._kept: OrderedDict[Key, bytes] = OrderedDict()

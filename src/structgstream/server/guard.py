@@ -34,9 +34,7 @@ class Guard:
         self._app = app
         self._limits = limits
         self._metrics = metrics
-        self._buckets = TokenBuckets(
-            limits.requests_per_second, limits.burst, most=limits.addresses, clock=clock
-        )
+        self._buckets = TokenBuckets(limits.requests_per_second, limits.burst, most=limits.addresses, clock=clock)
         self._together = Concurrent(limits.connections_per_address, most_together=2 * limits.connections)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -54,15 +54,13 @@ class ManifestWatch:
         clock: seconds that rise.
     """
 
-    def __init__(
-        self, opened: Callable[[], OpenedFile | None], *, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, opened: Callable[[], OpenedFile | None], *, clock: Callable[[], float] = time.monotonic) -> None:
         self._opened = opened
         self._clock = clock
         self._lock = asyncio.Lock()
         self._looked_at = -float("inf")
         self._stamp: FileStamp | None = None
-        self._found: Snapshot | BrokenManifest | None = None
+        self._found: Snapshot | str | None = None  # a text says what is wrong with the manifest
         self._changed = asyncio.Event()
         self._watching: asyncio.Task[None] | None = None
         self.waiters = 0
@@ -77,8 +75,8 @@ class ManifestWatch:
         async with self._lock:
             if self._clock() - self._looked_at >= LOOK_SECONDS:
                 await self._look()
-        if isinstance(self._found, BrokenManifest):
-            raise self._found
+        if isinstance(self._found, str):
+            raise BrokenManifest(self._found)
         return self._found
 
     async def newer(self, after: int, *, seconds: float) -> Snapshot | None:
@@ -118,13 +116,13 @@ class ManifestWatch:
         try:
             self._stamp, self._found = await to_thread.run_sync(self._read)
         except BrokenManifest as broken:
-            self._stamp, self._found = None, broken
+            self._stamp, self._found = None, str(broken)
         self._looked_at = self._clock()
-        if self._found is not before:
+        if self._found is not before and self._found != before:
             changed, self._changed = self._changed, asyncio.Event()
             changed.set()
 
-    def _read(self) -> tuple[FileStamp | None, Snapshot | BrokenManifest | None]:
+    def _read(self) -> tuple[FileStamp | None, Snapshot | str | None]:
         opened = self._opened()
         if opened is None:
             return None, None

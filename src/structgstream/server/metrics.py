@@ -118,7 +118,7 @@ def _number(number: float) -> str:
 def run_numbers(content: bytes) -> dict[str, float]:
     """The numbers in a trainer's ``OUT.metrics.json`` by the path to them, joined by ``_``: at most 500 of them.
 
-    Lists and texts are left out. What is no JSON object has none, because a run that writes it may be of another version.
+    Lists and texts are left out. What is no JSON object has none: a run that writes it may be of another version.
     """
     try:
         values = json.loads(content)

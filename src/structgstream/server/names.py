@@ -10,15 +10,12 @@ way only, without percent signs, and no address leads out of a folder.
 import re
 from typing import Final
 
+from structgstream.codec.segments.store import is_ours
+
 MANIFEST: Final = "manifest.json"
 STREAM_SUFFIX: Final = ".sgs"
 
 _STREAM = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
-_IMMUTABLE = re.compile(
-    r"(?:(?:init-[0-9]{4,10}|part-[0-9]{8,12}|segment-[0-9]{8,12})-([0-9a-f]{16})\.sgs"
-    r"|history-[0-9]{8,12}-([0-9a-f]{16})\.json)",
-    re.ASCII,
-)
 _PATH = re.compile(rb"/[A-Za-z0-9._/-]*")
 
 
@@ -29,8 +26,7 @@ def is_stream_name(name: str) -> bool:
 
 def hash_in_name(file: str) -> str | None:
     """The 16 hex digits in the name of an immutable file of a segments folder; None for other names."""
-    found = _IMMUTABLE.fullmatch(file)
-    return None if found is None else found[1] or found[2]
+    return None if file == MANIFEST or not is_ours(file) else file.rpartition("-")[2].partition(".")[0]
 
 
 def is_plain_path(raw: bytes) -> bool:

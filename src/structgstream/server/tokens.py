@@ -4,9 +4,9 @@
 Note [Tokens]
 ~~~~~~~~~~~~~
 EXPIRES is in Unix seconds; STREAM is the name of a stream, or ``~`` for every stream and the metrics. SIGNATURE is the
-HMAC-SHA256 of both under the secret, in base64 without padding. A token needs no store: whoever has the secret can check
-it. It cannot be withdrawn, so it should expire soon; all tokens of a secret end when its line is taken out of the file.
-All characters may stand in a query and in a header without escapes.
+HMAC-SHA256 of both under the secret, in base64 without padding. A token needs no store: whoever has the secret can
+check it. It cannot be withdrawn, so it should expire soon; all tokens of a secret end when the server is started
+without it. All characters may stand in a query and in a header without escapes.
 """
 
 import base64
@@ -42,7 +42,7 @@ class Access(Enum):
 
 @dataclass(frozen=True)
 class TokenKeys:
-    """Secrets: the first one signs, each of them is accepted, so that a secret can be replaced while tokens are about."""
+    """Secrets: the first one signs, each is accepted, so that a secret can be replaced while its tokens are about."""
 
     secrets: tuple[bytes, ...]
 

@@ -28,7 +28,7 @@ class PieceResponse(Response):
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Sends the response. uvicorn drops what is sent to a client that is gone, so that is watched for."""
         await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
-        gone = asyncio.create_task(_gone(receive))
+        gone = asyncio.create_task(client_gone(receive))
         try:
             async with aclosing(self._pieces) as pieces:
                 async for piece in pieces:
@@ -40,7 +40,7 @@ class PieceResponse(Response):
             gone.cancel()
 
 
-async def _gone(receive: Receive) -> None:
+async def client_gone(receive: Receive) -> None:
     """Returns when the client is gone."""
     while (await receive())["type"] != "http.disconnect":
         pass
