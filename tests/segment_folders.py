@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of segments that grow frame by frame, as a trainer's sink writes them, from the bytes of a finished stream."""
+"""Folders of segments that grow frame by frame, as a sink writes them, from the bytes of a finished stream."""
 
 from dataclasses import replace
 from pathlib import Path

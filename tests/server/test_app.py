@@ -163,8 +163,8 @@ def test_waiting_ends_with_the_next_frame_for_everyone(tmp_path: Path) -> None:
 
 
 def waiters(server: Served) -> float:
-    found = [line for line in server.ask("/metrics").body.decode().splitlines() if line.startswith("structgstream_wait")]
-    return sum(float(line.split()[-1]) for line in found)
+    lines = server.ask("/metrics").body.decode().splitlines()
+    return sum(float(line.split()[-1]) for line in lines if line.startswith("structgstream_waiters"))
 
 
 def test_waiting_ends_by_itself(server: Served) -> None:

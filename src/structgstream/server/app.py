@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable
 
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -90,7 +91,12 @@ def application(
     application = Starlette(
         routes=routes.all(),
         middleware=middleware,
-        exception_handlers={Refused: _refused, BrokenManifest: _broken, OSError: _unreadable},
+        exception_handlers={
+            HTTPException: _unrouted,
+            Refused: _refused,
+            BrokenManifest: _broken,
+            OSError: _unreadable,
+        },
     )
     application.router.redirect_slashes = False  # It would lead to this server's own name, also behind a proxy.
     return application
@@ -192,6 +198,11 @@ class _Routes:
 async def _refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, Refused), "what the handler is for"
     return PlainTextResponse(error.text, error.status, {**PASSING, **error.headers})
+
+
+async def _unrouted(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException), "what the handler is for"
+    return PlainTextResponse("There is nothing at this address.", error.status_code, PASSING)
 
 
 async def _broken(request: Request, error: Exception) -> Response:

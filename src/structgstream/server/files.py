@@ -77,12 +77,11 @@ def open_below(folder: Path, *parts: str) -> OpenedFile | None:
         if error.errno in _MISSING:
             return None
         raise
-    file = FileIO(handle, "rb")
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
-        file.close()
+        os.close(handle)
         return None
-    return OpenedFile(file, FileStamp(status.st_ino, status.st_mtime_ns, status.st_size))
+    return OpenedFile(FileIO(handle, "rb"), FileStamp(status.st_ino, status.st_mtime_ns, status.st_size))
 
 
 def _opened(folder: Path, parts: tuple[str, ...]) -> int:

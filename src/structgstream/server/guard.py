@@ -75,13 +75,15 @@ class Guard:
             return self._refused("body", 413, "A request has no body here.")
         if len(scope["raw_path"]) > self._limits.path_bytes or len(scope["query_string"]) > self._limits.query_bytes:
             return self._refused("length", 414, "The address is too long.")
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > self._limits.header_bytes:
+            return self._refused("header", 431, "The header is too long.")
         if not is_plain_path(scope["raw_path"]):
             return self._refused("path", 404, "There is nothing at this address.")
         return None
 
     def _refused(self, reason: str, status: int, text: str, wait_seconds: float = 0.0) -> Response:
         self._metrics.refused[reason] += 1
-        headers = {**PASSING, "Connection": "close"} if status in (405, 413, 414) else dict(PASSING)
+        headers = {**PASSING, "Connection": "close"} if status in (405, 413, 414, 431) else dict(PASSING)
         if status == 405:
             headers["Allow"] = ", ".join(METHODS)
         if wait_seconds:

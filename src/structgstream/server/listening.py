@@ -17,7 +17,6 @@ from structgstream.server.previews import Render, rendered_apart
 from structgstream.server.protocol import Door, bounded_protocol
 from structgstream.server.settings import LOOPBACK_NAMES, Limits, ServerSettings
 
-HEADER_BYTES = 16 * 1024
 KEEP_ALIVE_SECONDS = 15
 SHUTDOWN_SECONDS = 2
 SEND_BUFFER_BYTES = 256 * 1024
@@ -128,7 +127,7 @@ def server(
         server_header=False,
         proxy_headers=bool(settings.proxies),
         forwarded_allow_ips=list(settings.proxies),
-        h11_max_incomplete_event_size=HEADER_BYTES,
+        h11_max_incomplete_event_size=settings.limits.header_bytes,
         timeout_keep_alive=KEEP_ALIVE_SECONDS,
         timeout_graceful_shutdown=SHUTDOWN_SECONDS,
     )

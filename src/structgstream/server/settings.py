@@ -34,6 +34,7 @@ class Limits:
         wait_seconds: how long one waits at most.
         header_seconds: within which a request's header has to be complete.
         stalled_seconds: after which a client that takes no bytes is disconnected.
+        header_bytes: length of a header's names and values together.
         query_bytes: length of a query.
         path_bytes: length of a path.
     """
@@ -47,6 +48,7 @@ class Limits:
     wait_seconds: float = 25.0
     header_seconds: float = 10.0
     stalled_seconds: float = 60.0
+    header_bytes: int = 16 * 1024
     query_bytes: int = 1024
     path_bytes: int = 512
 
