@@ -138,9 +138,12 @@ async def rendered_apart(stream: ServedStream) -> bytes:
         env=environment,
     )  # fmt: skip
     assert process.stdout is not None, "a pipe was asked for"
+    content = b""
     try:
         async with asyncio.timeout(RENDER_SECONDS):
-            return await process.stdout.read(MOST_PICTURE_BYTES + 1) + await process.stdout.read(1)
+            while len(content) <= MOST_PICTURE_BYTES and (piece := await process.stdout.read(2**16)):
+                content += piece
+            return content if await process.wait() == 0 else b""
     except TimeoutError:
         return b""
     finally:
