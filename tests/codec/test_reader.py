@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.container.continuation import readable_part
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import PacketKind
-from structgstream.codec.reader import StreamReader, open_stream, readable_part
+from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
 
@@ -151,7 +152,7 @@ def test_files_that_are_no_streams(tmp_path: Path) -> None:
     empty.touch()
     other.write_text("A letter to someone.")
     for path, message in [
-        (tmp_path, "Cannot read .*directory"),
+        (tmp_path, "has no manifest.json; expected a folder written with --sink segments"),
         (tmp_path / "missing.sgs", "Cannot read .*missing.sgs .No such file"),
         (empty, "empty.sgs is empty"),
         (other, "other.sgs is not a structgstream file"),

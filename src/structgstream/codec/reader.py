@@ -35,7 +35,6 @@ from structgstream.codec.container.records import (
     RecordType,
     check_prefix,
     incomplete_reason,
-    prefix,
     read_head,
     read_record,
     scan_records,
@@ -44,6 +43,9 @@ from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.frame_renderer import FrameRenderer
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName
 from structgstream.scene.scene import Scene
@@ -139,6 +141,7 @@ class StreamReader:
         data: the bytes, or an open file, which the reader then closes.
         name: of the stream, for messages.
         by_index: open without reading every byte.
+        gone: frames that are known not to be in ``data`` any more, in order; they count as lost.
 
     Attributes:
         header: content of the init record.
@@ -154,10 +157,18 @@ class StreamReader:
         StreamError: not a stream, another major version, no whole init record, or inconsistent records.
     """
 
-    def __init__(self, data: ByteSource, *, name: str = "The stream", by_index: bool = False) -> None:
+    def __init__(
+        self,
+        data: ByteSource,
+        *,
+        name: str = "The stream",
+        by_index: bool = False,
+        gone: Sequence[range] = (),
+    ) -> None:
         check_prefix(data, name)
         self._data = data
         self._name = name
+        self._gone = {frames.start: frames for frames in gone}
         self.total_bytes = len(data)
         self.complete = False
         self.packets = Packets(data, name)
@@ -171,7 +182,7 @@ class StreamReader:
         self.header = unpack_header(init.payload)
         self.header_bytes = end = init.end
         self.header_field_bytes = field_sizes(init.payload)
-        offsets = read_index_offsets(data, end) if by_index else None
+        offsets = read_index_offsets(data, end) if by_index and not gone else None
         if offsets is not None:
             self.packets.offsets = offsets
             self.packets.whole = len(offsets)
@@ -204,7 +215,8 @@ class StreamReader:
             end = following.offset
         self.complete = ended and not found
         self.damage = [Damage(offset, range(frame, self._shown_from(frame))) for offset, frame in found]
-        self.packets.whole = next((damage.frames.start for damage in self.damage if damage.frames), len(offsets))
+        lost = [*(damage.frames for damage in self.damage), *self._gone.values()]
+        self.packets.whole = min([frames.start for frames in lost if frames], default=len(offsets))
         return end
 
     def _run(self, index: int) -> int:
@@ -241,6 +253,8 @@ class StreamReader:
             return before_seconds
         packet = parse_packet(record.payload, _KINDS[RecordType(record.type)])
         offsets = self.packets.offsets
+        if (gone := self._gone.get(len(offsets))) is not None and packet.index == gone.stop:
+            offsets.extend([LOST] * len(gone))
         if packet.index != len(offsets):
             raise StreamError(f"{self._name} has packet {packet.index} where packet {len(offsets)} belongs.")
         if packet.index == 0 and packet.kind is not PacketKind.KEY:
@@ -304,6 +318,8 @@ class StreamReader:
         return self._renderer.picture(index, self.header.camera(camera), decode=self.scene, backend=backend)
 
     def _missing(self, index: int) -> StreamError:
+        if any(index in frames for frames in self._gone.values()):
+            return StreamError(f"Frame {index} of {self._name} has left the window of frames that are kept.")
         for damage in self.damage:
             if index in damage.frames:
                 return StreamError(
@@ -344,48 +360,22 @@ class StreamReader:
 
 
 def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
-    """Open a stream file. It is closed at the end of a ``with`` block, by ``close()``, or with the reader.
+    """Open a stream file, or a folder of segments. A file is closed at the end of a ``with`` block, by ``close()``, or
+    with the reader.
 
     Args:
-        path: the file.
+        path: the file, the folder, or the folder's manifest.
         by_index: find packets by the file's index instead of verifying every byte first, see :class:`StreamReader`.
 
     Raises:
         StreamError: there is no such file, or it is not a stream.
     """
+    path = Path(path)
+    if path.name == MANIFEST or path.is_dir():
+        store = FolderStore(path.parent if path.name == MANIFEST else path)
+        stored = StoredBytes(store, read_manifest(store))
+        return StreamReader(stored, name=str(path), by_index=by_index, gone=stored.gone)
     data = FileBytes(path)
     if not len(data):
         raise StreamError(f"{path} is empty; expected a stream made by structgstream reconstruct.")
     return StreamReader(data, name=str(path), by_index=by_index)
-
-
-def readable_part(data: ByteSource, *, name: str) -> int | None:
-    """End of the last whole packet, before the index; None if the file is truncated within the init record.
-
-    Raises:
-        StreamError: not a stream, another major version, or a damaged init record, after which restarting would
-            destroy frames.
-    """
-    if prefix().startswith(bytes(data[: PREFIX.size + 1])):
-        return None  # Cut within the prefix, or empty.
-    check_prefix(data, name)
-    end, frames, complete = PREFIX.size, 0, False
-    for record in scan_records(data):
-        if complete := record.type == RecordType.INDEX:
-            break
-        end = record.end
-        frames += record.type in _KINDS
-    if end > PREFIX.size:
-        # A crash cannot leave whole frames after a damaged one; a failing disk can.
-        search = PacketSearch(data)
-        if not complete and search.next(end, expected=frames, after_seconds=-math.inf) is not None:
-            raise StreamError(
-                f"Cannot continue {name}: {incomplete_reason(data, end)}, and continuing would overwrite the whole "
-                f"frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them "
-                "again."
-            )
-        return end
-    reason = incomplete_reason(data, end)
-    if "damaged" in reason:
-        raise StreamError(f"Cannot continue {name}: {reason}. Start again with --overwrite.")
-    return None

@@ -3,16 +3,20 @@
 
 import io
 import os
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes
+from structgstream.codec.container.continuation import readable_part
+from structgstream.codec.container.disk_room import check_room, free_bytes
 from structgstream.codec.container.index import INDEX_ENTRY, pack_index
 from structgstream.codec.container.records import RecordType, packed, prefix
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.reader import StreamReader, readable_part
+from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
@@ -25,9 +29,11 @@ class _Writer:
     leaves at most extra bytes after ``_end``, which the next write or :meth:`finish` replaces.
     """
 
-    def __init__(self, file: BinaryIO, name: str) -> None:
+    def __init__(self, file: BinaryIO, name: str, *, free: Callable[[], int | None] = lambda: None) -> None:
         self._file = file
         self._name = name
+        self._free = free  # room on the disk
+        self._header_bytes = self._largest = 0
         self._end = 0
         self._entries = bytearray()  # packed INDEX_ENTRYs; those with an offset of _end or more were interrupted
         self._failed = False
@@ -37,15 +43,26 @@ class _Writer:
         entries = (INDEX_ENTRY.pack(info.index, _TYPES[info.kind], info.offset) for info in reader.packets)
         self._entries = bytearray(b"".join(entries))
         self._end = end
+        self._header_bytes = reader.header_bytes
         self._file.truncate(end)
 
     def open(self, header: StreamHeader) -> int:
-        return self._append(prefix() + packed(RecordType.INIT, pack_header(header)))
+        self._header_bytes = self._append(prefix() + packed(RecordType.INIT, pack_header(header)))
+        return self._header_bytes
 
     def write(self, packet: Packet) -> int:
         kind = _TYPES[packet.kind]
+        record = packed(kind, packet.payload)
+        self._largest = max(self._largest, len(record))
+        check_room(
+            self._free(),
+            largest=self._largest,
+            closing=self._header_bytes + len(self._entries) + INDEX_ENTRY.size,
+            where=self._name,
+            frames=len(self._entries) // INDEX_ENTRY.size,
+        )
         self._entries += INDEX_ENTRY.pack(packet.index, kind, self._end)
-        return self._append(packed(kind, packet.payload))
+        return self._append(record)
 
     def finish(self) -> None:
         """Write index and footer and truncate the rest of an interrupted write; does nothing after a failed write."""
@@ -122,7 +139,7 @@ class FileSink:
         mode = "wb" if self._resumed is None else "rb+"
         try:
             self._file = self.path.open(mode, buffering=0)  # type: ignore[assignment]
-            self._writer = _Writer(self._file, str(self.path))  # type: ignore[arg-type]
+            self._writer = _Writer(self._file, str(self.path), free=partial(free_bytes, self.path))  # type: ignore[arg-type]
             if self._resumed is not None:
                 self._writer.continue_at(*self._resumed)
                 return 0
@@ -136,7 +153,7 @@ class FileSink:
         """Append one packet; returns the bytes it took.
 
         Raises:
-            StorageError: the packet cannot be written; earlier packets stay.
+            StorageError: the packet cannot be written, or the disk is nearly full; earlier packets stay.
         """
         assert self._writer is not None, "open() comes before write()"
         return self._writer.write(packet)

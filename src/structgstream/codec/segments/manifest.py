@@ -3,6 +3,7 @@
 
 import hashlib
 from dataclasses import dataclass
+from typing import Protocol
 
 from structgstream.codec.packets import PacketKind
 
@@ -17,6 +18,19 @@ PAGE_FRAMES = 960
 """A page is written early when its segments have this many frames, which bounds the manifest for long groups too."""
 LISTED_SEGMENTS = 8
 """The newest segments are always listed in the manifest itself."""
+
+
+class StoredFile(Protocol):
+    """What every entry states of its file."""
+
+    @property
+    def file(self) -> str: ...
+
+    @property
+    def bytes(self) -> int: ...
+
+    @property
+    def sha256(self) -> str: ...
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 
 import os
 import re
-import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
+from structgstream.codec.container.disk_room import free_bytes
 from structgstream.errors import StorageError, StreamError
 
 _TEMPORARY = ".new-"
@@ -131,10 +131,7 @@ class FolderStore:
 
     def free_bytes(self) -> int | None:
         """What an ordinary user may still write to the folder's disk."""
-        try:
-            return shutil.disk_usage(self.folder).free
-        except OSError:
-            return None
+        return free_bytes(self.folder)
 
     def _sync(self) -> None:
         """Make a rename durable."""

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From one manifest to the next, and the files that must be there before it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from structgstream.codec.packets import StreamHeader
+from structgstream.codec.segments.group import part_of, records_of, segment_of
+from structgstream.codec.segments.history import paged, verified
+from structgstream.codec.segments.manifest import Edge, Manifest, PartEntry, PeriodEntry, Window
+from structgstream.codec.segments.store import Store
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A manifest to write.
+
+    Args:
+        manifest: with ``parts`` of the group that is being written.
+        records: of each of these parts.
+        files: names and contents of other files that must be there before the manifest.
+    """
+
+    manifest: Manifest
+    records: tuple[bytes, ...] = ()
+    files: tuple[tuple[str, bytes], ...] = ()
+
+
+def empty_manifest(header: StreamHeader, period: PeriodEntry, *, sequence: int = 0) -> Manifest:
+    """A manifest before the first frame; it is not written."""
+    return Manifest(
+        sequence=sequence,
+        live=True,
+        fps=header.fps,
+        name=str(header.metadata.get("capture", ""))[:1000],
+        target_latency_seconds=0.0,
+        frame_seconds=None,
+        edge=Edge(-1, 0.0, None, 0.0),
+        window=Window(0, 0, None),
+        periods=(period,),
+        history=(),
+        segments=(),
+        parts=(),
+    )
+
+
+def with_frame(draft: Draft, part: PartEntry, record: bytes, edge: Edge) -> Draft:
+    """With one more frame in the group that is being written: its part, and the record that this is."""
+    manifest = draft.manifest
+    manifest = replace(manifest, live=True, edge=edge, parts=(*manifest.parts, part))
+    return replace(draft, manifest=manifest, records=(*draft.records, record))
+
+
+def with_segment(draft: Draft) -> Draft:
+    """With the group that is being written as a segment, if there is one."""
+    manifest = draft.manifest
+    if not draft.records:
+        return draft
+    data = b"".join(draft.records)
+    entry = segment_of(manifest.parts, data, segment=next_segment(manifest))
+    found = paged(manifest.history, (*manifest.segments, entry))
+    manifest = replace(manifest, history=found.history, segments=found.segments, parts=())
+    return Draft(manifest, (), (*draft.files, (entry.file, data), *found.pages))
+
+
+def reopened(draft: Draft, store: Store) -> Draft:
+    """With the last segment, which an orderly stop has closed early, as the group that is being written.
+
+    Raises:
+        StreamError: the segment is missing or damaged.
+    """
+    manifest = draft.manifest
+    *before, last = manifest.segments
+    records = records_of(last, verified(store, last))
+    parts = tuple(part_of(record, period=last.period) for record in records)
+    files = tuple((part.file, record) for part, record in zip(parts, records, strict=True))
+    return Draft(replace(manifest, segments=tuple(before), parts=parts), tuple(records), (*draft.files, *files))
+
+
+def next_segment(manifest: Manifest) -> int:
+    """Number of the segment after the last one."""
+    if manifest.segments:
+        return manifest.segments[-1].segment + 1
+    return manifest.history[-1].first_segment + manifest.history[-1].segments if manifest.history else 0
+
+
+def periods_in(periods: Sequence[PeriodEntry], window: Window) -> tuple[PeriodEntry, ...]:
+    """The periods of which something is in the window."""
+    first = max(i for i, period in enumerate(periods) if i == 0 or period.first_frame <= window.first_frame)
+    return tuple(periods[first:])

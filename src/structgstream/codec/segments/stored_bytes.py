@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stream of segments as the bytes of a stream file (docs/segments.md)."""
+
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from structgstream.codec.container.index import pack_index
+from structgstream.codec.container.records import RecordType
+from structgstream.codec.packets import PacketKind
+from structgstream.codec.segments.history import segments_from, verified
+from structgstream.codec.segments.manifest import MANIFEST, Manifest, PartEntry, SegmentEntry, StoredFile
+from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.store import Store
+from structgstream.errors import StreamError
+
+_KEPT_FILES = 2
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A file, or an own sequence of bytes, and where it begins."""
+
+    start: int
+    content: StoredFile | bytes
+
+
+class StoredBytes:
+    """The bytes of the stream file that the run would have written instead of segments, read on demand.
+
+    Init record, segments, parts; with index and footer once the run has ended. Segments that have left the window, and
+    are no longer there, are left out: :attr:`gone` has their frames.
+
+    Args:
+        store: where the files are.
+        manifest: what the stream consists of.
+        held: contents of files that are not in the store yet.
+        check: verify the SHA-256 of every file; otherwise only lengths, and readers verify records.
+
+    Attributes:
+        gone: frames that are no longer there, in order.
+        sizes: of every frame from 0 on, in bytes, gone ones included.
+        kinds: of every frame.
+
+    Raises:
+        StreamError: a file is missing or not what the manifest states; also on slicing.
+    """
+
+    def __init__(
+        self, store: Store, manifest: Manifest, *, held: Mapping[str, bytes] | None = None, check: bool = False
+    ) -> None:
+        self._store = store
+        self._held = dict(held or {})
+        self._check = check
+        self._pieces: list[_Piece] = []
+        self._size = 0
+        self._cache: OrderedDict[str, bytes] = OrderedDict()
+        self.gone: list[range] = []
+        self.sizes: list[int] = []
+        self.kinds: list[PacketKind] = []
+        self._add(manifest.periods[0])
+        entries: list[tuple[int, int, int]] = []
+        there = store.names() | self._held.keys()
+        for entry in self._listed(manifest):
+            self._add_frames(entry, there, manifest, entries)
+        if not manifest.live:
+            self._add(pack_index(entries, self._size))
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, key: slice, /) -> bytes:
+        start, stop, _ = key.indices(self._size)
+        found = bytearray()
+        place = bisect_right(self._pieces, start, key=lambda piece: piece.start) - 1
+        while len(found) < stop - start:
+            piece = self._pieces[place]
+            at = start + len(found) - piece.start
+            found += self._content(piece.content)[at : stop - piece.start]
+            place += 1
+        return bytes(found)
+
+    def files(self) -> Iterator[bytes]:
+        """The contents of all files in order, each read once."""
+        for piece in self._pieces:
+            yield self._content(piece.content)
+
+    def _listed(self, manifest: Manifest) -> Iterator[SegmentEntry | PartEntry]:
+        yield from segments_from(self._store, manifest.history, manifest.segments, held=self._held)
+        yield from manifest.parts
+
+    def _add(self, content: StoredFile | bytes) -> None:
+        self._pieces.append(_Piece(self._size, content))
+        self._size += len(content) if isinstance(content, bytes) else content.bytes
+
+    def _add_frames(
+        self,
+        entry: SegmentEntry | PartEntry,
+        there: frozenset[str] | set[str],
+        manifest: Manifest,
+        entries: list[tuple[int, int, int]],
+    ) -> None:
+        """Add a segment or a part, and what an index says of it."""
+        if isinstance(entry, PartEntry):
+            first, sizes, kinds = entry.frame, (entry.bytes,), [entry.kind]
+        else:
+            first, sizes = entry.first_frame, entry.frame_bytes
+            kinds = [PacketKind.KEY, *[PacketKind.DELTA] * (entry.frames - 1)]
+        self.sizes += sizes
+        self.kinds += kinds
+        if entry.file not in there:
+            if not isinstance(entry, SegmentEntry) or entry.segment >= manifest.window.first_segment:
+                raise StreamError(f"{self._store.name} has no {entry.file}, which its manifest names.")
+            last = self.gone.pop() if self.gone and self.gone[-1].stop == first else range(first, first)
+            self.gone.append(range(last.start, first + len(sizes)))
+            return
+        offset = self._size
+        for index, (size, kind) in enumerate(zip(sizes, kinds, strict=True), start=first):
+            entries.append((index, RecordType.KEY if kind is PacketKind.KEY else RecordType.DELTA, offset))
+            offset += size
+        self._add(entry)
+
+    def _content(self, content: StoredFile | bytes) -> bytes:
+        if isinstance(content, bytes):
+            return content
+        name = content.file
+        if name not in self._cache:
+            data = self._held[name] if name in self._held else self._read(content)
+            self._cache[name] = data
+            if len(self._cache) > _KEPT_FILES:
+                self._cache.popitem(last=False)
+        return self._cache[name]
+
+    def _read(self, entry: StoredFile) -> bytes:
+        if self._check:
+            return verified(self._store, entry)
+        data = self._store.get(entry.file)
+        if len(data) != entry.bytes:
+            raise StreamError(
+                f"{entry.file} in {self._store.name} has {len(data)} bytes; the manifest states {entry.bytes}."
+            )
+        return data
+
+
+def read_manifest(store: Store) -> Manifest:
+    """The manifest of a stream of segments.
+
+    Raises:
+        StreamError: there is none, or it is not valid.
+    """
+    if MANIFEST not in store.names():
+        raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
+    return manifest_from_json(store.get(MANIFEST), name=f"{MANIFEST} in {store.name}")

@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Segments are the bytes of the file sink in pieces, a reader of late finds everything, and a kill loses nothing."""
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from segment_streams import Hands, Killed, KilledStore, as_file, folder, header, packets, written
+from structgstream.codec.container.records import prefix
+from structgstream.codec.packets import PacketKind
+from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.archive import write_archive
+from structgstream.codec.segments.manifest import MANIFEST, Manifest
+from structgstream.codec.segments.recovery import find
+from structgstream.codec.segments.sink import SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
+from structgstream.codec.stored_segments import resume_segments
+from structgstream.errors import StorageError, StreamError
+
+SENT = packets(8)
+
+
+def archived(store: FolderStore) -> bytes:
+    path = store.folder.parent / "archive.sgs"
+    write_archive(store, path)
+    return path.read_bytes()
+
+
+def test_the_archive_is_the_file_that_the_file_sink_writes(tmp_path: Path) -> None:
+    store = folder(tmp_path / "out")
+    written(store, SENT)
+    assert archived(store) == as_file(SENT)
+    manifest = read_manifest(store)
+    assert [(entry.first_frame, entry.frames) for entry in manifest.segments] == [(0, 3), (3, 3), (6, 2)]
+    assert (manifest.live, manifest.parts, manifest.edge.frame) == (False, (), 7)
+    assert (manifest.name, manifest.fps, manifest.sequence) == ("test", 30.0, 9)
+    assert (manifest.frame_seconds, manifest.target_latency_seconds) == (1.0, 3.0)
+    assert len(os.listdir(tmp_path)) == 2
+
+
+def test_every_manifest_names_only_files_that_are_there_and_whole(tmp_path: Path) -> None:
+    """Also the one before it and, for the time of grace, all others."""
+    store = folder(tmp_path)
+    seen: list[Manifest] = []
+    whole = as_file(SENT)
+
+    def look(frame: int) -> None:
+        manifest = read_manifest(store)
+        assert manifest.live
+        assert (manifest.edge.frame, manifest.edge.published_unix_seconds) == (frame, 1.7e9 + frame + 1)
+        assert [part.kind for part in manifest.parts] == [PacketKind.KEY, *[PacketKind.DELTA] * 2][: frame % 3 + 1]
+        seen.append(manifest)
+        for earlier in seen:
+            stored = StoredBytes(store, earlier, check=True)
+            assert whole.startswith(stored[: len(stored)])
+        assert [one.sequence for one in seen] == [*range(1, frame + 2)]
+
+    written(store, SENT, after=look)
+
+
+def test_parts_stay_for_the_time_of_grace_and_then_go(tmp_path: Path) -> None:
+    store, hands = folder(tmp_path), Hands()
+    seen: list[list[int]] = []
+
+    def look(frame: int) -> None:
+        seen.append(sorted(int(name.split("-")[1]) for name in store.names() if name.startswith("part-")))
+
+    written(store, SENT, options=SegmentsOptions(grace_seconds=2.5), hands=hands, after=look)
+    # Frame 3 makes a segment of the first three; its parts are still there 2 seconds later, and not 3 seconds later.
+    assert seen[3:] == [[0, 1, 2, 3], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 5], [3, 4, 5, 6], [3, 4, 5, 6, 7]]
+
+
+def test_a_folder_reads_as_the_file_does(tmp_path: Path) -> None:
+    store = folder(tmp_path / "out")
+    written(store, SENT)
+    (tmp_path / "file.sgs").write_bytes(as_file(SENT))
+    expected = open_stream(tmp_path / "file.sgs")
+    for path in (store.folder, store.folder / MANIFEST):
+        for by_index in (False, True):
+            reader = open_stream(path, by_index=by_index)
+            assert (reader.complete, reader.runs, len(reader)) == (True, [range(8)], 8)
+            assert [*reader.packets] == [*expected.packets]
+            assert reader.total_bytes == expected.total_bytes
+            assert [p.payload for p in reader.group(5)] == [p.payload for p in SENT[5:6]]
+            reader.close()
+
+
+def test_a_stream_that_grows_is_read_up_to_its_edge(tmp_path: Path) -> None:
+    store = folder(tmp_path)
+
+    def look(frame: int) -> None:
+        reader = open_stream(tmp_path)
+        assert (len(reader), reader.complete) == (frame + 1, False)
+        assert reader.cut_reason == f"it ends at byte {reader.total_bytes} without an index"
+
+    written(store, SENT, after=look)
+
+
+def test_killed_at_any_operation_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    """Before and after each, once and again; what was reported written is there."""
+    whole = as_file(SENT)
+    counter = KilledStore(folder(tmp_path / "count"), at=10**9, done=True)
+    options = SegmentsOptions(grace_seconds=1.5)
+    written(counter, SENT, options=options)
+    assert any("delete part" in operation for operation in counter.operations)
+    for at in range(len(counter.operations)):
+        for done in (False, True):
+            store = folder(tmp_path / f"{at}-{done}")
+            reported: list[int] = []
+            for place in (at, at // 2 + 1):
+                with pytest.raises(Killed):
+                    written(KilledStore(store, place, done), SENT, options=options, after=reported.append)
+                    raise Killed  # The second run may end before its place.
+                store.prepare()
+                found = find(store)
+                edge = -1 if found is None else found.manifest.edge.frame
+                assert edge >= max(reported, default=-1)
+            written(store, SENT, options=options)
+            assert archived(store) == whole, (at, done)
+            assert not [name for name in os.listdir(store.folder) if name.startswith(".")]
+
+
+def test_an_orderly_stop_in_the_middle_of_a_group_goes_on_to_the_same_segments(tmp_path: Path) -> None:
+    whole = folder(tmp_path / "whole")
+    written(whole, SENT)
+    files = {entry.file for entry in read_manifest(whole).segments}
+    for stop in range(1, 9):
+        store = folder(tmp_path / f"{stop}")
+        options = SegmentsOptions(grace_seconds=0.5)
+        written(store, SENT[:stop], options=options)
+        assert (read_manifest(store).live, archived(store)) == (False, as_file(SENT[:stop]))
+        written(store, SENT, options=options)
+        assert archived(store) == as_file(SENT)
+        assert {entry.file for entry in read_manifest(store).segments} == files
+
+
+def test_a_torn_or_damaged_last_part_is_as_one_that_was_never_written(tmp_path: Path) -> None:
+    sink = SegmentsSink(folder(tmp_path / "out"))
+    sink.open(header())
+    for packet in SENT[:5]:
+        sink.write(packet)
+    for number, left in ((4, 4), (3, 3)):
+        shutil.copytree(tmp_path / "out", tmp_path / f"{number}")
+        store = folder(tmp_path / f"{number}")
+        manifest = read_manifest(store)
+        if number == 3:
+            with pytest.raises(StreamError, match="Continuing would lose the frames after it"):
+                _flip(store, manifest.parts[0].file)
+                find(store)
+            continue
+        _flip(store, manifest.parts[-1].file)
+        found = find(store)
+        assert found is not None
+        assert found.manifest.edge.frame == left - 1
+        written(store, SENT)
+        assert archived(store) == as_file(SENT)
+
+
+def _flip(store: FolderStore, name: str) -> None:
+    data = bytearray(store.get(name))
+    data[-5] ^= 1
+    store.put(name, bytes(data))
+
+
+def test_what_cannot_be_continued_is_refused_in_words(tmp_path: Path) -> None:
+    store = folder(tmp_path)
+    written(store, SENT)
+    manifest = read_manifest(store)
+    content = store.get(MANIFEST)
+    store.delete(MANIFEST)
+    with pytest.raises(StreamError, match="it has frames of a stream, but no manifest.json. Put it back"):
+        resume_segments(store)
+    with pytest.raises(StreamError, match=r"has no manifest\.json; expected a folder written with --sink segments"):
+        open_stream(tmp_path)
+    store.put(MANIFEST, content[:-9])
+    with pytest.raises(StreamError, match="is not JSON"):
+        resume_segments(store)
+    store.put(MANIFEST, content)
+    store.delete(manifest.segments[1].file)
+    with pytest.raises(StreamError, match="names segment-00000001-.*, which is missing"):
+        resume_segments(store)
+    with pytest.raises(StreamError, match="has no segment-00000001-.*, which its manifest names"):
+        open_stream(tmp_path)
+
+
+def test_archiving_verifies_hashes(tmp_path: Path) -> None:
+    store = folder(tmp_path / "out")
+    written(store, SENT)
+    name = read_manifest(store).segments[1].file
+    _flip(store, name)
+    with pytest.raises(StreamError, match=f"{name} in .* is damaged: it has .* bytes with the SHA-256"):
+        archived(store)
+    assert os.listdir(tmp_path) == ["out"]
+    reader = open_stream(store.folder)  # As a file with the same damage: what else is whole is shown.
+    assert reader.runs == [range(5), range(6, 8)]
+    store.put(name, b"short")
+    with pytest.raises(StreamError, match="has 5 bytes; the manifest states"):
+        open_stream(store.folder)
+
+
+def test_an_existing_stream_stays_unless_it_may_be_replaced(tmp_path: Path) -> None:
+    store = folder(tmp_path / "out")
+    written(store, SENT)
+    (store.folder / "notes.txt").write_text("mine")
+    with pytest.raises(StorageError, match="holds a stream; continue it with --resume, replace it with --overwrite"):
+        SegmentsSink(store).open(header())
+    assert archived(store) == as_file(SENT)
+    sink = SegmentsSink(store, overwrite=True)
+    sink.open(header())
+    assert sorted(name[:5] for name in os.listdir(store.folder)) == ["init-", "notes"]
+    sink.write(SENT[0])
+    assert read_manifest(store).sequence == 10  # Whoever waits for a newer manifest gets one.
+    sink.close()
+    sink.close()
+    assert archived(store) == as_file(SENT[:1])
+
+
+def test_nothing_begun_is_nothing_left_to_read(tmp_path: Path) -> None:
+    sink = SegmentsSink(folder(tmp_path))
+    sink.close()
+    sink.open(header())
+    sink.close()
+    assert resume_segments(folder(tmp_path))[1] is None
+    written(folder(tmp_path), SENT)
+    assert len(open_stream(tmp_path)) == 8
+
+
+def test_the_window_and_what_has_left_it(tmp_path: Path) -> None:
+    sent = packets(30)
+    store = folder(tmp_path / "out")
+    written(store, sent, options=SegmentsOptions(window_seconds=0.25, grace_seconds=4.5))
+    manifest = read_manifest(store)
+    # The edge is frame 29; a quarter of a second is 7.5 frames: frames 21 and later, so segments 7 to 9.
+    assert (manifest.window.first_segment, manifest.window.first_frame, manifest.window.seconds) == (7, 21, 0.25)
+    numbers = sorted(int(name.split("-")[1]) for name in store.names() if name.startswith("segment-"))
+    assert numbers == [0, *range(5, 10)]  # 0 is needed to resume, 5 and 6 left less than 4.5 s ago
+    reader = open_stream(store.folder)
+    assert (reader.runs, reader.complete, len(reader)) == ([range(3), range(15, 30)], True, 3)
+    assert reader.scene(29) is not None
+    with pytest.raises(StreamError, match=r"Frame 5 of .* has left the window"):
+        reader.scene(5)
+    with pytest.raises(StreamError, match="frames 3 to 14 have left its window"):
+        archived(store)
+
+
+def test_a_stream_with_a_window_is_continued_with_all_its_sizes(tmp_path: Path) -> None:
+    sent = packets(400)
+    whole, stopped = folder(tmp_path / "whole"), folder(tmp_path / "stopped")
+    options = SegmentsOptions(window_seconds=1.0, grace_seconds=5.0)
+    written(whole, sent, options=options)
+    hands = Hands()
+    written(stopped, sent[:200], options=options, hands=hands)
+    _, resumed = resume_segments(stopped)
+    assert resumed is not None
+    records = [len(packet.payload) + 12 for packet in sent[:200]]
+    assert [info.bytes for info in resumed.packets] == records
+    assert [info.kind for info in resumed.packets] == [packet.kind for packet in sent[:200]]
+    assert [packet.index for packet in resumed.group(199)] == [199]  # Codec raw; the sizes told the rest.
+    assert resumed.scene(0) is not None
+    written(stopped, sent, options=options, hands=hands)
+    one, other = read_manifest(whole), read_manifest(stopped)
+    assert (one.segments, one.history, one.window) == (other.segments, other.history, other.window)
+    assert {name for name in whole.names() if "part" not in name} == {
+        name for name in stopped.names() if "part" not in name
+    }
+
+
+def test_pages_are_read_where_segments_have_left_the_manifest(tmp_path: Path) -> None:
+    sent = packets(50, group=1)
+    store = folder(tmp_path / "out")
+    written(store, sent)
+    manifest = read_manifest(store)
+    assert [(page.level, page.segments) for page in manifest.history] == [(0, 32)]
+    assert [entry.segment for entry in manifest.segments] == [*range(32, 50)]
+    assert archived(store) == as_file(sent)
+    assert len(open_stream(store.folder)) == 50
+
+
+def test_a_disk_that_is_nearly_full_closes_the_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = folder(tmp_path / "out")
+    sink = SegmentsSink(store)
+    sink.open(header())
+    sink.write(SENT[0])
+    monkeypatch.setattr(FolderStore, "free_bytes", lambda self: 30_000)
+    with pytest.raises(StorageError, match="nearly full: 30000 bytes are left.* closed after 1 frames"):
+        sink.write(SENT[1])
+    sink.close()
+    assert archived(store) == as_file(SENT[:1])
+    monkeypatch.undo()
+    written(store, SENT)
+    assert archived(store) == as_file(SENT)
+
+
+def test_manifests_are_plain_json_with_the_keys_of_the_document(tmp_path: Path) -> None:
+    """docs/segments.md lists them."""
+    store = folder(tmp_path)
+    sink = SegmentsSink(store)
+    sink.open(header())
+    for packet in packets(40, group=1)[:33]:
+        sink.write(packet)
+    text = (Path(__file__).parents[3] / "docs" / "segments.md").read_text()
+    plain = json.loads(store.get(MANIFEST))
+    keys = {*plain, *plain["edge"], *plain["window"]}
+    for name in ("periods", "segments", "parts", "history"):
+        keys |= {key for entry in plain[name] for key in entry}
+    assert not {key for key in keys if not re.search(rf"[`.]{key}\b", text)}
+    assert store.get(plain["periods"][0]["file"]).startswith(prefix())
