@@ -52,12 +52,12 @@ class ServedStream:
         return open_below(self.root, self.name)
 
     def open_beside(self, suffix: str) -> OpenedFile | None:
-        """A file beside the stream: ``studio`` and ``suffix``, ``ball`` and ``suffix`` for ``ball.sgs``. Blocks.
+        """The file beside the stream that is named after it, with another suffix; None without one. Blocks.
 
         Raises:
             OSError: the system cannot open files now.
         """
-        return open_below(self.root, f"{self.name.removesuffix(STREAM_SUFFIX)}{suffix}")
+        return open_below(self.root, Path(self.name).with_suffix(suffix).name)
 
 
 class Catalog:
