@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fetching files as fast as a server gives them, over connections that are kept."""
 
+import getpass
 import hashlib
+import os
 import socket
 import statistics
 import threading
@@ -114,7 +116,8 @@ def nginx_configuration(folder: Path, work: Path, port: int) -> str:
     places = "\n".join(
         f"    {kind}_temp_path {work}/nginx-{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
     )
-    return f"""daemon off;
+    user = f"user {getpass.getuser()};\n" if os.geteuid() == 0 else ""  # else another user could not read the folder
+    return f"""{user}daemon off;
 worker_processes 1;
 pid {work}/nginx.pid;
 events {{ worker_connections 1024; }}

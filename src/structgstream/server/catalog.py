@@ -61,7 +61,7 @@ class ServedStream:
 
 
 class Catalog:
-    """The streams of a folder, looked for again when the last look is a second old. Methods block and are thread-safe.
+    """The streams of a folder, looked for again when the last look is a second old. Thread-safe.
 
     A folder that is itself a segments folder holds one stream: itself.
 
@@ -80,7 +80,8 @@ class Catalog:
         self._clock = clock
         self._lock = threading.Lock()
         self._looked_at = -float("inf")
-        self._streams: Mapping[str, ServedStream] = {}
+        self.found: Mapping[str, ServedStream] = {}
+        """The streams by their names, sorted, at the last look."""
         self.unnamed: tuple[str, ...] = ()
         """Names of streams that are not served because of characters in their names."""
         try:
@@ -88,16 +89,20 @@ class Catalog:
         except OSError as error:
             raise PlayerError(f"The folder {folder} cannot be read ({error.strerror}).") from None
 
-    def streams(self) -> Mapping[str, ServedStream]:
-        """The streams by their names, sorted.
+    @property
+    def stale(self) -> bool:
+        """Whether it is time to look again."""
+        return self._clock() - self._looked_at >= LOOK_AGAIN_SECONDS
+
+    def look(self) -> None:
+        """Looks for streams if it is time. Blocks.
 
         Raises:
             OSError: the folder cannot be read.
         """
         with self._lock:
-            if self._clock() - self._looked_at >= LOOK_AGAIN_SECONDS:
+            if self.stale:
                 self._look()
-            return self._streams
 
     def _look(self) -> None:
         if _has_manifest(self._folder):
@@ -106,7 +111,7 @@ class Catalog:
             with os.scandir(self._folder) as entries:
                 kinds = {entry.name: kind for entry in islice(entries, MOST_ENTRIES) if (kind := _kind(entry))}
             found = {name: ServedStream(self._folder, name, kinds[name]) for name in sorted(kinds)}
-        self._streams = {name: stream for name, stream in found.items() if is_stream_name(name)}
+        self.found = {name: stream for name, stream in found.items() if is_stream_name(name)}
         self.unnamed = tuple(name for name in found if not is_stream_name(name))
         self._looked_at = self._clock()
 

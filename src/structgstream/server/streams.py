@@ -2,7 +2,7 @@
 """The streams of a running server: their manifests, previews and cached files, and what is told about them."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from anyio import to_thread
@@ -38,11 +38,16 @@ class Streams:
 
     async def named(self, name: str) -> ServedStream | None:
         """The stream of this name, or None."""
-        return (await to_thread.run_sync(self._catalog.streams)).get(name)
+        return (await self._found()).get(name)
 
     async def all(self) -> list[ServedStream]:
         """All of them, sorted by their names."""
-        return list((await to_thread.run_sync(self._catalog.streams)).values())
+        return list((await self._found()).values())
+
+    async def _found(self) -> Mapping[str, ServedStream]:
+        if self._catalog.stale:
+            await to_thread.run_sync(self._catalog.look)
+        return self._catalog.found
 
     def watch(self, stream: ServedStream) -> ManifestWatch:
         """The one watcher of a stream of segments."""
