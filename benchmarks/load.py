@@ -22,6 +22,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from benchmarks.machine import load_average, machine
 
 NAME = "live"
 PATIENCE_SECONDS = 60.0
+SERVER_NICE = 5  # as in deploy/structgstream-serve.service
+PLAYERS_NICE = 19  # they stand for other machines
 
 
 class Watched:
@@ -60,9 +63,10 @@ class Watched:
 
 
 @contextmanager
-def process(*command: str, output: int | None = None) -> Iterator["subprocess.Popen[str]"]:
-    """A Python module in a process of its own, which ends with the block."""
-    running = subprocess.Popen([sys.executable, "-m", *command], stdout=output, text=True)
+def process(*command: str, output: int | None = None, nice: int = 0) -> Iterator["subprocess.Popen[str]"]:
+    """A Python module in a process of its own, with a lower priority by ``nice``, which ends with the block."""
+    lower = ["nice", "-n", str(nice)] if nice else []
+    running = subprocess.Popen([*lower, sys.executable, "-m", *command], stdout=output, text=True)
     try:
         yield running
     finally:
@@ -76,11 +80,17 @@ def serving(folder: Path) -> Iterator[tuple[str, int]]:
     """The server on a free port, with limits that a single address may use up; its address and its process."""
     limits = ("--connections", "2000", "--connections-per-address", "2000", "--requests-per-second", "100000")
     command = ("structgstream", "serve", str(folder), "--port", "0", "--no-previews", *limits)
-    with process(*command, output=subprocess.PIPE) as running:
+    with process(*command, output=subprocess.PIPE, nice=SERVER_NICE) as running:
         assert running.stdout is not None
         found = re.search(r"http://\S+/", running.stdout.readline())
         assert found, "the server tells its address"
         yield found[0], running.pid
+
+
+def processor_seconds(process: int) -> float:
+    """What a process has taken of the processor since it began."""
+    values = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(values[11]) + int(values[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def live(stream: Path, work: Path, options: argparse.Namespace) -> dict[str, Any]:
@@ -100,23 +110,23 @@ def live(stream: Path, work: Path, options: argparse.Namespace) -> dict[str, Any
                 began = time.monotonic()
                 counts = ("--fast", str(options.players - options.players // 2), "--slow", str(options.players // 2))
                 command = ("benchmarks.load_players", f"{address}streams/{NAME}/", *counts)
-                with process(*command, "--seconds", str(options.seconds), output=subprocess.PIPE) as players:
+                seconds = ("--seconds", str(options.seconds))
+                with process(*command, *seconds, output=subprocess.PIPE, nice=PLAYERS_NICE) as players:
                     assert players.stdout is not None
                     found = json.loads(players.stdout.read())
                 spans.append({"players": options.players, "span": (began, time.monotonic()), "found": found})
             trainer.send_signal(signal.SIGTERM)
             trainer.wait(PATIENCE_SECONDS)
-            usage = Path(f"/proc/{server}/stat").read_text().rsplit(")", 1)[1].split()
+            busy = processor_seconds(server)
     frames = [json.loads(line) for line in log.read_text().splitlines()]
     for one in spans:
         one["server_bytes"] = memory.most(one["span"])
-    ticks = os.sysconf("SC_CLK_TCK")
     return {
         "spans": [judged(one, frames, folder) for one in spans],
         "server": {
             "before_bytes": memory.samples[0][1],
             "most_bytes": memory.most(),
-            "processor_seconds": (int(usage[11]) + int(usage[12])) / ticks,
+            "processor_seconds": busy,
             "seconds": memory.samples[-1][0] - memory.samples[0][0],
         },
     }
@@ -200,19 +210,23 @@ def throughput(stream: Path, work: Path, options: argparse.Namespace) -> dict[st
         for kind, pattern in (("init", "init-*"), ("segments", "segment-*"), ("manifest", "manifest.json"))
     }
     found: dict[str, Any] = {kind: {} for kind in files}
-    with serving(folder) as (ours, _), static_python(folder) as python, static_nginx(folder, work) as nginx:
-        addresses = {"serve": f"{ours}streams/", "python -m http.server": python, **({"nginx": nginx} if nginx else {})}
+    with serving(folder) as (ours, us), static_python(folder) as python, static_nginx(folder, work) as nginx:
+        servers = {"serve": (f"{ours}streams/", us), "python -m http.server": python}
+        if nginx is not None:
+            servers["nginx"] = nginx
         for kind, names in files.items():
             for _ in range(options.turns):
-                for server, address in addresses.items():
+                for server, (address, number) in servers.items():
+                    before = processor_seconds(number)
                     outcome = fetched(address, names, connections=options.connections, seconds=options.turn_seconds)
-                    found[kind].setdefault(server, []).append(outcome)
+                    busy = processor_seconds(number) - before
+                    found[kind].setdefault(server, []).append(replace(outcome, busy_seconds=busy))
     return {kind: rates(outcomes, folder, files[kind]) for kind, outcomes in found.items()}
 
 
 @contextmanager
-def static_python(folder: Path) -> Iterator[str]:
-    """The standard library's server of a folder."""
+def static_python(folder: Path) -> Iterator[tuple[str, int]]:
+    """The standard library's server of a folder: its address and its process."""
     command = ("http.server", "0", "--bind", "127.0.0.1", "--directory", str(folder), "--protocol", "HTTP/1.1")
     running = subprocess.Popen(
         [sys.executable, "-u", "-m", *command], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -221,14 +235,14 @@ def static_python(folder: Path) -> Iterator[str]:
         assert running.stdout is not None
         found = re.search(r"http://\S+/", running.stdout.readline())
         assert found, "the server tells its address"
-        yield found[0]
+        yield found[0], running.pid
     finally:
         running.terminate()
         running.wait(PATIENCE_SECONDS)
 
 
 @contextmanager
-def static_nginx(folder: Path, work: Path) -> Iterator[str | None]:
+def static_nginx(folder: Path, work: Path) -> Iterator[tuple[str, int] | None]:
     """nginx with one process, as an ordinary static server; None where it is not installed."""
     program = shutil.which("nginx")
     if program is None:
@@ -243,7 +257,7 @@ def static_nginx(folder: Path, work: Path) -> Iterator[str | None]:
     try:
         time.sleep(1.0)
         assert running.poll() is None, (work / "nginx.log").read_text()
-        yield f"http://127.0.0.1:{port}/"
+        yield f"http://127.0.0.1:{port}/", running.pid
     finally:
         running.terminate()
         running.wait(PATIENCE_SECONDS)

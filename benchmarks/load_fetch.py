@@ -17,12 +17,16 @@ from urllib.parse import urlsplit
 
 @dataclass(frozen=True)
 class Fetched:
-    """What came in some time: bytes of bodies, answers, and the SHA-256 of each file when it came first."""
+    """What came in some time: bytes of bodies, answers, and the SHA-256 of each file when it came first.
+
+    ``busy_seconds`` are those of the server's process.
+    """
 
     seconds: float
     bytes: int
     answers: int
     digests: Mapping[str, str]
+    busy_seconds: float = 0.0
 
 
 def fetched(address: str, names: Sequence[str], *, connections: int, seconds: float) -> Fetched:
@@ -93,6 +97,7 @@ def rates(outcomes: Mapping[str, Sequence[Fetched]], folder: Path, names: Sequen
             server: {
                 "megabytes_per_second": statistics.median(speeds[server]),
                 "answers_per_second": statistics.median(one.answers / one.seconds for one in turns),
+                "busy_ms_an_answer": statistics.median(1000 * one.busy_seconds / one.answers for one in turns),
                 "serve_is_times": statistics.median(
                     mine / theirs for mine, theirs in zip(speeds["serve"], speeds[server], strict=True)
                 ),
@@ -112,13 +117,13 @@ def free_port() -> int:
 
 
 def nginx_configuration(folder: Path, work: Path, port: int) -> str:
-    """Of an nginx with one worker that serves a folder, and keeps its files in ``work``."""
+    """Of an nginx of one process that serves a folder, and keeps its files in ``work``."""
     places = "\n".join(
         f"    {kind}_temp_path {work}/nginx-{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
     )
     user = f"user {getpass.getuser()};\n" if os.geteuid() == 0 else ""  # else another user could not read the folder
     return f"""{user}daemon off;
-worker_processes 1;
+master_process off;
 pid {work}/nginx.pid;
 events {{ worker_connections 1024; }}
 http {{

@@ -19,8 +19,8 @@ def table(result: dict[str, Any]) -> str:
         f"Server: {live['server']['before_bytes'] / 1e6:.0f} MB before, {live['server']['most_bytes'] / 1e6:.0f} MB at "
         f"most; {live['server']['processor_seconds']:.1f} processor seconds in {live['server']['seconds']:.0f} s.",
         "",
-        "| files | server | MB/s | answers a second | serve is times | exact |",
-        "|---|---|---|---|---|---|",
+        "| files | server | MB/s | answers a second | processor ms an answer | serve is times (MB/s) | exact |",
+        "|---|---|---|---|---|---|---|",
         *(row for kind, found in result["throughput"].items() for row in _servers(kind, found)),
         "",
         f"Load average before {load['before']}, after {load['after']}.",
@@ -39,12 +39,15 @@ def _span(one: dict[str, Any]) -> str:
 
 def _ratio(spans: list[dict[str, Any]]) -> list[str]:
     """With players over without, of neighbouring spans."""
-    found = []
-    for alone, together in zip(spans[::2], spans[1::2], strict=True):
-        before, after = _median(alone["fit_seconds"]), _median(together["fit_seconds"])
-        if before and after:
-            found.append(after / before)
-    return [f"With players over without, round by round: {', '.join(f'{one:.3f}' for one in found)}.", ""]
+    lines = []
+    for what, name in (("seconds", "fit_seconds"), ("busy seconds", "busy_seconds")):
+        found = []
+        for alone, together in zip(spans[::2], spans[1::2], strict=True):
+            before, after = _median(alone[name]), _median(together[name])
+            if before and after:
+                found.append(after / before)
+        lines.append(f"{what} with players over without, round by round: {', '.join(f'{one:.2f}' for one in found)}")
+    return [f"Trainer's {'; '.join(lines)}.", ""]
 
 
 def _players(spans: list[dict[str, Any]]) -> list[str]:
@@ -69,6 +72,7 @@ def _servers(kind: str, found: dict[str, Any]) -> list[str]:
     files = f"{kind}, {size / 1e3:.0f} kB"
     return [
         f"| {files} | {server} | {one['megabytes_per_second']:.0f} | {one['answers_per_second']:.0f} | "
+        f"{one['busy_ms_an_answer']:.2f} | "
         f"{one['serve_is_times']:.2f} | {'yes' if one['exact'] else 'NO'} |"
         for server, one in found["servers"].items()
     ]
