@@ -76,11 +76,11 @@ def process(*command: str, output: int | None = None, nice: int = 0) -> Iterator
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[tuple[str, int]]:
+def serving(folder: Path, *, nice: int = 0) -> Iterator[tuple[str, int]]:
     """The server on a free port, with limits that a single address may use up; its address and its process."""
     limits = ("--connections", "2000", "--connections-per-address", "2000", "--requests-per-second", "100000")
     command = ("structgstream", "serve", str(folder), "--port", "0", "--no-previews", *limits)
-    with process(*command, output=subprocess.PIPE, nice=SERVER_NICE) as running:
+    with process(*command, output=subprocess.PIPE, nice=nice) as running:
         assert running.stdout is not None
         found = re.search(r"http://\S+/", running.stdout.readline())
         assert found, "the server tells its address"
@@ -101,7 +101,7 @@ def live(stream: Path, work: Path, options: argparse.Namespace) -> dict[str, Any
     spans: list[dict[str, Any]] = []
     with process("benchmarks.load_trainer", str(folder), str(stream), *trainer_options) as trainer:
         wait_for(folder / "manifest.json", trainer)
-        with serving(folder.parent) as (address, server), Watched(server) as memory:
+        with serving(folder.parent, nice=SERVER_NICE) as (address, server), Watched(server) as memory:
             time.sleep(2.0)
             for _ in range(options.rounds):
                 began = time.monotonic()
