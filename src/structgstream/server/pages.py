@@ -20,6 +20,9 @@ p{margin:0;padding:.5rem .75rem;display:flex;justify-content:space-between;gap:1
 .live{color:#d22;font-weight:600}
 </style>
 """
+REFRESH_SECONDS = 60
+"""After which the list is loaded again: streams come and end, and previews that were not ready are asked for."""
+
 LIST_POLICY = policy(frame_ancestors="'self'")
 
 
@@ -56,7 +59,8 @@ def list_page(streams: Sequence[Listed], *, query: str) -> str:
     """
     entries = "\n".join(_entry(stream, query) for stream in streams)
     body = f"<h1>Streams</h1>\n<ul>\n{entries}\n</ul>" if streams else "<h1>Streams</h1>\n<p>There is none yet.</p>"
-    return html_page("Streams", head=_STYLE, body=body, rules=policy())
+    refresh = f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">\n'
+    return html_page("Streams", head=refresh + _STYLE, body=body, rules=policy())
 
 
 def _entry(stream: Listed, query: str) -> str:
