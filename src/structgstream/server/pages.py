@@ -15,7 +15,7 @@ h1{font-size:1.25rem;font-weight:600;margin:0 0 1rem}
 ul{list-style:none;margin:0;padding:0;display:grid;gap:1rem;grid-template-columns:repeat(auto-fill,minmax(15rem,1fr))}
 a{display:block;color:inherit;text-decoration:none;border:1px solid #8884;border-radius:.5rem;overflow:hidden}
 a:hover,a:focus-visible{border-color:currentColor}
-img{display:block;width:100%;aspect-ratio:4/3;object-fit:cover;background:#8882}
+i{display:block;aspect-ratio:4/3;background:#8882 center/cover}
 p{margin:0;padding:.5rem .75rem;display:flex;justify-content:space-between;gap:1rem;overflow-wrap:anywhere}
 .live{color:#d22;font-weight:600}
 </style>
@@ -67,7 +67,8 @@ def _entry(stream: Listed, query: str) -> str:
     address = html.escape(f"streams/{stream.name}/")
     tail = html.escape(query)
     state = '<span class="live">live</span>' if stream.live else _duration(stream.seconds)
-    picture = f'<img src="{address}preview{tail}" alt="" loading="lazy">'
+    # A background, because a picture that is not ready yet would be shown as broken.
+    picture = f'<i style="background-image:url(&quot;{address}preview{tail}&quot;)"></i>'
     return f'<li><a href="{address}{tail}">{picture}<p><span>{html.escape(stream.name)}</span>{state}</p></a></li>'
 
 

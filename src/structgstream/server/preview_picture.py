@@ -115,8 +115,8 @@ def _read(stream: ServedStream, file: str, *, most: int) -> bytes:
 
 
 def main(arguments: list[str]) -> int:
-    """Renders, with the lowest priority; returns the exit status."""
-    os.nice(19)
+    """Renders, with a low priority; returns the exit status."""
+    os.nice(10)
     root, name, kind = arguments
     try:
         content = preview(ServedStream(Path(root), name, StreamKind(kind)))

@@ -3,7 +3,7 @@
 
 Note [Previews]
 ~~~~~~~~~~~~~~~
-A picture beside the stream is taken as it is. Otherwise a process of its own renders one, with the lowest priority and
+A picture beside the stream is taken as it is. Otherwise a process of its own renders one, with a low priority and
 one at a time, so that neither the server's loop nor its memory knows a decoder, and a trainer on the same machine
 hardly notices. It is rendered when someone asks, and again at the earliest after a minute and when there is another key
 frame; until then those who ask get the older picture. Who asks first waits a little and may have to ask again, as the
@@ -27,7 +27,7 @@ from structgstream.server.catalog import ServedStream, StreamKind
 
 AGAIN_SECONDS: Final = 60.0
 WAIT_SECONDS: Final = 5.0
-RENDER_SECONDS: Final = 120.0
+RENDER_SECONDS: Final = 300.0
 MOST_PICTURE_BYTES: Final = 2 * 10**6
 MOST_KEPT_BYTES: Final = 32 * 10**6
 MOST_QUEUED: Final = 32
