@@ -73,6 +73,8 @@ def process(*command: str, output: int | None = None, nice: int = 0) -> Iterator
         if running.poll() is None:
             running.terminate()
         running.wait(PATIENCE_SECONDS)
+        if running.stdout is not None:
+            running.stdout.close()
 
 
 @contextmanager
@@ -188,12 +190,19 @@ def _median(values: list[float | None]) -> float | None:
     return statistics.median(known) if known else None
 
 
+def listed(folder: Path, page: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The entries of all segments of a manifest or a history page, in order."""
+    for entry in page.get("history", ()):
+        yield from listed(folder, json.loads((folder / entry["file"]).read_bytes()))
+    yield from page.get("segments", ())
+
+
 def digests(folder: Path) -> dict[int, str]:
     """SHA-256 of the init record and the first so many frames, by their number."""
     manifest = json.loads((folder / "manifest.json").read_bytes())
     total = hashlib.sha256((folder / manifest["periods"][0]["file"]).read_bytes())
     found = {0: total.hexdigest()}
-    for entry in manifest["segments"]:
+    for entry in listed(folder, manifest):
         content, start = (folder / entry["file"]).read_bytes(), 0
         for number, size in enumerate(entry["frame_bytes"], entry["first_frame"] + 1):
             total.update(content[start : start + size])
@@ -239,6 +248,8 @@ def static_python(folder: Path) -> Iterator[tuple[str, int]]:
     finally:
         running.terminate()
         running.wait(PATIENCE_SECONDS)
+        if running.stdout is not None:
+            running.stdout.close()
 
 
 @contextmanager

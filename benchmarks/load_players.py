@@ -140,8 +140,12 @@ async def follow(address: str, got: Got, *, slow: bool) -> None:
 
 
 async def _catch_up(connection: Connection, manifest: dict[str, Any], got: Got, total: "hashlib._Hash") -> None:
-    """Gets the frames that a manifest lists and the player lacks."""
-    for entry in manifest["segments"]:
+    """Gets the frames that a manifest or a history page lists and the player lacks."""
+    for entry in manifest.get("history", ()):
+        if entry["first_frame"] + entry["frames"] > got.frames:
+            page = json.loads(await _checked(connection, entry, got))
+            await _catch_up(connection, page, got, total)
+    for entry in manifest.get("segments", ()):
         have = got.frames - entry["first_frame"]
         if have >= entry["frames"]:
             continue
@@ -154,7 +158,7 @@ async def _catch_up(connection: Connection, manifest: dict[str, Any], got: Got, 
             got.wrong += [f"part of {entry['file']}"] if len(rest) != entry["bytes"] - first else []
             total.update(rest)
         got.frames = entry["first_frame"] + entry["frames"]
-    for entry in manifest["parts"]:
+    for entry in manifest.get("parts", ()):
         if entry["frame"] == got.frames:
             total.update(await _checked(connection, entry, got))
             got.frames += 1

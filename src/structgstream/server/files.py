@@ -11,6 +11,7 @@ wait for its writer.
 import errno
 import os
 import stat
+import weakref
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
@@ -30,7 +31,7 @@ class FileStamp:
 
 @dataclass(frozen=True)
 class OpenedFile:
-    """A regular file at its length when it was opened."""
+    """A regular file at its length when it was opened. Dropping it closes it, too."""
 
     file: FileIO
     stamp: FileStamp
@@ -81,7 +82,11 @@ def open_below(folder: Path, *parts: str) -> OpenedFile | None:
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
         return None
-    return OpenedFile(FileIO(handle, "rb"), FileStamp(status.st_ino, status.st_mtime_ns, status.st_size))
+    file = FileIO(handle, "rb")
+    opened = OpenedFile(file, FileStamp(status.st_ino, status.st_mtime_ns, status.st_size))
+    # Requests are cancelled anywhere, also between opening in a thread and taking what was opened.
+    weakref.finalize(opened, file.close)
+    return opened
 
 
 def _opened(folder: Path, parts: tuple[str, ...]) -> int:
