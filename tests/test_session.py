@@ -67,9 +67,9 @@ def run(
     return list(Session(source, sink, pipeline, reference_backend(), resumed=resumed, metadata=metadata).run())
 
 
-def uninterrupted(frames: int = 5) -> bytes:
+def uninterrupted(frames: int = 5, config: StreamConfig = TINY_RIG) -> bytes:
     sink = MemorySink()
-    run(capture(frames), sink)
+    run(capture(frames), sink, config=config)
     return sink.data
 
 

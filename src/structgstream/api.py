@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError
@@ -33,7 +34,7 @@ from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import Preparation, prepare_capture
 from structgstream.preparation.steps import Listener
 from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
-from structgstream.recorder import check_output, record
+from structgstream.recorder import check_output, record, segments_at, segments_folder
 from structgstream.struct_gstream import stream_pipeline
 
 
@@ -101,6 +102,8 @@ def reconstruct(
     backend: Backend | BackendName = "auto",
     resume: bool = False,
     overwrite: bool = False,
+    sink: Literal["file", "segments"] = "file",
+    window_seconds: float | None = None,
     on_frame: Callable[[FrameReport], object] | None = None,
 ) -> list[FrameReport]:
     """Reconstructs a capture to a stream file, frame by frame; returns after the last frame is stored.
@@ -111,7 +114,7 @@ def reconstruct(
 
     Args:
         capture: the folder of a capture, or an opened one.
-        path: the stream file to write.
+        path: the stream file to write; the folder, if it is written as segments.
         preset: name of a preset, or a configuration (``dataclasses.replace`` on one of ``PRESETS``).
         quality: of compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.
         mbits: of compact streams: target rate in Mbit/s; None for constant quality.
@@ -125,6 +128,8 @@ def reconstruct(
         backend: the compute back-end; ``auto`` takes the first available of cuda, cpu, reference.
         resume: continue after the last whole frame of ``path``.
         overwrite: replace ``path`` if it exists.
+        sink: ``segments`` writes a folder of immutable files and a manifest (docs/segments.md).
+        window_seconds: of segments: how far viewers can go back; None keeps everything.
         on_frame: called with the report of each frame.
 
     Returns:
@@ -146,7 +151,12 @@ def reconstruct(
     if seed is not None:
         config = replace(config, seed=seed)
     path = Path(path)
-    check_output(path, may_exist=resume or overwrite)
+    storage = None
+    if sink == "segments":
+        store = segments_folder(path, may_exist=resume or overwrite)
+        storage = segments_at(store, options=SegmentsOptions(window_seconds))
+    else:
+        check_output(path, may_exist=resume or overwrite)
     metadata: dict[str, object] = {} if named is None else {"preset": named}
     if isinstance(capture, Path | str):
         source = open_capture(capture, held_out=held_out, scale=scale, start=start, frames=frames, near=near)
@@ -158,7 +168,8 @@ def reconstruct(
         )
     else:
         source = capture
-    run = record(path, source, stream_pipeline(config), select_backend(backend), resume=resume, metadata=metadata)
+    pipeline, chosen = stream_pipeline(config), select_backend(backend)
+    run = record(path, source, pipeline, chosen, resume=resume, storage=storage, metadata=metadata)
     reports = []
     with closing(run.reports) as recording:
         for report in recording:

@@ -8,16 +8,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from structgstream.codec.packets import PacketSink
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.store import FolderStore, Store
+from structgstream.codec.stored_segments import StoredSegments, resume_segments
 from structgstream.data.prefetch import Prefetch
 from structgstream.data.source import FrameSource
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import Memory, Pipeline, State
+from structgstream.pipeline import Memory, Pipeline, State, StoredStream
+from structgstream.scene.scene import Scene
 from structgstream.session import Session
 from structgstream.training.result import StepListener
 
+Storage = Callable[[bool], tuple[PacketSink, StoredStream[State] | None]]
+"""Opens a sink; when called with True, to continue what is there, of which it gives a reader."""
 LogExtras = Callable[[FrameReport], Mapping[str, Any]]
 """Further entries of a frame's line in the log."""
 
@@ -42,11 +50,12 @@ def record(
     backend: Backend,
     *,
     resume: bool = False,
+    storage: Storage[State] | None = None,
     metadata: Mapping[str, object] | None = None,
     on_step: StepListener | None = None,
     remarks: LogExtras | None = None,
 ) -> Run:
-    """Reconstructs a capture into a file, with a log beside it.
+    """Reconstructs a capture into a file or other storage, with a log beside it.
 
     The call checks an existing file and starts the log; the file is written as the reports are consumed.
 
@@ -56,6 +65,7 @@ def record(
         pipeline: fits and stores frames.
         backend: the compute back-end.
         resume: continue after the last whole frame of an existing file.
+        storage: opens another sink than a file at ``path``, such as :func:`segments_at`.
         metadata: plain JSON values for the header, equal in all runs of a stream.
         on_step: called after every optimisation step.
         remarks: see :data:`LogExtras`.
@@ -65,7 +75,10 @@ def record(
         StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
         StorageError: the file or the log cannot be written; whole frames stay in the file.
     """
-    sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
+    if storage is None:
+        sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
+    else:
+        sink, resumed = storage(resume)
     session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
     return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
@@ -99,6 +112,36 @@ def _append_reports(
             yield report
 
 
+def segments_at(
+    store: Store, *, options: SegmentsOptions | None = None, clocks: Clocks | None = None
+) -> Storage[Scene]:
+    """Segments in a store, for :func:`record`; what is there is replaced unless it is resumed."""
+
+    def opened(resume: bool) -> tuple[SegmentsSink, StoredSegments | None]:
+        if resume:
+            return resume_segments(store, options=options, clocks=clocks)
+        return SegmentsSink(store, overwrite=True, options=options, clocks=clocks), None
+
+    return opened
+
+
+def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
+    """The folder of a stream of segments, made if it is not there, checked before frame 0 is fitted for minutes.
+
+    Raises:
+        StorageError: it holds a stream, cannot be made or written, or another process writes to it.
+    """
+    store = FolderStore(path)
+    store.make()
+    store.lock()
+    store.prepare()
+    if MANIFEST in store.names() and not may_exist:
+        raise StorageError(
+            f"{path} holds a stream; continue it with --resume, replace it with --overwrite, or choose another name."
+        )
+    return store
+
+
 def check_output(path: Path, *, may_exist: bool) -> None:
     """Check that the stream can be written, before frame 0 is fitted for minutes.
 
@@ -106,7 +149,9 @@ def check_output(path: Path, *, may_exist: bool) -> None:
         StorageError: the file exists, its folder cannot be created, or there is no permission to write.
     """
     if path.is_dir():
-        raise StorageError(f"{path} is a folder; give the name of a file, such as {path / 'scene.sgs'}.")
+        raise StorageError(
+            f"{path} is a folder; give the name of a file, such as {path / 'scene.sgs'}, or add --sink segments."
+        )
     if path.exists() and not may_exist:
         raise StorageError(
             f"{path} exists; continue it with --resume, replace it with --overwrite, or choose another name."

@@ -4,11 +4,13 @@ import io
 import struct
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
+from structgstream.codec.container import disk_room
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind
@@ -152,6 +154,32 @@ def test_an_interrupted_write_is_replaced_by_the_index(tmp_path: Path, disk: typ
     expected = MemorySink()
     write_stream(expected, SCENES[:1])
     assert sink.path.read_bytes() == expected.data
+
+
+def test_a_disk_that_is_nearly_full_is_told_of_and_the_stream_gets_its_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three packets and the header are kept free."""
+    free = {"bytes": 10**9}
+    monkeypatch.setattr(disk_room.shutil, "disk_usage", lambda path: SimpleNamespace(free=free["bytes"]))
+    sink = FileSink(tmp_path / "a.sgs")
+    header_bytes = sink.open(header_for(SCENES[0]))
+    size = sink.write(packets()[0])
+    free["bytes"] = header_bytes + 3 * size
+    with pytest.raises(StorageError, match=rf"nearly full: {free['bytes']} bytes are left.* closed after 1 frames"):
+        sink.write(packets()[1])
+    sink.close()
+    expected = MemorySink()
+    write_stream(expected, SCENES[:1])
+    assert sink.path.read_bytes() == expected.data
+    free["bytes"] = 10**9
+    again, reader = FileSink.resume(sink.path)
+    assert reader is not None
+    again.open(reader.header)
+    for packet in packets()[1:]:
+        again.write(packet)
+    again.close()
+    assert sink.path.read_bytes() == small_stream()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/dev/full is Linux's")

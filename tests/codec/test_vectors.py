@@ -17,12 +17,15 @@ import zstandard
 
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
+from structgstream.codec.segments.stored_bytes import open_segments
 from structgstream.scene.state import state_of
 from vectors.generate import (
     COMPACT_EXPECTED,
     COMPACT_STEPS,
     COMPACT_STREAM,
     EXPECTED,
+    SEGMENTS,
     STREAM,
     SUMS,
     compact_header,
@@ -54,7 +57,7 @@ def test_the_files_are_those_that_were_published() -> None:
     assert STREAM.stat().st_size < 20_000
     assert COMPACT_STREAM.stat().st_size < 20_000
     lines = SUMS.read_text().splitlines()
-    assert len(lines) == 4
+    assert len(lines) == 4 + len(list(SEGMENTS.iterdir()))
     for line in lines:
         digest, name = line.split()
         assert hashlib.sha256((STREAM.parent / name).read_bytes()).hexdigest() == digest, name
@@ -120,3 +123,17 @@ def test_today_s_reader_understands_the_golden_header() -> None:
     assert header.rig.held_out == {"middle"}
     assert header.rig["right"].viewmat[0].tolist() == [1.0, 0.0, 0.0, -1.0]
     assert header.rig["left"].K.flatten().tolist() == [40.0, 0, 24, 0, 40.25, 16, 0, 0, 1]
+
+
+def test_the_golden_segments_are_the_beginning_of_the_golden_stream() -> None:
+    """docs/segments.md: init record, segments, parts; version 1 of the manifest must be readable for ever."""
+    with open_stream(SEGMENTS) as reader, open_stream(COMPACT_STREAM) as whole:
+        assert [*reader.packets] == [*whole.packets]
+        assert not reader.complete
+        assert all(state_of(reader.scene(i)).keys() == state_of(whole.scene(i)).keys() for i in range(6))
+    with open_segments(SEGMENTS) as stored:
+        assert COMPACT_STREAM.read_bytes().startswith(stored[:])
+    manifest = manifest_from_json((SEGMENTS / "manifest.json").read_bytes(), name="manifest.json")
+    assert (len(manifest.segments), len(manifest.parts), manifest.live) == (1, 3, True)
+    assert manifest_to_json(manifest) == (SEGMENTS / "manifest.json").read_bytes()
+    assert {*manifest.files, "manifest.json"} == {path.name for path in SEGMENTS.iterdir()}

@@ -20,6 +20,9 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.sink import Clocks, SegmentsSink
+from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
@@ -28,6 +31,7 @@ from structgstream.similarity import Similarity
 FOLDER = Path(__file__).parent
 STREAM, EXPECTED, SUMS = (FOLDER / name for name in ("version-2.sgs", "version-2.json", "SHA256SUMS"))
 COMPACT_STREAM, COMPACT_EXPECTED = (FOLDER / f"version-2-compact.{suffix}" for suffix in ("sgs", "json"))
+SEGMENTS = FOLDER / "segments-1"
 ANCHORS, K, FEATURES, HIDDEN = 3, 2, 2, 3
 KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.KEY)
 COMPACT_KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA)
@@ -215,6 +219,22 @@ def compact_stream() -> bytes:
     return streamed(compact_header(), [compact_scene(i) for i in range(len(COMPACT_KINDS))], COMPACT_KINDS)
 
 
+def write_segments(folder: Path) -> None:
+    """The stream of codec ``compact`` while it is made: a segment of the first group, parts of the second."""
+    store = FolderStore(folder)
+    store.prepare()
+    reader = open_stream(COMPACT_STREAM)
+    seconds = iter(range(100))
+    sink = SegmentsSink(store, clocks=Clocks(wall=lambda: 1.7e9 + next(seconds), captured=lambda frame: 1.6e9 + frame))
+    sink.open(reader.header)
+    for index in range(len(reader)):
+        (*_, packet) = reader.group(index)
+        sink.write(packet)
+    for name in store.names():
+        if name.startswith("part-") and int(name.split("-")[1]) < 3:
+            store.delete(name)
+
+
 def main() -> None:
     """Write what is missing, and the sums of all."""
     raw, compact = [golden_scene(i) for i in range(3)], [compact_scene(i) for i in range(6)]
@@ -227,7 +247,11 @@ def main() -> None:
     for path, data in files.items():
         if not path.exists():
             path.write_bytes(data)
-    SUMS.write_text("".join(f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in files))
+    if not SEGMENTS.exists():
+        write_segments(SEGMENTS)
+    found = [*files, *sorted(SEGMENTS.iterdir())]
+    sums = [(hashlib.sha256(path.read_bytes()).hexdigest(), path.relative_to(FOLDER)) for path in found]
+    SUMS.write_text("".join(f"{digest}  {name}\n" for digest, name in sums))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
+from structgstream.cli.termination import Terminated
 from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
@@ -26,6 +27,7 @@ COMMANDS = {
     "token": "make an access token for a served stream",
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .splat, .spz",
+    "archive": "turn a folder of segments into one stream file",
     "inspect": "show the content of a stream file",
     "doctor": "show available back-ends and packages, and how to install missing ones",
 }
@@ -33,7 +35,7 @@ ENTRY_POINTS = "structgstream.commands"
 """Entry-point group for other distributions' commands: packages with ``COMMANDS`` and a module with ``main`` each."""
 STUDIES = ("ablate", "compare")
 """Commands of the distribution structgstream-studies, which is installed separately."""
-DONE, PROBLEM, USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, PROBLEM, USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
 
 class UsageError(Exception):
@@ -58,7 +60,7 @@ def usage_errors() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns the exit status: 0 done, 1 an error, 2 wrong usage, 130 interrupted."""
+    """Runs one command and returns the exit status: 0 done, 1 an error, 2 wrong usage, 130 Ctrl-C, 143 SIGTERM."""
     # Spinning OpenMP threads slow each other down on a machine with other load. OpenMP reads this once, when torch is
     # loaded, so it is set before any command imports it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -83,6 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, Interrupted) as error:
         _say(f"\nInterrupted. {error}".rstrip())
         return INTERRUPTED
+    except Terminated as error:
+        _say(f"\nTerminated. {error}")
+        return TERMINATED
     except BrokenPipeError:
         # The reader of our output has exited (`| head`). Python would raise again while it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -21,6 +21,7 @@ OPTIONAL = (
     ("matplotlib", "matplotlib", "report", "plots, contact sheets"),
     ("starlette", "starlette", "serve", "command play"),
     ("uvicorn", "uvicorn", "serve", "command play"),
+    ("s3fs", "s3fs", "cloud", "publish segments to S3"),
     ("anywidget", "anywidget", "notebook", "player in notebooks"),
     ("gsplat", "gsplat", "cuda", "back-end cuda"),
 )

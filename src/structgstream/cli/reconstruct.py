@@ -4,6 +4,7 @@
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,11 +21,15 @@ from structgstream.cli.options import (
     resolve_config,
 )
 from structgstream.cli.progress import display, human_bytes
+from structgstream.cli.segment_options import SegmentOptions
+from structgstream.cli.termination import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
+    from structgstream.recorder import Storage
+    from structgstream.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -32,20 +37,23 @@ class Reconstruct:
     """Turns a capture into a stream, one frame after the other.
 
     The file can be read while it grows: structgstream play OUT.sgs --wait shows each frame when it is done. After
-    Ctrl-C, --resume continues after the last whole frame. Seconds by stage and memory of each frame are written to
-    OUT.log.jsonl. Any field of the configuration is an option by its path: --online.iterations 50 (see --help-config).
+    Ctrl-C, --resume continues after the last whole frame; SIGTERM finishes the frame first (status 143). Seconds by
+    stage and memory of each frame are written to OUT.log.jsonl. Any field of the configuration is an option by its
+    path: --online.iterations 50 (see --help-config).
 
     Example: structgstream reconstruct basketball -o ball.sgs --frames 20 --held-out 0 10 15 30
 
     Example: structgstream reconstruct basketball -o ball.sgs --preset fast --scale 0.5 --online.iterations 40
 
     Example: structgstream reconstruct basketball -o ball.sgs --mbits 5
+
+    Example: structgstream reconstruct basketball -o ball --sink segments --window 600
     """
 
     scene: tyro.conf.Positional[Folder]
     """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
-    """The stream file to write."""
+    """The stream file to write; with --sink segments, a folder."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default: small packets), rig (the paper on any rig), motion (as rig, trains only movers), fast (compact
     in minutes), paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
@@ -58,12 +66,13 @@ class Reconstruct:
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Random seed. Default: the preset's."""
     resume: bool = False
-    """Continue after the last whole frame of OUT.sgs. The same options give the file of an uninterrupted run."""
+    """Continue after the last whole frame of OUT. The same options give the bytes of an uninterrupted run."""
     overwrite: bool = False
-    """Replace OUT.sgs when it exists."""
+    """Replace OUT when it exists."""
     help_config: bool = False
     """List the fields of the configuration with the preset's values."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
+    segments: SegmentOptions = field(default_factory=SegmentOptions)
 
 
 def main(arguments: list[str]) -> None:
@@ -74,23 +83,29 @@ def main(arguments: list[str]) -> None:
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)
-    from structgstream.presets import departures, with_budget
-    from structgstream.recorder import check_output
+    from structgstream.presets import with_budget
 
     with usage_errors():
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
-    check_output(options.output, may_exist=options.resume or options.overwrite)
+    console = Console()
+    may_exist = options.resume or options.overwrite
+    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(_say, console)) as storage:
+        _reconstruct(options, config, preset=preset, storage=storage, console=console)
+    _say(console, f"Wrote {options.output}")
+
+
+def _reconstruct(
+    options: Reconstruct, config: "StreamConfig", *, preset: str, storage: "Storage[Scene] | None", console: Console
+) -> None:
     from structgstream.kernels.backend import select_backend
+    from structgstream.presets import departures
 
     source = open_selected_capture(options.scene, options.capture)
     backend = select_backend(options.device)
-    console = Console()
-    console.print(
+    _say(
+        console,
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
         f"{', '.join(source.rig.testing) or 'none'}; {len(source)} frames; preset {preset}, back-end {backend.name}.",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
     )
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
@@ -101,11 +116,15 @@ def main(arguments: list[str]) -> None:
         backend=backend,
         metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
         resume=options.resume,
+        storage=storage,
     )
     if peaks:
         stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
-        console.print(f"Peak memory by stage: {stages}.", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Wrote {options.output}", highlight=False, markup=False, soft_wrap=True)
+        _say(console, f"Peak memory by stage: {stages}.")
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def run_reconstruction(
@@ -116,14 +135,16 @@ def run_reconstruction(
     backend: "Backend",
     metadata: Mapping[str, object],
     resume: bool = False,
+    storage: "Storage[Scene] | None" = None,
 ) -> dict[str, int]:
-    """Reconstructs ``source`` into the file ``output``, replacing what is there unless it is resumed.
+    """Reconstructs ``source`` into the file ``output`` or other storage, replacing what is there unless it is resumed.
 
     Returns:
         the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
 
     Raises:
         Interrupted: the user pressed Ctrl-C; whole frames stay in the file.
+        Terminated: SIGTERM came; the frame that was being fitted is in the file, too.
         StructGStreamError: any other error; whole frames stay in the file.
     """
     from structgstream.recorder import record
@@ -135,22 +156,26 @@ def run_reconstruction(
         stream_pipeline(config),
         backend,
         resume=resume,
+        storage=storage,
         metadata=metadata,
         on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
     )
     done = run.done
     peaks: dict[str, int] = {}
     try:
-        with display(len(source), done=done) as progress, closing(run.reports) as reports:
+        with Termination() as ending, display(len(source), done=done) as progress, closing(run.reports) as reports:
             for report in reports:
                 on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
                 for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
                     peaks[stage] = max(size, peaks.get(stage, 0))
                 progress.frame(report)
                 done = report.index + 1
-    except KeyboardInterrupt:
+                if ending.asked and done < len(source):
+                    raise Terminated
+    except (KeyboardInterrupt, Terminated) as error:
         kept = f"{output} has {done} of {len(source)} frames; continue with the same command and --resume."
-        raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None
+        ended = Terminated if isinstance(error, Terminated) else Interrupted
+        raise ended(kept if done else "No frame was done, so nothing was written.") from None
     return peaks
 
 

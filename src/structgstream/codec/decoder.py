@@ -6,7 +6,7 @@ from collections.abc import Set
 from torch import Tensor
 
 from structgstream.codec.container.blocks import coded_payloads, unpack_raw_blocks
-from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.packets import Packet, StreamHeader
 from structgstream.codec.scene.compact import CompactDecoder, CompactState
 from structgstream.codec.scene.shapes import check_shapes

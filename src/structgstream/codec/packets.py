@@ -3,15 +3,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
 from typing import Any, Protocol
 
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.codec.packet_kind import PacketKind
 from structgstream.errors import ConfigError
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity
+
+__all__ = ["Packet", "PacketKind", "PacketSink", "StreamHeader"]
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,6 @@ class StreamHeader:
                 raise ConfigError(f"The stream has no camera {camera!r}; it has {', '.join(self.rig)}.")
             camera = self.rig[camera]
         return self.similarity.camera(camera)
-
-
-class PacketKind(IntEnum):
-    """A key packet needs only the header; a delta packet also needs the packet before it."""
-
-    KEY = 1
-    DELTA = 2
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ from structgstream.codec.container.byte_source import ByteSlice, ByteSource, Fil
 from structgstream.codec.container.damage import Damage, PacketSearch, next_index
 from structgstream.codec.container.index import read_index_offsets
 from structgstream.codec.container.init_record import field_sizes
-from structgstream.codec.container.payload import FRAME, parse_packet
+from structgstream.codec.container.packet_head import FRAME
+from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import (
     CHECKSUM,
     PREFIX,
@@ -43,9 +44,7 @@ from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.frame_renderer import FrameRenderer
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind
-from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
+from structgstream.codec.segments.stored_bytes import is_segments, open_segments
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName
 from structgstream.scene.scene import Scene
@@ -370,10 +369,8 @@ def open_stream(path: Path | str, *, by_index: bool = False) -> StreamReader:
     Raises:
         StreamError: there is no such file, or it is not a stream.
     """
-    path = Path(path)
-    if path.name == MANIFEST or path.is_dir():
-        store = FolderStore(path.parent if path.name == MANIFEST else path)
-        stored = StoredBytes(store, read_manifest(store))
+    if is_segments(path):
+        stored = open_segments(path)
         return StreamReader(stored, name=str(path), by_index=by_index, gone=stored.gone)
     data = FileBytes(path)
     if not len(data):

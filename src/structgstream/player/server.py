@@ -19,6 +19,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from structgstream.codec.container.byte_source import FileBytes
+from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import CaptureError, StreamError
 from structgstream.player.bundle import bundle
 from structgstream.player.byte_range import requested_part
@@ -111,7 +112,7 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
     return StreamingResponse(_closing(data, part.wanted), part.status, headers, "application/octet-stream")
 
 
-def _closing(data: FileBytes, wanted: range) -> Iterator[bytes | memoryview]:
+def _closing(data: FileBytes | StoredBytes, wanted: range) -> Iterator[bytes | memoryview]:
     with data, suppress(StreamError):  # If the file becomes shorter meanwhile, the response ends early.
         yield from pieces(data, wanted)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A possibly growing stream file for the server, which does not decode packets."""
+"""A possibly growing stream for the server, which does not decode packets: a file, or a folder of segments."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from structgstream.codec.container.records import (
     incomplete_reason,
     read_head,
 )
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments
 from structgstream.errors import StreamError
 
 PIECE_BYTES = 256 * 1024
@@ -21,17 +23,25 @@ PIECE_BYTES = 256 * 1024
 
 @dataclass(frozen=True)
 class StreamFile:
-    """The file at ``path``; every method opens it anew, because it may be replaced at any time."""
+    """The file or folder at ``path``; every method opens it anew, because it may be replaced at any time."""
 
     path: Path
 
-    def opened(self) -> FileBytes:
-        """The open file at its present length.
+    def opened(self) -> FileBytes | StoredBytes:
+        """The open stream at its present length.
 
         Raises:
-            StreamError: it cannot be read.
+            StreamError: it cannot be read, or frames of it have left the window.
         """
-        return FileBytes(self.path)
+        if not is_segments(self.path):
+            return FileBytes(self.path)
+        stored = open_segments(self.path)
+        if stored.gone:
+            raise StreamError(
+                f"{self.path} keeps a window, and its first frames have left it; it cannot be shown as one file. Show "
+                "it with structgstream serve."
+            )
+        return stored
 
     def state(self) -> tuple[int, bool]:
         """Length of the file in bytes, and whether it is complete (has its index).
@@ -53,7 +63,8 @@ class StreamFile:
         Raises:
             StreamError: it is no stream, or of another version.
         """
-        if not self.path.exists():
+        manifest = self.path if self.path.name == MANIFEST else self.path / MANIFEST
+        if not (manifest if is_segments(self.path) else self.path).exists():
             return False
         with self.opened() as data:
             if len(data) < PREFIX.size:

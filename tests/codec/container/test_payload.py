@@ -37,3 +37,12 @@ def test_a_payload_that_is_cut() -> None:
         parse_packet(payload[:11], PacketKind.KEY)
     with pytest.raises(StreamError, match="Packet 0 "):
         parse_packet(payload[:-1], PacketKind.KEY)
+
+
+def test_a_stream_that_is_as_long_as_it_can_be() -> None:
+    """Identities of births are frame * 2^32 + number, of 63 bits: 2.27 years at 30 frames a second."""
+    assert packet_from_blocks(BLOCKS, index=2**31 - 1, pts_seconds=7e7, kind=PacketKind.KEY).index == 2**31 - 1
+    assert ((2**31 - 1) << 32) + 2**32 - 1 < 2**63
+    assert 2.26 < 2**31 / 30 / 86400 / 365.25 < 2.28
+    with pytest.raises(StreamError, match="A stream has at most 2147483648 frames; begin another one"):
+        packet_from_blocks(BLOCKS, index=2**31, pts_seconds=7e7, kind=PacketKind.KEY)

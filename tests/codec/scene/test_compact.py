@@ -17,7 +17,8 @@ from properties import examples
 from rigs import random_scene
 from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 from structgstream.codec.container.blocks import coded_payloads
-from structgstream.codec.container.payload import FRAME, parse_packet
+from structgstream.codec.container.packet_head import FRAME
+from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import RECORD, RecordType, scan_records
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder

@@ -3,6 +3,8 @@
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -85,3 +87,22 @@ def test_names_of_the_sink_are_known() -> None:
     ours = [f"part-00000012-{sixteen}.sgs", f"init-0000-{sixteen}.sgs", f"history-00000000-{sixteen}.json"]
     assert all(map(is_ours, [*ours, f"segment-123456789-{sixteen}.sgs", "manifest.json"]))
     assert not any(map(is_ours, ["notes.txt", "part-1.sgs", f"x{ours[0]}", f"{ours[0]}x", f"{ours[0]}\n", ".new-x"]))
+
+
+def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
+    """The lock ends with the process, however that ends."""
+    store = FolderStore(tmp_path)
+    child = (
+        "import sys; from structgstream.codec.segments.store import FolderStore; store = FolderStore(sys.argv[1]);"
+        "store.lock(); print('locked', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", child, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"locked\n"
+        with pytest.raises(StorageError, match="Another process writes to .*; wait for its end"):
+            store.lock()
+        other.kill()
+    store.lock()
+    FolderStore(tmp_path).lock()
+    assert store.names() == frozenset()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from structgstream.codec.container.byte_source import ByteSource
 from structgstream.codec.container.index import INDEX_ENTRY
-from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.container.records import CHECKSUM, RECORD, Record, RecordType, read_head, read_record
 
 LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size

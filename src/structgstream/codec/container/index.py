@@ -6,7 +6,7 @@ from array import array
 from collections.abc import Iterable
 
 from structgstream.codec.container.byte_source import ByteSource
-from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.container.records import (
     CHECKSUM,
     FOOTER,

@@ -2,21 +2,29 @@
 """The payload of a packet's record: frame index, presentation time, field blocks."""
 
 import math
-import struct
 from collections.abc import Mapping
 
 from structgstream.codec.container.blocks import iterate_blocks
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
-FRAME = struct.Struct("<Id")  # index, presentation time in seconds
+MAX_FRAMES = 2**31
+"""Frames of a stream."""
 
 
 def packet_from_blocks(
     blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind
 ) -> Packet:
-    """The packet of a frame with these field blocks, in this order."""
+    """The packet of a frame with these field blocks, in this order.
+
+    Raises:
+        StreamError: the stream is as long as it can be.
+    """
+    # The identity of a birth is frame * 2^32 + number, of 63 bits. 2^31 frames are 2.27 years at 30 frames a second.
+    if index >= MAX_FRAMES:
+        raise StreamError(f"A stream has at most {MAX_FRAMES} frames; begin another one.")
     payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())
     return Packet(kind, index, pts_seconds, payload, {name: len(block) for name, block in blocks.items()})
 

@@ -3,9 +3,9 @@
 
 from collections.abc import Sequence
 
-from structgstream.codec.container.payload import FRAME
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.container.records import RecordType, read_record
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.manifest import PartEntry, SegmentEntry, part_name, segment_name, sha256_of
 from structgstream.errors import StreamError
 

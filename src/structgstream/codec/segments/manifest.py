@@ -5,7 +5,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Protocol
 
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packet_kind import PacketKind
 
 FORMAT = "structgstream-segments"
 VERSION = 1

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.manifest import (
     FORMAT,
     VERSION,

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
 from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.group import part_of
 from structgstream.codec.segments.history import verified
 from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, PartEntry, PeriodEntry, sha256_of

@@ -108,7 +108,7 @@ class SegmentsSink:
         self._found = found
         self._draft: Draft | None = None
         self._present: list[SegmentEntry] = []  # segments in the window, if there is one
-        self._leaving: deque[tuple[float, str]] = deque()  # files that no manifest names, and since when
+        self._leaving: dict[str, float] = {}  # files that no manifest names, and since when; oldest first
         self._published: deque[float] = deque(maxlen=_RECENT_FRAMES + 1)
         self._header_bytes = self._largest = 0
 
@@ -189,7 +189,7 @@ class SegmentsSink:
             first = manifest.window.first_segment
             self._present = [*segments_from(self._store, manifest.history, manifest.segments, first=first)]
         now = self._clocks.elapsed()
-        self._leaving.extend((now, name) for name in sorted(stale_files(manifest, there)))
+        self._leaving = dict.fromkeys(sorted(stale_files(manifest, there)), now)
         self._publish(replace(found, manifest=replace(manifest, live=True)), [])
 
     def _remove(self, there: frozenset[str]) -> int:
@@ -254,13 +254,12 @@ class SegmentsSink:
     def _forget(self, leaving: Iterable[str]) -> None:
         """Remember that files are no longer named; remove those for which that has been so for long enough."""
         now = self._clocks.elapsed()
-        self._leaving.extend((now, name) for name in leaving)
-        named = {part.file for part in self._opened().manifest.parts}
-        while self._leaving and self._leaving[0][0] <= now - self._options.grace_seconds:
-            name = self._leaving.popleft()[1]
-            if name not in named:  # A resumed run may name parts of the run before again.
-                with suppress(StorageError):  # It is found again when the stream is resumed.
-                    self._store.delete(name)
+        self._leaving |= dict.fromkeys(leaving, now)
+        late = now - self._options.grace_seconds
+        for name in [name for name, since in self._leaving.items() if since <= late]:
+            del self._leaving[name]
+            with suppress(StorageError):  # It is found again when the stream is resumed.
+                self._store.delete(name)
 
     def _check_room(self, draft: Draft, size: int) -> None:
         self._largest = max(self._largest, size)
@@ -278,6 +277,8 @@ class SegmentsSink:
         try:
             for name, data in files:
                 self._store.put(name, data)
+                # What a killed run had written too early may come again under the same name, and then stays.
+                self._leaving.pop(name, None)
         except StorageError as error:
             frames = 0 if self._draft is None else self._draft.manifest.edge.frame + 1
             raise StorageError(

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a stream's segments lie: a folder here; an object store in ``cloud_store``."""
 
+import errno
+import fcntl
 import os
 import re
+import weakref
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
@@ -11,6 +14,7 @@ from structgstream.codec.container.disk_room import free_bytes
 from structgstream.errors import StorageError, StreamError
 
 _TEMPORARY = ".new-"
+_LOCK = ".writer"
 _OURS = re.compile(r"manifest\.json|(init|part|segment)-\d{4,}-[0-9a-f]{16}\.sgs|history-\d{8,}-[0-9a-f]{16}\.json")
 
 
@@ -75,18 +79,51 @@ class FolderStore:
         """The folder."""
         return str(self.folder)
 
+    def make(self) -> None:
+        """Make the folder, if it is not there.
+
+        Raises:
+            StorageError: it cannot be made, or it is a file.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"The folder {self.folder} cannot be made ({error.strerror}).") from error
+
     def prepare(self) -> None:
         """Make the folder, and remove the temporary files of a writer that was killed.
 
         Raises:
-            StorageError: the folder cannot be made, or it is a file.
+            StorageError: the folder cannot be made or changed, or it is a file.
         """
+        self.make()
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
             for path in self.folder.glob(f"{_TEMPORARY}*"):
                 path.unlink(missing_ok=True)
         except OSError as error:
-            raise StorageError(f"The folder {self.folder} cannot be made ({error.strerror}).") from error
+            raise StorageError(f"{self.folder} cannot be changed ({error.strerror}).") from error
+
+    def lock(self) -> None:
+        """Keep other processes from writing here, until this one ends or forgets the store.
+
+        Raises:
+            StorageError: another process writes here.
+        """
+        path = self.folder / _LOCK
+        try:
+            file = path.open("w")
+        except OSError as error:
+            raise StorageError(f"{self.folder} cannot be written ({error.strerror}).") from error
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                raise StorageError(
+                    f"Another process writes to {self.folder}; wait for its end, or choose another folder."
+                ) from error
+            return  # A file system without locks, as some networks' are.
+        weakref.finalize(self, file.close)
 
     def put(self, name: str, data: bytes) -> None:
         """See :meth:`Store.put`."""

@@ -5,14 +5,15 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from structgstream.codec.container.index import pack_index
 from structgstream.codec.container.records import RecordType
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.history import segments_from, verified
 from structgstream.codec.segments.manifest import MANIFEST, Manifest, PartEntry, SegmentEntry, StoredFile
 from structgstream.codec.segments.manifest_json import manifest_from_json
-from structgstream.codec.segments.store import Store
+from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StreamError
 
 _KEPT_FILES = 2
@@ -81,6 +82,16 @@ class StoredBytes:
             place += 1
         return bytes(found)
 
+    def __enter__(self) -> "StoredBytes":
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Nothing is open between calls; what was read is forgotten."""
+        self._cache.clear()
+
     def files(self) -> Iterator[bytes]:
         """The contents of all files in order, each read once."""
         for piece in self._pieces:
@@ -141,6 +152,26 @@ class StoredBytes:
                 f"{entry.file} in {self._store.name} has {len(data)} bytes; the manifest states {entry.bytes}."
             )
         return data
+
+
+def open_segments(path: Path | str) -> StoredBytes:
+    """The bytes of a stream in a folder.
+
+    Args:
+        path: the folder, or its manifest.
+
+    Raises:
+        StreamError: there is no manifest, or it is not valid, or a file is missing.
+    """
+    path = Path(path)
+    store = FolderStore(path.parent if path.name == MANIFEST else path)
+    return StoredBytes(store, read_manifest(store))
+
+
+def is_segments(path: Path | str) -> bool:
+    """Whether :func:`open_segments` is for this path: a folder, or a manifest's name."""
+    path = Path(path)
+    return path.name == MANIFEST or path.is_dir()
 
 
 def read_manifest(store: Store) -> Manifest:

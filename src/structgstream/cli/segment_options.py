@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of a stream that is written as segments, and where it goes."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from structgstream.cli.app import UsageError
+
+if TYPE_CHECKING:
+    from structgstream.recorder import Storage
+    from structgstream.scene.scene import Scene
+
+FINISH_SECONDS = 60.0
+"""How long the end of a run waits for what is still to be published."""
+Sink = Literal["file", "segments"]
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Options of --sink segments (docs/segments.md)."""
+
+    sink: Annotated[Sink | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """file: OUT is one file. segments: OUT is a folder of immutable files and a manifest, which any web host can serve
+    while it grows. Default: segments if OUT is a folder with a manifest.json, else file."""
+    window: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    """Segments only: how far viewers can go back; older segments are removed. Default: everything is kept."""
+    keep: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 120.0
+    """Segments only: how long a file stays after the manifest has stopped naming it."""
+    publish: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    """Segments only: copy OUT to this folder of an object store as it grows, such as s3://bucket/studio. When it cannot
+    be reached, the stream goes on in OUT, and what is missing is copied later. Needs the extra cloud."""
+
+    def chosen(self, output: Path) -> Sink:
+        """The sink of ``output``.
+
+        Raises:
+            UsageError: options of segments for a file, or values that make no sense.
+        """
+        from structgstream.codec.segments.manifest import MANIFEST
+
+        found: Sink = "segments" if (output / MANIFEST).is_file() else "file"
+        sink = self.sink or found
+        if sink == "file" and (self.window is not None or self.publish is not None):
+            raise UsageError(f"{'--publish' if self.window is None else '--window'} is for --sink segments.")
+        if (self.window is not None and self.window <= 0) or self.keep < 0:
+            raise UsageError("--window must be positive, and --keep zero or more.")
+        return sink
+
+    @contextmanager
+    def storage(
+        self, output: Path, *, may_exist: bool, tell: Callable[[str], object]
+    ) -> Iterator["Storage[Scene] | None"]:
+        """Where the stream goes, checked before anything takes time; None for the file ``output``.
+
+        At the end of the block what is to be published is waited for, and ``tell`` gets a sentence if it is not done.
+
+        Raises:
+            StorageError: it exists and may not be replaced, or cannot be written.
+            MissingExtraError: a package is missing that the URL needs.
+        """
+        from structgstream.codec.segments.sink import SegmentsOptions
+        from structgstream.recorder import check_output, segments_at, segments_folder
+
+        options = SegmentsOptions(self.window, self.keep)
+        if self.chosen(output) == "file":
+            check_output(output, may_exist=may_exist)
+            yield None
+        elif self.publish is None:
+            yield segments_at(segments_folder(output, may_exist=may_exist), options=options)
+        else:
+            from structgstream.codec.segments.cloud_store import CloudStore
+            from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
+
+            remote = CloudStore(self.publish)
+            folder = segments_folder(output, may_exist=may_exist)
+            mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, tell))
+            mirror.copy_all()  # What an earlier run has left, also if there is nothing to do now.
+            try:
+                yield segments_at(mirror, options=options)
+            finally:
+                if left := mirror.finish(wait_seconds=FINISH_SECONDS):
+                    tell(
+                        f"{left} files of {output} are not yet in {self.publish}; the next run with --resume, or any "
+                        "program that copies folders, brings them there."
+                    )

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of segments that is copied to another store in the background, such as an object store.
+
+The folder is what counts: a packet is written when it is durable there, and whoever writes never waits for the network.
+A thread copies what is new, with back-off when the other store cannot be reached; what waits is in the folder, also
+after the process was killed, and the next run copies it. Nothing is kept in memory but names.
+
+Note [Order of copying]
+~~~~~~~~~~~~~~~~~~~~~~~
+One round takes the folder's manifest and the names that wait together, copies the files, and then the manifest, so
+that the other store's manifest names only files that are there. Manifests that were replaced meanwhile are left out. A
+file is removed from the other store no sooner than the time of grace after its first manifest without it.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.store import FolderStore, Store
+from structgstream.errors import StorageError, StreamError
+
+_FIRST_WAIT_SECONDS = 0.5
+_LONGEST_WAIT_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class MirrorOptions:
+    """How the copy is made.
+
+    Args:
+        grace_seconds: how long a file that has left the folder stays in the other store.
+        tell: is told of trouble and its end, each once, in a sentence.
+        elapsed: seconds that never jump.
+    """
+
+    grace_seconds: float = 120.0
+    tell: Callable[[str], object] = lambda text: None
+    elapsed: Callable[[], float] = time.monotonic
+
+
+class MirroredStore:
+    """A folder whose files are copied to ``remote`` by a thread (Note [Order of copying]).
+
+    Args:
+        folder: what is read and written.
+        remote: what follows it.
+        options: how.
+    """
+
+    def __init__(self, folder: FolderStore, remote: Store, *, options: MirrorOptions | None = None) -> None:
+        self._folder = folder
+        self._remote = remote
+        self._options = options or MirrorOptions()
+        self._changed = threading.Condition()
+        self._waiting: dict[str, None] = {}  # names to copy, in their order
+        self._manifest_waits = False
+        self._gone: dict[str, float | None] = {}  # names to remove, and since when the remote manifest lacks them
+        self._ending = False
+        self._known = False  # whether the remote's files have been compared with the folder's
+        self._busy = False
+        self._failures = 0
+        self._thread: threading.Thread | None = None
+
+    @property
+    def name(self) -> str:
+        """The folder."""
+        return self._folder.name
+
+    def put(self, name: str, data: bytes) -> None:
+        """Write to the folder; the copy follows."""
+        self._folder.put(name, data)
+        with self._changed:
+            if name == MANIFEST:
+                self._manifest_waits = True
+            else:
+                self._waiting[name] = None
+                self._gone.pop(name, None)
+            self._started()
+            self._changed.notify_all()
+
+    def get(self, name: str) -> bytes:
+        """From the folder."""
+        return self._folder.get(name)
+
+    def delete(self, name: str) -> None:
+        """Remove from the folder at once; the copy goes later."""
+        self._folder.delete(name)
+        with self._changed:
+            self._waiting.pop(name, None)
+            self._gone[name] = None
+
+    def names(self) -> frozenset[str]:
+        """Of the folder."""
+        return self._folder.names()
+
+    def free_bytes(self) -> int | None:
+        """Of the folder."""
+        return self._folder.free_bytes()
+
+    def copy_all(self) -> None:
+        """Copy what an earlier run has left, if there is anything, also if nothing is written now."""
+        if MANIFEST not in self._folder.names():
+            return
+        with self._changed:
+            self._manifest_waits = True
+            self._started()
+            self._changed.notify_all()
+
+    def finish(self, *, wait_seconds: float) -> int:
+        """Wait until everything is copied, at most this long, and end the thread.
+
+        Returns:
+            how many files still wait; they are in the folder, and the next run with the same folder copies them.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: not self._pending(), timeout=wait_seconds)
+            self._ending = True
+            self._changed.notify_all()
+            left = len(self._waiting) + self._manifest_waits
+            thread = self._thread
+        if thread is not None and not left:
+            thread.join()
+        return left
+
+    def _pending(self) -> bool:
+        return self._thread is not None and (bool(self._waiting) or self._manifest_waits or self._busy)
+
+    def _started(self) -> None:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="segments-mirror", daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ending or self._waiting or self._manifest_waits)
+                if self._ending:
+                    return
+                self._busy = True
+            wait_seconds = self._round()
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                if wait_seconds:
+                    self._changed.wait_for(lambda: self._ending, timeout=wait_seconds)
+
+    def _round(self) -> float:
+        """Copy what waits; returns the seconds to wait before the next round."""
+        try:
+            if not self._known:
+                self._compare()
+            self._copy()
+        except (StorageError, StreamError) as error:
+            self._failures += 1
+            if self._failures == 2:  # A single failure is nothing to be told of.
+                self._options.tell(
+                    f"{self._remote.name} cannot be reached ({error}); the stream goes on in {self._folder.name}, and "
+                    "is copied when it can be again."
+                )
+            return min(_FIRST_WAIT_SECONDS * 2.0 ** (self._failures - 1), _LONGEST_WAIT_SECONDS)
+        if self._failures >= 2:
+            self._options.tell(f"{self._remote.name} can be reached again, and is up to date.")
+        self._failures = 0
+        return 0.0
+
+    def _compare(self) -> None:
+        """Find what an earlier run has not copied, and what it has not removed."""
+        there = self._remote.names()
+        here = self._folder.names()
+        with self._changed:
+            earlier = {name: None for name in sorted(here - there - self._waiting.keys()) if name != MANIFEST}
+            self._waiting = {**earlier, **self._waiting}
+            for name in there - here - {MANIFEST}:
+                self._gone.setdefault(name)
+            self._known = True
+
+    def _copy(self) -> None:
+        """One round."""
+        with self._changed:
+            names = [*self._waiting]
+            manifest = self._folder.get(MANIFEST) if self._manifest_waits else None
+            self._manifest_waits = False
+            leaving = [name for name, since in self._gone.items() if since is None]
+        try:
+            for name in names:
+                self._copy_file(name)
+            if manifest is not None:
+                self._remote.put(MANIFEST, manifest)
+        except BaseException:
+            with self._changed:
+                self._manifest_waits = self._manifest_waits or manifest is not None
+            raise
+        now = self._options.elapsed()
+        if manifest is not None:
+            with self._changed:
+                self._gone.update({name: now for name in leaving if name in self._gone})
+        with self._changed:
+            late = now - self._options.grace_seconds
+            removed = [name for name, since in self._gone.items() if since is not None and since <= late]
+        for name in removed:
+            self._remote.delete(name)
+            with self._changed:
+                self._gone.pop(name, None)
+
+    def _copy_file(self, name: str) -> None:
+        with self._changed:
+            if name not in self._waiting:
+                return  # It has left the folder meanwhile; a newer manifest does not name it.
+        try:
+            data = self._folder.get(name)
+        except StreamError:
+            with self._changed:
+                if name not in self._waiting:
+                    return
+            raise
+        self._remote.put(name, data)
+        with self._changed:
+            self._waiting.pop(name, None)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of segments goes through every command as a file does, and the two are the same bytes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from backends import QUICKEST
+from s3_emulator import BUCKET, emulator
+from small_presets import few_points
+from structgstream.cli import main, segment_options
+from structgstream.cli.termination import Terminated, Termination
+from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.archive import write_archive
+from structgstream.codec.segments.cloud_store import CloudStore
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.stored_bytes import read_manifest
+from structgstream.data.clip import bundled_clip_path
+
+CLIP = str(bundled_clip_path())
+QUICK = ["--scale", "0.25", "--preset", "tiny", "--device", QUICKEST, "--initial.iterations", "3"]
+QUICK += ["--online.iterations", "2", "--online.patching.iteration", "1", "--points.max-points", "1500"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_presets() -> Iterator[None]:
+    with few_points("tiny"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the same three frames as ``file.sgs`` and as ``segments``."""
+    folder = tmp_path_factory.mktemp("made")
+    for output, more in ((folder / "file.sgs", []), (folder / "segments", ["--sink", "segments", "--keep", "60"])):
+        assert main(["reconstruct", CLIP, "-o", str(output), "--frames", "3", *QUICK, *more]) == 0
+    return folder
+
+
+def test_the_archive_is_the_file(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    archive = tmp_path / "archive.sgs"
+    assert main(["archive", str(made / "segments"), "-o", str(archive)]) == 0
+    assert archive.read_bytes() == (made / "file.sgs").read_bytes()
+    assert "archive.sgs: 3 frames" in capsys.readouterr().out.replace("\n", "")
+    assert main(["archive", str(made / "segments"), "-o", str(archive)]) == 2
+    assert "archive.sgs exists; replace it with --overwrite" in capsys.readouterr().err
+    assert main(["archive", str(made / "segments"), "-o", str(archive), "--overwrite"]) == 0
+    assert main(["archive", str(made), "-o", str(tmp_path / "x.sgs")]) == 1
+    assert "has no manifest.json; expected a folder written with --sink segments" in capsys.readouterr().err
+
+
+def test_inspect_evaluate_render_and_export_give_the_same(made: Path, tmp_path: Path) -> None:
+    outputs = []
+    for name in ("file.sgs", "segments"):
+        stream, out = str(made / name), tmp_path / name
+        out.mkdir()
+        assert main(["inspect", stream, "--json", str(out / "inspect.json")]) == 0
+        assert main(["evaluate", stream, CLIP, "--json", str(out / "scores.json"), "--device", QUICKEST]) == 0
+        assert main(["export", stream, "--frame", "2", "-o", str(out / "frame.ply"), "--device", QUICKEST]) == 0
+        assert main(["export", stream, "--format", "site", "-o", str(out / "site")]) == 0
+        arguments = ["--camera", "cam00", "--frame", "1", "-o", str(out / "view.png"), "--device", QUICKEST]
+        assert main(["render", stream, *arguments]) == 0
+        scores = json.loads((out / "scores.json").read_text())
+        inspected = json.loads((out / "inspect.json").read_text())
+        changes = [packet.pop("changes") for packet in inspected["packets"]]
+        files = [(out / file).read_bytes() for file in ("frame.ply", "site/stream.sgs", "view.png")]
+        outputs.append((scores["mean"]["psnr"], scores["stream"]["total_bytes"], inspected, len(changes), files))
+    assert outputs[0] == outputs[1]
+
+
+def test_a_folder_is_continued_without_saying_what_it_is(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    common = ["reconstruct", CLIP, "-o", str(out), *QUICK]
+    assert main([*common, "--sink", "segments", "--frames", "2"]) == 0
+    assert main([*common, "--frames", "3"]) == 1
+    assert "out holds a stream; continue it with --resume" in capsys.readouterr().err
+    assert main([*common, "--frames", "3", "--resume"]) == 0
+    with open_stream(out) as reader:
+        assert reader.total_bytes == (made / "file.sgs").stat().st_size
+    assert main(["archive", str(out), "-o", str(tmp_path / "a.sgs")]) == 0
+    assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
+    assert (tmp_path / "out.log.jsonl").is_file()
+
+
+def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, status, message in (
+        (["-o", str(tmp_path / "a.sgs"), "--window", "9"], 2, "--window is for --sink segments"),
+        (["-o", str(tmp_path / "a"), "--sink", "segments", "--window", "0"], 2, "--window must be positive"),
+        (["-o", str(tmp_path)], 1, "or add --sink segments"),
+    ):
+        assert main(["reconstruct", CLIP, *arguments]) == status
+        assert message in capsys.readouterr().err.replace("\n", " ")
+    (tmp_path / "file").write_text("x")
+    assert main(["reconstruct", CLIP, "-o", str(tmp_path / "file"), "--sink", "segments"]) == 1
+    assert "cannot be made" in capsys.readouterr().err
+
+
+def test_sigterm_finishes_the_frame_and_closes_the_stream(tmp_path: Path) -> None:
+    """Status 143; with --resume it goes on."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "structgstream", "reconstruct", CLIP, "-o", str(out), "--sink", "segments", *QUICK]
+    process = subprocess.Popen([*command, "--frames", "12"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    try:
+        while not (out / "manifest.json").is_file() and process.poll() is None:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGTERM)
+        _, error = process.communicate(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == 143, error
+    manifest = read_manifest(FolderStore(out))
+    assert (manifest.live, manifest.parts) == (False, ())
+    done = manifest.edge.frame + 1
+    assert 1 <= done < 12
+    assert f"{out} has {done} of 12 frames; continue with the same command and --resume." in error.decode()
+
+
+def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
+    before, asked = signal.getsignal(signal.SIGTERM), []
+    with Termination(lambda: asked.append(True)) as ending:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert (ending.asked, asked) == (True, [True])
+        with pytest.raises(Terminated, match="was given up"):
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_publishing_to_s3(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is missing after a run is copied by the next, also if there is nothing to fit."""
+    out = tmp_path / "out"
+    with emulator() as server:
+        options = server.options
+        monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
+        monkeypatch.setenv("AWS_ACCESS_KEY_ID", options["key"])
+        monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", options["secret"])
+        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 0.0)
+        url = f"s3://{BUCKET}/out"
+        command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUICK, "--sink", "segments", "--publish", url]
+        assert main(command) == 0
+        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
+        assert main([*command, "--resume"]) == 0
+        remote = CloudStore(url, **options)
+        assert remote.names() == FolderStore(out).names()
+        write_archive(remote, tmp_path / "a.sgs")
+    assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
+    assert main(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs"), "--publish", url]) == 2
+    assert "--publish is for --sink segments" in capsys.readouterr().err

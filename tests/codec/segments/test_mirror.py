@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What follows the folder is whole at every moment, catches up after an outage, and never holds up the writer."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from segment_streams import Hands, as_file, folder, packets, written
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
+from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
+from structgstream.errors import StorageError
+
+SENT = packets(9)
+
+
+class Remote(FolderStore):
+    """A folder that can be out of reach, and that notes every manifest it gets with the files that are there."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.prepare()
+        self.reachable = threading.Event()
+        self.reachable.set()
+        self.refused = threading.Semaphore(0)
+        self.before: Callable[[str], object] = lambda name: None
+        self.edges: list[int] = []
+
+    def put(self, name: str, data: bytes) -> None:
+        self._asked()
+        self.before(name)
+        if name == MANIFEST:
+            manifest = manifest_from_json(data, name=name)
+            StoredBytes(self, manifest, check=True)[:]
+            self.edges.append(manifest.edge.frame)
+        super().put(name, data)
+
+    def delete(self, name: str) -> None:
+        self._asked()
+        super().delete(name)
+
+    def names(self) -> frozenset[str]:
+        self._asked()
+        return super().names()
+
+    def _asked(self) -> None:
+        if not self.reachable.is_set():
+            self.refused.release()
+            raise StorageError("No route to host.")
+
+
+def content(store: FolderStore) -> dict[str, bytes]:
+    return {name: store.get(name) for name in store.names()}
+
+
+def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> None:
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    mirror = MirroredStore(here, remote)
+    written(mirror, SENT)
+    assert mirror.finish(wait_seconds=60) == 0
+    assert content(remote) == content(here)
+    assert remote.edges == sorted(remote.edges)
+    assert remote.edges[-1] == 8
+    stored = StoredBytes(remote, read_manifest(remote), check=True)
+    assert stored[: len(stored)] == as_file(SENT)
+
+
+def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Path) -> None:
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    told: list[str] = []
+    remote.reachable.clear()
+    mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
+    written(mirror, SENT)
+    for _ in range(2):
+        assert remote.refused.acquire(timeout=60)
+    assert read_manifest(here).edge.frame == 8
+    assert remote.edges == []
+    remote.reachable.set()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert content(remote) == content(here)
+    assert remote.edges == [8]  # Those before were replaced while they waited.
+    assert len(told) == 2
+    assert "cannot be reached (No route to host.); the stream goes on in" in told[0]
+    assert "can be reached again" in told[1]
+
+
+def test_what_was_not_copied_is_told_and_copied_by_the_next_run(tmp_path: Path) -> None:
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    remote.reachable.clear()
+    mirror = MirroredStore(here, remote)
+    written(mirror, SENT)
+    assert mirror.finish(wait_seconds=0.0) > 0
+    remote.reachable.set()
+    (remote.folder / "notes.txt").write_text("mine")
+    again = MirroredStore(here, remote)
+    again.copy_all()
+    assert again.finish(wait_seconds=60) == 0
+    assert content(remote) == content(here)
+    assert (remote.folder / "notes.txt").read_text() == "mine"
+
+
+def test_a_file_that_leaves_the_folder_leaves_the_other_store_after_its_grace(tmp_path: Path) -> None:
+    hands = Hands()
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    options = MirrorOptions(grace_seconds=5.0, elapsed=lambda: hands.elapsed)
+    mirror = MirroredStore(here, remote, options=options)
+    kept = SegmentsOptions(grace_seconds=0.5)
+    sent = packets(16)
+    written(mirror, sent, options=kept, hands=hands, after=lambda _: _settle(mirror))
+    assert mirror.finish(wait_seconds=60) == 0
+    parts = [sorted(int(n.split("-")[1]) for n in store.names() if "part" in n) for store in (here, remote)]
+    assert set(parts[0]) < set(parts[1])
+    assert 0 not in parts[1]
+    stored = StoredBytes(remote, read_manifest(remote), check=True)
+    assert stored[: len(stored)] == as_file(sent)
+
+
+def _settle(mirror: MirroredStore) -> None:
+    with mirror._changed:
+        assert mirror._changed.wait_for(lambda: not mirror._pending(), timeout=60)
+
+
+def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(tmp_path: Path) -> None:
+    """The outage is longer than the time of grace."""
+    hands = Hands()
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    remote.reachable.clear()
+    mirror = MirroredStore(here, remote)
+    written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5), hands=hands)
+    remote.reachable.set()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert content(remote) == content(here)
+    assert not {int(name.split("-")[1]) for name in remote.names() if "part" in name} & {0, 1, 2}
+
+
+@pytest.mark.parametrize("frame", [2, 3])
+def test_a_killed_writer_is_followed_up(tmp_path: Path, frame: int) -> None:
+    """The thread dies with the process, anywhere; the next run compares."""
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    written(here, SENT[:frame])
+    names = sorted(here.names() - {MANIFEST})
+    for name in names[: frame + 1]:
+        FolderStore.put(remote, name, here.get(name))
+    mirror = MirroredStore(here, remote)
+    written(mirror, SENT)
+    assert mirror.finish(wait_seconds=60) == 0
+    assert content(remote) == content(here)
