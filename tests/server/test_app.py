@@ -276,8 +276,8 @@ def test_metrics_and_health(server: Served, folder: Path) -> None:
     (folder / "studio.metrics.json").write_text(json.dumps(run))
     (folder / "ball.metrics.json").write_text("{broken")
     assert json.loads(server.ask("/health").body) == {"status": "ok"}
-    server.ask("/streams/studio/manifest.json")
-    server.ask("/streams/studio/manifest.json")
+    size = len(server.ask("/streams/studio/manifest.json").body)
+    server.ask("/streams/studio/manifest.json", method="HEAD")
     server.ask("/nothing")
     answer = server.ask("/metrics")
     assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
@@ -285,6 +285,7 @@ def test_metrics_and_health(server: Served, folder: Path) -> None:
     for line in (
         'structgstream_requests_total{stream="studio",kind="manifest",status="200"} 2',
         'structgstream_requests_total{stream="",kind="other",status="404"} 1',
+        f'structgstream_sent_bytes_total{{stream="studio"}} {size}',
         'structgstream_live{stream="studio"} 1',
         'structgstream_edge_frame{stream="studio"} 6',
         'structgstream_manifest_sequence{stream="studio"} 7',

@@ -49,7 +49,7 @@ class Guard:
             if message["type"] == "http.response.start":
                 status = message["status"]
             await send(message)
-            sent += len(message.get("body", b""))
+            sent += 0 if scope["method"] == "HEAD" else len(message.get("body", b""))
 
         refusal = self._refusal(scope, client)
         entered = refusal is None and self._together.enter(client)
