@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The player's real server in a thread, for tests that talk to it through a socket."""
+"""The real servers in a thread, for tests that talk to them through a socket."""
 
 import http.client
+import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import uvicorn
 
@@ -13,6 +15,8 @@ from structgstream.player.running import bound
 from structgstream.player.server import application
 from structgstream.player.stream_file import StreamFile
 from structgstream.player.truth import Truth
+from structgstream.server.listening import listening_socket, server
+from structgstream.server.settings import ServerSettings
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,10 @@ class Served:
     def address(self) -> str:
         return f"http://127.0.0.1:{self.port}/"
 
+    def connected(self) -> socket.socket:
+        """A connection, for what no HTTP client would send."""
+        return socket.create_connection(("127.0.0.1", self.port), timeout=20)
+
     def ask(self, path: str, *, method: str = "GET", **headers: str) -> Answer:
         """Asks for ``path``, just as it is written; headers with ``_`` for ``-``."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
@@ -47,10 +55,9 @@ class Served:
 
 
 @contextmanager
-def served(stream: StreamFile, *, truth: Truth | None = None) -> Iterator[Served]:
-    """The server of ``structgstream play`` on a free port."""
-    with bound(0) as listening:
-        server = uvicorn.Server(uvicorn.Config(application(stream, truth=truth), log_level="warning", access_log=False))
+def running(server: uvicorn.Server, listening: socket.socket) -> Iterator[Served]:
+    """A server on a bound socket, which is closed afterwards."""
+    with listening:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
         thread.start()
         try:
@@ -59,3 +66,18 @@ def served(stream: StreamFile, *, truth: Truth | None = None) -> Iterator[Served
             server.should_exit = True
             thread.join(20)
             assert not thread.is_alive()
+
+
+@contextmanager
+def hosted(settings: ServerSettings, **options: Any) -> Iterator[Served]:
+    """The server of ``structgstream serve`` on a free port; options are those of ``server``."""
+    with running(server(settings, **options), listening_socket("127.0.0.1", 0)) as found:
+        yield found
+
+
+@contextmanager
+def served(stream: StreamFile, *, truth: Truth | None = None) -> Iterator[Served]:
+    """The server of ``structgstream play`` on a free port."""
+    config = uvicorn.Config(application(stream, truth=truth), log_level="warning", access_log=False)
+    with running(uvicorn.Server(config), bound(0)) as found:
+        yield found

@@ -23,6 +23,8 @@ COMMANDS = {
     "reconstruct": "turn a capture into a stream, frame by frame",
     "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
+    "serve": "serve a folder of streams to viewers, live ones while they are made",
+    "token": "make an access token for a served stream",
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .splat, .spz",
     "archive": "turn a folder of segments into one stream file",

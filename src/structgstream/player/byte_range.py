@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``Range`` header of a request for bytes (RFC 9110, section 14)."""
+"""The ``Range`` header of a request for bytes, and what answers it (RFC 9110, section 14)."""
 
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 _ONE_RANGE = re.compile(r"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.ASCII | re.IGNORECASE)
 
@@ -34,3 +36,33 @@ def requested_range(header: str | None, size_bytes: int) -> range | None:
     if not asked:
         raise UnsatisfiableRange
     return asked
+
+
+@dataclass(frozen=True)
+class Part:
+    """The answer to a request for bytes: its status, the headers that say which bytes these are, and their offsets."""
+
+    status: int
+    headers: Mapping[str, str]
+    wanted: range
+
+
+def requested_part(request: Mapping[str, str], size_bytes: int, *, etag: str | None = None) -> Part:
+    """What answers a request for some or all of ``size_bytes`` bytes: 200, 206, or 416 without bytes.
+
+    Args:
+        request: headers by their names in lower case.
+        size_bytes: how many there are.
+        etag: strong validator of the bytes. Without one a request with ``If-Range`` gets all of them, because nobody
+            can know which version its part belongs to.
+    """
+    valid = "if-range" not in request or (etag is not None and request["if-range"] == etag)
+    try:
+        asked = requested_range(request.get("range") if valid else None, size_bytes)
+    except UnsatisfiableRange:
+        return Part(416, {"Accept-Ranges": "bytes", "Content-Range": f"bytes */{size_bytes}"}, range(0))
+    wanted = range(size_bytes) if asked is None else asked
+    headers = {"Accept-Ranges": "bytes", "Content-Length": str(len(wanted))}
+    if asked is not None:
+        headers["Content-Range"] = f"bytes {wanted.start}-{wanted.stop - 1}/{size_bytes}"
+    return Part(200 if asked is None else 206, headers, wanted)

@@ -29,7 +29,12 @@ _POLICY: Final = {
     "base-uri": "'none'",
     "form-action": "'none'",
 }
-_STYLE: Final = "html,body{margin:0;height:100%;color-scheme:light dark}structgstream-player{width:100%;height:100%}"
+_PLAYER_STYLE: Final = """<style>
+html,body{margin:0;height:100%;color-scheme:light dark}
+structgstream-player{width:100%;height:100%}
+</style>
+"""
+_NO_SCRIPT: Final = "<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>"
 
 
 def policy(**sources: str) -> str:
@@ -46,16 +51,20 @@ SERVED_POLICY: Final = {"script_src": "'self' blob:", "connect_src": "'self' blo
 """Further directives of pages that load the module and the stream from their origin."""
 
 
-def linked_page(title: str, *, stream: str, attributes: Mapping[str, str] | None = None) -> str:
-    """A page with ``player.js`` beside it, for a server.
+def linked_page(
+    title: str, *, stream: str, module: str = "player.js", attributes: Mapping[str, str] | None = None
+) -> str:
+    """A page that loads the player and the stream, for a server.
 
     Args:
         title: of the window.
         stream: address of the stream, relative to the page.
+        module: address of the player, relative to the page.
         attributes: further ones of the element.
     """
-    element = _element({"src": stream, **(attributes or {})})
-    return _page(title, '<script type="module" src="player.js"></script>', element, policy(**SERVED_POLICY))
+    script = f'<script type="module" src="{html.escape(module)}"></script>'
+    body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
+    return html_page(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))
 
 
 def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
@@ -78,9 +87,8 @@ def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
     digest = base64.b64encode(hashlib.sha256(inlined.encode()).digest()).decode()
     rules = policy(script_src=f"'sha256-{digest}' blob:", connect_src="blob: data:")
     data = '<script type="application/octet-stream;base64" id="stream">'
-    page = _page(
-        title, f"{data}</script>", f'{_element({"src": "#stream"})}<script type="module">{inlined}</script>', rules
-    )
+    element = f'{_element({"src": "#stream"})}<script type="module">{inlined}</script>\n{_NO_SCRIPT}'
+    page = html_page(title, head=f"{_PLAYER_STYLE}{data}</script>", body=element, rules=rules)
     before, after = page.split(data)
     return b"".join((before.encode(), data.encode(), base64.b64encode(stream[:]), after.encode()))
 
@@ -101,7 +109,15 @@ def _element(attributes: Mapping[str, str]) -> str:
     return f"<structgstream-player{written} autoplay loop></structgstream-player>"
 
 
-def _page(title: str, head: str, body: str, rules: str) -> str:
+def html_page(title: str, *, head: str, body: str, rules: str) -> str:
+    """A whole page.
+
+    Args:
+        title: of the window, as plain text.
+        head: further elements of the head, as HTML.
+        body: content, as HTML.
+        rules: its Content-Security-Policy.
+    """
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -110,12 +126,10 @@ def _page(title: str, head: str, body: str, rules: str) -> str:
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <link rel="icon" href="data:,">
 <title>{html.escape(title)}</title>
-<style>{_STYLE}</style>
 {head}
 </head>
 <body>
 {body}
-<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>
 </body>
 </html>
 """

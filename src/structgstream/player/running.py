@@ -35,16 +35,20 @@ def run(app: Starlette, *, port: int = 0, on_start: Callable[[str], None]) -> No
             uvicorn.Server(config).run(sockets=[listening])
 
 
-def bound(port: int) -> socket.socket:
-    """A listening socket on the loopback address, so that a browser can be opened at once.
+def bound(port: int, *, address: str = ADDRESS) -> socket.socket:
+    """A listening socket, on the loopback address unless told otherwise, so that a browser can be opened at once.
+
+    Args:
+        port: 0 takes a free one.
+        address: IPv4 or IPv6 address of this machine.
 
     Raises:
         PlayerError: the port is taken, or may not be used.
     """
-    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listening = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind((ADDRESS, port))
+        listening.bind((address, port))
         listening.listen()
     except (OSError, OverflowError) as error:
         listening.close()

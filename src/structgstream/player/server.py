@@ -22,7 +22,7 @@ from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import CaptureError, StreamError
 from structgstream.player.bundle import bundle
-from structgstream.player.byte_range import UnsatisfiableRange, requested_range
+from structgstream.player.byte_range import requested_part
 from structgstream.player.page import SERVED_POLICY, linked_page, policy
 from structgstream.player.stream_file import StreamFile, pieces
 from structgstream.player.truth import Truth
@@ -101,24 +101,15 @@ def _part_of(stream: StreamFile, request: Request) -> Response:
         data = stream.opened()
     except StreamError as error:
         return _gone(error)
-    size = len(data)
-    headers = {**_HEADERS, "Accept-Ranges": "bytes"}
-    # If-Range refers to a validator, and no response has one.
-    header = None if "if-range" in request.headers else request.headers.get("range")
-    try:
-        asked = requested_range(header, size)
-    except UnsatisfiableRange:
+    part = requested_part(request.headers, len(data))
+    headers = {**_HEADERS, **part.headers}
+    if part.status == 416:
         data.close()
-        return Response(status_code=416, headers={**headers, "Content-Range": f"bytes */{size}"})
-    wanted = range(size) if asked is None else asked
-    headers["Content-Length"] = str(len(wanted))
-    if asked is not None:
-        headers["Content-Range"] = f"bytes {wanted.start}-{wanted.stop - 1}/{size}"
-    status = 200 if asked is None else 206
+        return Response(status_code=416, headers=headers)
     if request.method == "HEAD":
         data.close()
-        return Response(status_code=status, headers=headers, media_type="application/octet-stream")
-    return StreamingResponse(_closing(data, wanted), status, headers, "application/octet-stream")
+        return Response(status_code=part.status, headers=headers, media_type="application/octet-stream")
+    return StreamingResponse(_closing(data, part.wanted), part.status, headers, "application/octet-stream")
 
 
 def _closing(data: FileBytes | StoredBytes, wanted: range) -> Iterator[bytes | memoryview]:

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The server of ``structgstream serve``, asked through a socket: what is where, and what it says of it."""
+
+import gzip
+import hashlib
+import json
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from segment_folders import GrowingFolder
+from serving import Served, hosted
+from streams import small_stream
+from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.player.bundle import bundle
+from structgstream.server.catalog import ServedStream
+from structgstream.server.settings import Limits, ServerSettings
+
+STREAM = small_stream(7)
+PNG = b"\x89PNG\r\n\x1a\n not a whole picture"
+SOON_SECONDS = 0.3
+YEAR = "public, max-age=31536000, immutable"
+
+
+async def rendered(stream: ServedStream) -> bytes:
+    return PNG + stream.name.encode()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A live stream with two segments and a part, and a file."""
+    growing = GrowingFolder(tmp_path / "studio", STREAM)
+    for _ in range(growing.frames):
+        growing.write()
+    (tmp_path / "ball.sgs").write_bytes(STREAM)
+    (tmp_path / "notes.txt").write_text("not for viewers")
+    return tmp_path
+
+
+@pytest.fixture
+def server(folder: Path) -> Iterator[Served]:
+    settings = ServerSettings(folder, limits=Limits(wait_seconds=SOON_SECONDS, burst=2000))
+    with hosted(settings, render=rendered) as running:
+        yield running
+
+
+def test_the_list(server: Served) -> None:
+    values = json.loads(server.ask("/streams.json").body)["streams"]
+    assert [(one["name"], one["kind"], one["live"]) for one in values] == [
+        ("ball.sgs", "file", None),
+        ("studio", "segments", True),
+    ]
+    for one in values:
+        assert server.ask(f"/{one['page']}").status == 200
+        assert server.ask(f"/{one['stream']}").status == 200
+        assert server.ask(f"/{one['preview']}").body == PNG + one["name"].encode()
+    page = server.ask("/").body.decode()
+    for name in ("studio", "ball.sgs"):
+        assert f'href="streams/{name}/"' in page
+        assert f"url(&quot;streams/{name}/preview&quot;)" in page
+    assert "notes" not in page
+
+
+def test_a_stream_that_comes_later_is_found(server: Served, folder: Path) -> None:
+    assert server.ask("/streams/later.sgs/state").status == 404
+    (folder / "later.sgs").write_bytes(STREAM)
+    last = time.monotonic() + 20
+    while server.ask("/streams/later.sgs/state").status != 200:
+        assert time.monotonic() < last
+        time.sleep(0.1)
+
+
+def test_the_page_plays_what_is_beside_it(server: Served) -> None:
+    for name, source in (("studio", "manifest.json"), ("ball.sgs", "stream.sgs")):
+        page = server.ask(f"/streams/{name}/")
+        assert page.headers["content-type"] == "text/html; charset=utf-8"
+        assert f'src="{source}"' in page.body.decode()
+        assert 'src="../../player.js"' in page.body.decode()
+        assert "frame-ancestors 'self'" in page.headers["content-security-policy"]
+        moved = server.ask(f"/streams/{name}?t=3")
+        assert (moved.status, moved.headers["location"]) == (307, f"{name}/?t=3")
+    assert server.ask("/player.js").body.decode() == bundle()
+
+
+def test_a_player_gets_every_byte_of_the_stream(server: Served) -> None:
+    answer = server.ask("/streams/studio/manifest.json")
+    manifest = manifest_from_json(answer.body, name="it")
+    assert (len(manifest.segments), len(manifest.parts)) == (2, 1)
+    entries = [*manifest.periods, *manifest.segments, *manifest.parts]
+    content = b""
+    for entry in entries:
+        got = server.ask(f"/streams/studio/{entry.file}")
+        assert hashlib.sha256(got.body).hexdigest() == entry.sha256
+        assert got.headers["cache-control"] == YEAR
+        assert got.headers["content-type"] == "application/octet-stream"
+        content += got.body
+    assert STREAM.startswith(content)
+    assert len(STREAM) - len(content) < 500  # index and footer
+
+
+def test_an_immutable_file_has_ranges_and_a_validator(server: Served, folder: Path) -> None:
+    file = next((folder / "studio").glob("init-*"))
+    content, address = file.read_bytes(), f"/streams/studio/{file.name}"
+    etag = server.ask(address).headers["etag"]
+    assert etag == f'"{hashlib.sha256(content).hexdigest()[:16]}"'
+    part = server.ask(address, Range="bytes=10-19")
+    assert (part.status, part.body, part.headers["cache-control"]) == (206, content[10:20], YEAR)
+    assert server.ask(address, Range="bytes=10-19", If_Range=etag).body == content[10:20]
+    assert server.ask(address, Range="bytes=10-19", If_Range='"other"').body == content
+    assert server.ask(address, Range=f"bytes={len(content)}-").status == 416
+    for given in (etag, f"W/{etag}", f'"x", {etag}', "*"):
+        known = server.ask(address, If_None_Match=given)
+        assert (known.status, known.body, known.headers["etag"]) == (304, b"", etag)
+    told = server.ask(address, method="HEAD")
+    assert (told.status, told.body, told.headers["content-length"]) == (200, b"", str(len(content)))
+
+
+def test_a_file_is_served_from_memory_until_it_has_to_go(server: Served, folder: Path) -> None:
+    file = next((folder / "studio").glob("part-*"))
+    content = file.read_bytes()
+    assert server.ask(f"/streams/studio/{file.name}").body == content
+    file.unlink()
+    assert server.ask(f"/streams/studio/{file.name}").body == content
+    other = next((folder / "studio").glob("segment-*"))
+    other.unlink()
+    assert server.ask(f"/streams/studio/{other.name}").status == 404
+
+
+def test_the_manifest_has_a_validator_for_each_encoding(server: Served) -> None:
+    plain = server.ask("/streams/studio/manifest.json")
+    zipped = server.ask("/streams/studio/manifest.json", Accept_Encoding="br, gzip")
+    assert gzip.decompress(zipped.body) == plain.body
+    assert zipped.headers["content-encoding"] == "gzip"
+    assert plain.headers["etag"] != zipped.headers["etag"]
+    assert not plain.headers["etag"].startswith("W/")
+    for answer in (plain, zipped):
+        assert answer.headers["cache-control"] == "no-cache"
+        assert answer.headers["vary"] == "Accept-Encoding"
+        assert server.ask("/streams/studio/manifest.json", If_None_Match=answer.headers["etag"]).status == 304
+    assert server.ask("/streams/studio/manifest.json", If_None_Match='"old"').status == 200
+
+
+def test_waiting_ends_with_the_next_frame_for_everyone(tmp_path: Path) -> None:
+    growing = GrowingFolder(tmp_path / "studio", STREAM)
+    growing.write()
+    settings = ServerSettings(tmp_path, limits=Limits(wait_seconds=30.0))
+    with hosted(settings, render=rendered) as server, ThreadPoolExecutor(12) as pool:
+        waiting = [pool.submit(server.ask, "/streams/studio/manifest.json?after=1") for _ in range(12)]
+        while waiters(server) < 12:
+            time.sleep(0.05)
+        assert not any(one.done() for one in waiting)
+        growing.write()
+        found = [manifest_from_json(one.result(20).body, name="it").sequence for one in waiting]
+        assert found == [2] * 12
+        # Who is behind does not wait, nor who asks a finished stream.
+        assert server.ask("/streams/studio/manifest.json?after=1").status == 200
+        growing.write_all()
+        last = manifest_from_json(server.ask("/streams/studio/manifest.json?after=99").body, name="it")
+    assert not last.live
+
+
+def waiters(server: Served) -> float:
+    lines = server.ask("/metrics").body.decode().splitlines()
+    return sum(float(line.split()[-1]) for line in lines if line.startswith("structgstream_waiters"))
+
+
+def test_waiting_ends_by_itself(server: Served) -> None:
+    address = "/streams/studio/manifest.json?after=7"
+    same = server.ask(address)
+    assert manifest_from_json(same.body, name="it").sequence == 7
+    assert server.ask(address, If_None_Match=same.headers["etag"]).status == 304
+
+
+def test_a_stream_that_begins_anew_ends_waiting(tmp_path: Path) -> None:
+    growing = GrowingFolder(tmp_path / "studio", STREAM)
+    for _ in range(3):
+        growing.write()
+    with hosted(ServerSettings(tmp_path), render=rendered) as server, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(server.ask, "/streams/studio/manifest.json?after=3")
+        while waiters(server) < 1:
+            time.sleep(0.05)
+        GrowingFolder(tmp_path / "studio", STREAM, name="another").write()
+        assert manifest_from_json(waiting.result(20).body, name="it").sequence == 1
+
+
+def test_who_goes_away_no_longer_waits(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write()
+    with hosted(ServerSettings(tmp_path), render=rendered) as server:
+        with server.connected() as connection:
+            connection.sendall(b"GET /streams/studio/manifest.json?after=1 HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            while waiters(server) < 1:
+                time.sleep(0.05)
+        last = time.monotonic() + 20
+        while waiters(server):
+            assert time.monotonic() < last
+            time.sleep(0.05)
+
+
+def test_one_waiter_too_many_gets_what_there_is(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write()
+    settings = ServerSettings(tmp_path, limits=Limits(waiters=1, wait_seconds=30.0))
+    with hosted(settings, render=rendered) as server, server.connected() as connection:
+        connection.sendall(b"GET /streams/studio/manifest.json?after=1 HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        while waiters(server) < 1:
+            time.sleep(0.05)
+        answer = server.ask("/streams/studio/manifest.json?after=1")
+        assert (answer.status, answer.headers["retry-after"]) == (200, "2")
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"format": "other"}', b"[" * 100_000])
+def test_a_broken_manifest_is_told(folder: Path, content: bytes) -> None:
+    (folder / "studio" / "manifest.json").write_bytes(content)
+    with hosted(ServerSettings(folder), render=rendered) as server:
+        answer = server.ask("/streams/studio/manifest.json")
+        assert (answer.status, answer.headers["cache-control"]) == (502, "no-store")
+        assert b"is no manifest" in answer.body
+        assert server.ask("/").status == 200
+        assert server.ask("/metrics").status == 200
+
+
+def test_a_growing_file_as_play_serves_it(server: Served, folder: Path) -> None:
+    address, path = "/streams/ball.sgs/stream.sgs", folder / "ball.sgs"
+    assert json.loads(server.ask("/streams/ball.sgs/state").body) == {"bytes": len(STREAM), "complete": True}
+    path.write_bytes(STREAM[:1000])
+    assert json.loads(server.ask("/streams/ball.sgs/state").body) == {"bytes": 1000, "complete": False}
+    assert server.ask(address, Range="bytes=1000-").status == 416
+    with path.open("ab") as growing:
+        growing.write(STREAM[1000:])
+    part = server.ask(address, Range="bytes=1000-")
+    assert (part.status, part.body, part.headers["cache-control"]) == (206, STREAM[1000:], "no-store")
+    assert "etag" not in part.headers
+    assert server.ask(address).body == STREAM
+    assert server.ask(address, Range="bytes=5-9", If_Range='"x"').body == STREAM
+    assert server.ask(address, method="HEAD").headers["content-length"] == str(len(STREAM))
+
+
+def test_only_what_a_stream_is_made_of_is_served(server: Served, folder: Path) -> None:
+    for name in ("secret.sgs", "part-00000001.sgs", ".new-manifest.json", "studio.metrics.json"):
+        (folder / "studio" / name).write_text("hidden")
+    for address in (
+        "/notes.txt",
+        "/streams/notes.txt/",
+        "/streams/notes.txt/stream.sgs",
+        "/streams/studio/secret.sgs",
+        "/streams/studio/part-00000001.sgs",
+        "/streams/studio/.new-manifest.json",
+        "/streams/studio/studio.metrics.json",
+        "/streams/studio/stream.sgs",
+        "/streams/ball.sgs/manifest.json",
+        "/streams/nobody/",
+        "/streams/",
+        "/streams/studio/x/y",
+    ):
+        answer = server.ask(address)
+        assert answer.status == 404, address
+        assert b"hidden" not in answer.body
+
+
+def test_a_folder_of_segments_is_one_stream(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write_all()
+    (tmp_path / "studio.metrics.json").write_text(json.dumps({"frames": 7}))
+    (tmp_path / "other.sgs").write_bytes(STREAM)
+    with hosted(ServerSettings(tmp_path / "studio"), render=rendered) as server:
+        values = json.loads(server.ask("/streams.json").body)["streams"]
+        assert [(one["name"], one["live"]) for one in values] == [("studio", False)]
+        assert server.ask("/streams/studio/manifest.json").status == 200
+        assert 'structgstream_run{stream="studio",name="frames"} 7' in server.ask("/metrics").body.decode()
+
+
+def test_metrics_and_health(server: Served, folder: Path) -> None:
+    run = {"frames": 7, "psnr": {"mean": 30.5}, "done": False, "cameras": ["a"], "name": "x"}
+    (folder / "studio.metrics.json").write_text(json.dumps(run))
+    (folder / "ball.metrics.json").write_text("{broken")
+    assert json.loads(server.ask("/health").body) == {"status": "ok"}
+    size = len(server.ask("/streams/studio/manifest.json").body)
+    server.ask("/streams/studio/manifest.json", method="HEAD")
+    server.ask("/nothing")
+    answer = server.ask("/metrics")
+    assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    lines = answer.body.decode().splitlines()
+    for line in (
+        'structgstream_requests_total{stream="studio",kind="manifest",status="200"} 2',
+        'structgstream_requests_total{stream="",kind="other",status="404"} 1',
+        f'structgstream_sent_bytes_total{{stream="studio"}} {size}',
+        'structgstream_live{stream="studio"} 1',
+        'structgstream_edge_frame{stream="studio"} 6',
+        'structgstream_manifest_sequence{stream="studio"} 7',
+        'structgstream_viewers{stream="studio"} 2',
+        'structgstream_run{stream="studio",name="frames"} 7',
+        'structgstream_run{stream="studio",name="psnr_mean"} 30.5',
+        'structgstream_run{stream="studio",name="done"} 0',
+        "structgstream_connections 1",
+    ):
+        assert line in lines
+    assert not [line for line in lines if "nothing" in line]
+
+
+def test_a_preview_that_is_a_file_is_taken(server: Served, folder: Path) -> None:
+    (folder / "studio" / "preview.jpg").write_bytes(b"\xff\xd8\xff and so on")
+    (folder / "ball.preview.png").write_bytes(PNG)
+    jpeg = server.ask("/streams/studio/preview")
+    assert (jpeg.headers["content-type"], jpeg.body) == ("image/jpeg", b"\xff\xd8\xff and so on")
+    assert server.ask("/streams/ball.sgs/preview").body == PNG
+    assert server.ask("/streams/studio/preview", If_None_Match=jpeg.headers["etag"]).status == 304
+    (folder / "studio" / "preview.jpg").write_bytes(b"<svg onload=alert(1)>")
+    assert server.ask("/streams/studio/preview").body != b"<svg onload=alert(1)>"
+
+
+def test_requests_go_on_while_a_preview_is_made(folder: Path) -> None:
+    free = threading.Event()
+
+    async def slow(stream: ServedStream) -> bytes:
+        import asyncio
+
+        while not free.is_set():
+            await asyncio.sleep(0.01)
+        return PNG
+
+    with hosted(ServerSettings(folder), render=slow) as server, ThreadPoolExecutor(2) as pool:
+        waiting = [pool.submit(server.ask, f"/streams/{name}/preview") for name in ("studio", "ball.sgs")]
+        assert server.ask("/streams/studio/manifest.json").status == 200
+        assert not any(one.done() for one in waiting)
+        free.set()
+        assert [one.result(20).body for one in waiting] == [PNG, PNG]

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The served pages in a real browser: the list, and a stream that needs a token."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chromium import Tab, opened_browser
+from rigs import random_scene
+from segment_folders import GrowingFolder
+from serving import hosted
+from streams import compact_header, moved, write_stream
+from structgstream.codec.sinks import MemorySink
+from structgstream.evaluation.png import png_bytes
+from structgstream.server.catalog import ServedStream
+from structgstream.server.settings import ServerSettings
+from structgstream.server.tokens import EVERY_STREAM, TokenKeys
+
+KEYS = TokenKeys((b"a secret of thirty-two characters",))
+SHOWN = 'document.querySelector("structgstream-player")?.stats?.settled'
+
+
+async def drawn(stream: ServedStream) -> bytes:
+    return png_bytes(np.full((6, 8, 3), 200, np.uint8))
+
+
+@pytest.fixture
+def tab(tmp_path: Path) -> Iterator[Tab]:
+    with opened_browser(tmp_path) as opened:
+        yield opened
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    sink = MemorySink()
+    scenes = [moved(random_scene(60, seed=4), step) for step in range(6)]
+    write_stream(sink, scenes, header=compact_header(scenes[0]))
+    streams = tmp_path / "streams"
+    GrowingFolder(streams / "studio", sink.data).write()
+    (streams / "ball.sgs").write_bytes(sink.data)
+    return streams
+
+
+def test_from_the_list_to_a_picture_with_one_token(tab: Tab, folder: Path) -> None:
+    token = KEYS.token(EVERY_STREAM, expires_unix_seconds=int(time.time()) + 600)
+    with hosted(ServerSettings(folder, keys=KEYS), render=drawn) as server:
+        tab.open(f"{server.address}?token={token}", width=640, height=480)
+        pictures = "performance.getEntriesByType('resource').filter(one => one.responseStatus === 200).length"
+        tab.wait_for(f"{pictures} === 2")
+        assert not tab.complaints
+        tab.evaluate("document.querySelector('a[href*=\"ball.sgs\"]').click(), 1")
+        tab.wait_for(SHOWN)
+        asked = [address for address in tab.requests if address.startswith("http") and "player.js" not in address]
+        answers = server.ask("/metrics", Authorization=f"Bearer {token}").body.decode()
+    # The player's worker asks for the bytes; no request lacked the token.
+    assert 'structgstream_requests_total{stream="ball.sgs",kind="file",status="20' in answers
+    assert 'status="401"' not in answers
+    assert all(f"token={token}" in address for address in asked)
+    assert all(address.startswith(server.address) for address in asked)
+    assert not tab.complaints
+
+
+def test_without_a_token_nothing_is_shown(tab: Tab, folder: Path) -> None:
+    with hosted(ServerSettings(folder, keys=KEYS, previews=False)) as server:
+        tab.open(server.address)
+        tab.wait_for('document.body.innerText === "An access token is needed here."')
