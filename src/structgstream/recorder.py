@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from structgstream.data.prefetch import Prefetch
-from structgstream.data.source import FrameSource
+from structgstream.data.prefetch import read_ahead
+from structgstream.data.source import FrameStream, frame_count
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
 from structgstream.frame_report import FrameReport
@@ -37,7 +37,7 @@ class Run:
 
 def record(
     path: Path,
-    source: FrameSource,
+    source: FrameStream,
     pipeline: Pipeline[State, Memory],
     backend: Backend,
     *,
@@ -52,7 +52,7 @@ def record(
 
     Args:
         path: the file; an existing one is replaced unless it is resumed.
-        source: the capture; its frames are read ahead.
+        source: the capture; frames of a recording are read ahead.
         pipeline: fits and stores frames.
         backend: the compute back-end.
         resume: continue after the last whole frame of an existing file.
@@ -65,8 +65,8 @@ def record(
         StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
         StorageError: the file or the log cannot be written; whole frames stay in the file.
     """
-    sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
-    session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
+    sink, resumed = pipeline.codec.file(path, frames=frame_count(source), resume=resume)
+    session = Session(read_ahead(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
     return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
 

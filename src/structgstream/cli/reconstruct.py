@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.live_run import LiveChoice, open_live, watched
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -19,10 +20,10 @@ from structgstream.cli.options import (
     parse_known_options,
     resolve_config,
 )
-from structgstream.cli.progress import display, human_bytes
+from structgstream.cli.progress import human_bytes
 
 if TYPE_CHECKING:
-    from structgstream.data.source import FrameSource
+    from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
 
@@ -40,10 +41,13 @@ class Reconstruct:
     Example: structgstream reconstruct basketball -o ball.sgs --preset fast --scale 0.5 --online.iterations 40
 
     Example: structgstream reconstruct basketball -o ball.sgs --mbits 5
+
+    Example: structgstream reconstruct rig.toml -o now.sgs --live --preset fast --record take1
     """
 
     scene: tyro.conf.Positional[Folder]
-    """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them."""
+    """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them; with --live
+    the rig file of cameras that send now (docs/live.md)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
@@ -64,6 +68,7 @@ class Reconstruct:
     help_config: bool = False
     """List the fields of the configuration with the preset's values."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
+    live: LiveChoice = field(default_factory=LiveChoice)
 
 
 def main(arguments: list[str]) -> None:
@@ -82,12 +87,18 @@ def main(arguments: list[str]) -> None:
     check_output(options.output, may_exist=options.resume or options.overwrite)
     from structgstream.kernels.backend import select_backend
 
-    source = open_selected_capture(options.scene, options.capture)
+    if options.live.live:
+        source = open_live(options.scene, options.capture, options.live, stream=options.output, resume=options.resume)
+        length = "live"
+    else:
+        options.live.check(options.scene)
+        source = open_selected_capture(options.scene, options.capture)
+        length = f"{len(source)} frames"
     backend = select_backend(options.device)
     console = Console()
     console.print(
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
-        f"{', '.join(source.rig.testing) or 'none'}; {len(source)} frames; preset {preset}, back-end {backend.name}.",
+        f"{', '.join(source.rig.testing) or 'none'}; {length}; preset {preset}, back-end {backend.name}.",
         highlight=False,
         markup=False,
         soft_wrap=True,
@@ -109,7 +120,7 @@ def main(arguments: list[str]) -> None:
 
 
 def run_reconstruction(
-    source: "FrameSource",
+    source: "FrameStream",
     config: "StreamConfig",
     *,
     output: Path,
@@ -126,9 +137,13 @@ def run_reconstruction(
         Interrupted: the user pressed Ctrl-C; whole frames stay in the file.
         StructGStreamError: any other error; whole frames stay in the file.
     """
+    from structgstream.data.source import frame_count
     from structgstream.recorder import record
+    from structgstream.run_metrics import RunMetrics
     from structgstream.struct_gstream import stream_pipeline
 
+    total = frame_count(source)
+    metrics = RunMetrics(output, fps=source.fps, total=total, live=getattr(source, "status", None))
     run = record(
         output,
         source,
@@ -137,11 +152,12 @@ def run_reconstruction(
         resume=resume,
         metadata=metadata,
         on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
+        remarks=metrics.frame,
     )
     done = run.done
     peaks: dict[str, int] = {}
     try:
-        with display(len(source), done=done) as progress, closing(run.reports) as reports:
+        with watched(source, metrics, done=done) as progress, closing(run.reports) as reports:
             for report in reports:
                 on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
                 for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
@@ -149,7 +165,8 @@ def run_reconstruction(
                 progress.frame(report)
                 done = report.index + 1
     except KeyboardInterrupt:
-        kept = f"{output} has {done} of {len(source)} frames; continue with the same command and --resume."
+        of = "" if total is None else f" of {total}"
+        kept = f"{output} has {done}{of} frames; continue with the same command and --resume."
         raise Interrupted(kept if done else "No frame was done, so nothing was written.") from None
     return peaks
 
