@@ -103,7 +103,7 @@ def state_line(values: Mapping[str, Any]) -> str:
         if live["delay_seconds"] is not None:
             parts.append(f"pictures {live['delay_seconds']:.2f} s old")
     if values["bits_per_second"] is not None:
-        parts.append(f"{values['bits_per_second'] / 1e6:.2f} Mbit/s")
+        parts.append(f"{values['bits_per_second'] / 1e3:,.1f} kbit/s")
     if values["disk_free_bytes"] is not None:
         parts.append(f"disk {human_bytes(values['disk_free_bytes'])} free")
     if values["resident_bytes"] is not None:

@@ -54,6 +54,7 @@ class Arrivals:
             deadline_seconds=rig.deadline_seconds,
             queue_frames=rig.queue_frames,
             count=faults.count,
+            begun=now(),
         )
         self._arrived = threading.Condition()
         self._stop = threading.Event()

@@ -73,6 +73,7 @@ class CameraFeed:
         stuck_seconds: the same picture for so long is not used if others change.
         keeper: keeps its packets, or None.
         opens: opens a camera with a timeout in seconds.
+        wait: waits before the camera is opened again; None for seconds, or until :meth:`stop`.
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class CameraFeed:
         stuck_seconds: float,
         keeper: PacketKeeper | None = None,
         opens: Opens | None = None,
+        wait: Callable[[float], object] | None = None,
     ) -> None:
         self.name, self._camera, self._size = name, camera, size
         self._receiver, self._stamps, self._faults, self._base = receiver, stamps, faults, base
@@ -99,11 +101,13 @@ class CameraFeed:
         self._keeper = keeper
         self._opens = open_camera if opens is None else opens
         self._stop = threading.Event()
+        self._wait = self._stop.wait if wait is None else wait
         # A daemon, so that a camera that hangs in the system cannot keep the program from ending.
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
         self._checksum: int | None = None
         self._damaged, self._shown = True, False
         self._gone_since: float | None = None
+        self._paced: float | None = None
         self.ended = False
         self.decoded = 0
         self.changed_at = -float("inf")
@@ -132,7 +136,7 @@ class CameraFeed:
                 self.ended = True
                 return
             wait = FIRST_WAIT_SECONDS if self.decoded > before else min(2 * wait, MOST_WAIT_SECONDS)
-            self._stop.wait(wait)
+            self._wait(wait)
 
     def _connection(self) -> str:
         """Reads until the camera ends or fails; why it did."""
@@ -192,6 +196,7 @@ class CameraFeed:
 
     def _picture(self, frame: "VideoFrame", wrap_seconds: float | None) -> float:
         """Delivers a decoded frame unless something is wrong with it; the shift from its stamp to the common clock."""
+        self._keep_pace(frame)
         arrived = self._now()
         self.decoded += 1
         self._back(arrived)
@@ -199,6 +204,14 @@ class CameraFeed:
         if seconds is not None and self._fits(frame) and not self._stands_still(frame, arrived):
             self._receiver.deliver(self.name, LivePicture(seconds, arrived, frame))
         return self._stamps.shift
+
+    def _keep_pace(self, frame: "VideoFrame") -> None:
+        """A file that is complete is read at the speed at which it was filmed."""
+        if not self._camera.is_file or frame.time is None:
+            return
+        if self._paced is None:
+            self._paced = self._now() - frame.time
+        self._stop.wait(max(self._paced + frame.time - self._now(), 0.0))
 
     def _placed(self, frame: "VideoFrame", arrived: float, wrap_seconds: float | None) -> float | None:
         """When the picture was taken, on the common clock; None if it must not be used."""

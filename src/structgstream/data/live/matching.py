@@ -62,6 +62,7 @@ class SetMatcher:
         deadline_seconds: how long a set waits.
         queue_frames: pictures of a camera that are kept; the oldest are dropped.
         count: told of dropped and unmatched pictures.
+        begun: when cameras were opened, from which on they are waited for as if they had sent.
     """
 
     def __init__(
@@ -73,8 +74,9 @@ class SetMatcher:
         deadline_seconds: float,
         queue_frames: int,
         count: Count,
+        begun: float = -float("inf"),
     ) -> None:
-        self._queues = {name: _Queue() for name in cameras}
+        self._queues = {name: _Queue(last_arrived=begun) for name in cameras}
         self._spacing = LEAST_SPACING / fps
         self._tolerance, self._deadline = tolerance_seconds, deadline_seconds
         self._most, self._count = queue_frames, count
