@@ -5,7 +5,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +92,7 @@ def test_sets_of_one_instant_come_over_the_network(tmp_path: Path, transport: st
         frames = list(source.frames())
     assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
     assert frames[0].pts_seconds == 0.0
-    assert all(one.pts_seconds < other.pts_seconds for one, other in zip(frames, frames[1:]))
+    assert all(one.pts_seconds < other.pts_seconds for one, other in pairwise(frames))
     for frame in frames:
         assert len({shown(image) for image in frame.images.values()}) == 1, "pictures of one instant"
         assert frame.captured_unix_seconds is not None

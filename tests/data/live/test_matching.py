@@ -2,6 +2,7 @@
 """Pictures in, sets out, in synthetic time."""
 
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -180,6 +181,6 @@ def test_no_picture_is_used_twice_and_times_rise(events: list[tuple[str, float]]
             used += [picture.content for picture in one.pictures.values()]
             assert all(abs(picture.seconds - one.seconds) <= PERIOD / 2 for picture in one.pictures.values())
     assert len(set(used)) == len(used)
-    assert all(b - a >= 0.75 * PERIOD - 1e-9 for a, b in zip(times, times[1:]))
+    assert all(b - a >= 0.75 * PERIOD - 1e-9 for a, b in pairwise(times))
     lost = sum(count for count in rig.counted.values())
     assert len(used) + lost + sum(rig.matcher.lengths.values()) == len(events)

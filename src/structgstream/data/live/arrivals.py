@@ -170,8 +170,14 @@ class Arrivals:
 
     def _tell_astray(self, astray: Mapping[str, float]) -> None:
         for name, seconds in astray.items():
+            if seconds < 0:
+                why = (
+                    f"are {-seconds:.3f} s behind those of the others: either they come late, which a longer "
+                    "deadline_seconds or a less busy machine mends, or its clock is"
+                )
+            else:
+                why = f"are {seconds:.3f} s ahead of those of the others: its clock is"
             text = (
-                f"sends pictures, but they lie {seconds:+.3f} s from the instants of the others, so it is absent; "
-                f"correct its clock, or its offset_seconds in the rig file by {-seconds:+.3f}"
+                f"is absent, because its pictures {why}, which offset_seconds = {-seconds:+.3f} in the rig file mends"
             )
             self._faults.say(name, Fault.UNMATCHED.value, text)

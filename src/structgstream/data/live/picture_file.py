@@ -86,4 +86,4 @@ def _read(file: Any, entry: Any, kind: type[Any], last: tuple[int, ...]) -> NDAr
         raise ValueError(f"shape {shape}")
     count = int(np.prod(shape))
     data = zstandard.ZstdDecompressor().decompress(file.read(min(size, 2 * count + 1024)), max_output_size=count)
-    return np.frombuffer(data, kind).reshape(shape)
+    return np.frombuffer(bytearray(data), kind).reshape(shape)  # a copy that may be written to
