@@ -11,17 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FILE = Path(__file__).parents[1] / "tools" / "senders" / "send.py"
+FOLDER = Path(__file__).parents[1] / "tools" / "senders"
 
 
 @cache
 def sender() -> ModuleType:
     """The module, which lies outside of any package."""
-    spec = importlib.util.spec_from_file_location("send", FILE)
+    _loaded("rtsp")
+    return _loaded("send")
+
+
+def _loaded(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules["send"] = module
+    sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
 

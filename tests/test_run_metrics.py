@@ -29,7 +29,12 @@ def read(stream: Path) -> dict:
 def test_rates_stages_and_sizes_are_of_the_last_frames(tmp_path: Path) -> None:
     clock, sets, stream = Clock(), [0], tmp_path / "x.sgs"
     metrics = RunMetrics(
-        stream, fps=10.0, live=lambda: LiveStatus(CAMERAS, sets[0], skipped_sets=5), now=clock, unix=lambda: 1.7e9
+        stream,
+        fps=10.0,
+        live=lambda: LiveStatus(CAMERAS, sets[0], skipped_sets=5),
+        captured=lambda index: 1.7e9 - index,
+        now=clock,
+        unix=lambda: 1.7e9,
     )
     extras = {}
     for index in range(5):
@@ -47,6 +52,7 @@ def test_rates_stages_and_sizes_are_of_the_last_frames(tmp_path: Path) -> None:
     assert (values["train_psnr"], values["absent"], values["pts_seconds"]) == (30.0, ["b"], 2.0)
     assert values["live"]["cameras"]["a"] == {"present": True, "decoded": 40, "queued": 1, "faults": {"jump": 1}}
     assert values["disk_free_bytes"] > 0
+    assert values["stored_after_seconds"] == extras["run"]["stored_after_seconds"] == 4.0
     assert extras["run"]["live"]["skipped_sets"] == 5
     assert not list(tmp_path.glob("*.part"))
 

@@ -104,6 +104,7 @@ def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
     list(record(whole, Now(kept_folder(whole), 5), pipeline, backend).reports)
     path = tmp_path / "x.sgs"
     run = record(path, Now(kept_folder(path), 5, newest_only=newest_only), pipeline, backend)
+    killed, kept = b"", {}
     for report in run.reports:
         if report.index + 1 == killed_after:
             killed = path.read_bytes()  # what a kill -9 leaves: no index

@@ -25,6 +25,7 @@ from structgstream.memory import resident_bytes
 
 FORMAT, VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0
+RATES = ("frames_in_per_second", "frames_out_per_second", "bits_per_second")
 RECENT = 30  # frames over which rates are taken
 
 
@@ -51,6 +52,7 @@ class RunMetrics:
         total: number of frames, None where it is unknown.
         done: number of frames that were there before.
         live: what live cameras do; None for a recording.
+        captured: when a frame was filmed, Unix time, by its number; None where that is not known.
         now: monotonic seconds.
         unix: Unix time.
     """
@@ -63,11 +65,13 @@ class RunMetrics:
         total: int | None = None,
         done: int = 0,
         live: Callable[[], LiveStatus] | None = None,
+        captured: Callable[[int], float | None] | None = None,
         now: Callable[[], float] = time.monotonic,
         unix: Callable[[], float] = time.time,
     ) -> None:
         self._stream, self._fps, self._total, self._done = stream, fps, total, done
-        self._live, self._now, self._unix = live, now, unix
+        self._live, self._captured, self._now, self._unix = live, captured, now, unix
+        self._age: float | None = None
         self._begun = now()
         self._state = RunState.WAITING
         self._recent: deque[tuple[float, FrameReport]] = deque(maxlen=RECENT)
@@ -82,11 +86,13 @@ class RunMetrics:
             self._recent.append((self._now(), report))
             self._done = report.index + 1
             self._bytes += report.bytes
+            filmed = None if self._captured is None else self._captured(report.index)
+            self._age = None if filmed is None else self._unix() - filmed
         self.write()
         if self._live is None:
             return {}
         taken = self.values()
-        keys = ("frames_out_per_second", "bits_per_second", "disk_free_bytes", "resident_bytes", "live")
+        keys = (*RATES, "stored_after_seconds", "disk_free_bytes", "resident_bytes", "live")
         return {"run": {key: taken[key] for key in keys}}
 
     def values(self) -> dict[str, Any]:
@@ -112,6 +118,7 @@ class RunMetrics:
                 "frames_in_per_second": None if live is None else _rate(arrived),
                 "frames_out_per_second": _rate([(at, report.index) for at, report in recent]),
                 "pts_seconds": None if last is None else last.pts_seconds,
+                "stored_after_seconds": self._age,
                 "bytes": self._bytes,
                 "bits_per_second": _bit_rate([report for _, report in recent], self._fps),
                 "seconds_by_stage": _mean([report.seconds for _, report in recent]),

@@ -3,9 +3,9 @@
 
 ``python tools/senders/send.py build/rig --transport udp --fps 10 --fault cam03:cut:20:10``
 
-Each camera's twelve frames are coded once and sent in a loop, as MPEG-TS over UDP, TCP or HTTP on this machine, so that
-ten cameras cost next to nothing. Stamps are Unix time, as far as MPEG-TS's 33 bits go: with ``clock = "unix"`` a reader
-knows when each picture was "filmed". ``build/rig/rig.toml`` is the rig file that goes with it.
+Each camera's twelve frames are coded once and sent in a loop, as MPEG-TS over UDP, TCP or HTTP, or by RTSP, on this
+machine, so that ten cameras cost next to nothing. Stamps of MPEG-TS are Unix time, as far as its 33 bits go: with
+``clock = "unix"`` a reader knows when each picture was "filmed". ``build/rig/rig.toml`` is the rig file for them.
 """
 
 import argparse
@@ -26,6 +26,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from rtsp import RtspCamera
 from structgstream.data.clip import bundled_clip, bundled_clip_path
 
 TICKS = 90_000
@@ -101,7 +102,7 @@ class Loop:
 class Line(Protocol):
     """Where the bytes of a camera go."""
 
-    def write(self, data: bytes) -> int: ...
+    def write(self, data: bytes, /) -> int: ...
 
     def close(self) -> None: ...
 
@@ -255,7 +256,7 @@ class SentCamera:
 
     name: str
     loops: Mapping[str, Loop]
-    line: Line
+    line: Line | RtspCamera
     fps: float
     troubles: Sequence[Trouble] = ()
     seed: int = 0
@@ -271,24 +272,27 @@ class SentCamera:
         since = number / self.fps
         faults = {trouble.fault for trouble in self.troubles if trouble.start <= since < trouble.start + trouble.length}
         if faults & {Fault.CUT, Fault.SILENT}:
-            if Fault.CUT in faults and isinstance(self.line, Served):
+            if Fault.CUT in faults and isinstance(self.line, Served | RtspCamera):
                 self.line.hang_up()
             self._cut = True
             return
         kind = next((fault.value for fault in (Fault.SIZE, Fault.SHAPE, Fault.STUCK) if fault in faults), "")
         loop = self.loops[kind]
         at = number % len(loop.packets)
-        if not self._ready(loop, at):
-            return
-        assert self._muxer is not None
         data = loop.packets[at]
         if Fault.GARBAGE in faults:
             data = data[:8] + self._random.randbytes(max(len(data) - 8, 0))
         stamp = begun + self._stamped(number, faults)
+        self.sent += 1
+        if isinstance(self.line, RtspCamera):
+            self.line.send(loop.template, data, stamp, key=at == 0)
+            return
+        if not self._ready(loop, at, self.line):
+            return
+        assert self._muxer is not None
         self._muxer.send(data, stamp, key=at == 0)
         if Fault.DUPLICATE in faults:
             self._muxer.send(data, stamp, key=at == 0)
-        self.sent += 1
 
     def delay(self, number: int) -> float:
         """How much later than filmed it is sent, seconds."""
@@ -303,16 +307,16 @@ class SentCamera:
         shift = {Fault.JUMP: 100.0, Fault.BACK: -100.0, Fault.DRIFT: 0.001 * stamp}
         return stamp + sum(shift.get(fault, 0.0) for fault in faults)
 
-    def _ready(self, loop: Loop, at: int) -> bool:
+    def _ready(self, loop: Loop, at: int, line: Line) -> bool:
         """Whether a muxer is open; it begins anew with a key frame after a cut, for a new client and another loop."""
-        fresh = isinstance(self.line, Served) and self.line.fresh.is_set()
+        fresh = isinstance(line, Served) and line.fresh.is_set()
         if self._muxer is None or self._muxer.loop is not loop or self._cut or fresh:
             if at:
                 return self._muxer is not None and self._muxer.loop is loop and not self._cut
-            self._muxer = _Muxer(loop, self.line)
+            self._muxer = _Muxer(loop, line)
             self._cut = False
-            if isinstance(self.line, Served):
-                self.line.fresh.clear()
+            if isinstance(line, Served):
+                line.fresh.clear()
         return True
 
 
@@ -352,17 +356,18 @@ def rig_text(urls: Mapping[str, str], calibration: Path, **settings: object) -> 
     lines = [f"calibration = {json.dumps(str(calibration))}"]
     lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
     for name, url in urls.items():
-        lines += ["", f"[cameras.{name}]", f"url = {json.dumps(url)}", 'format = "mpegts"']
+        further = 'options = {rtsp_transport = "tcp"}' if url.startswith("rtsp:") else 'format = "mpegts"'
+        lines += ["", f"[cameras.{name}]", f"url = {json.dumps(url)}", further]
     return "\n".join(lines) + "\n"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="where rig.toml is written")
-    parser.add_argument("--transport", choices=("udp", "tcp", "http"), default="udp")
+    parser.add_argument("--transport", choices=("udp", "tcp", "http", "rtsp"), default="udp")
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument("--seconds", type=float, default=float("inf"))
-    parser.add_argument("--clock", choices=("arrival", "stream", "unix"), default="unix")
+    parser.add_argument("--clock", choices=("arrival", "stream", "unix"), help="default: unix; arrival for RTSP")
     parser.add_argument(
         "--fault", type=Trouble.parsed, action="append", default=[], metavar="CAMERA:FAULT:START:LENGTH"
     )
@@ -382,13 +387,15 @@ def main() -> None:
     ]
     options.folder.mkdir(parents=True, exist_ok=True)
     file = options.folder / "rig.toml"
-    file.write_text(rig_text(urls, bundled_clip_path(), clock=options.clock, fps=options.fps))
+    clock = options.clock or ("arrival" if options.transport == "rtsp" else "unix")
+    file.write_text(rig_text(urls, bundled_clip_path(), clock=clock, fps=options.fps))
     print(f"{len(cameras)} cameras send; structgstream reconstruct {file} --live -o live.sgs", flush=True)
     film(cameras, threading.Event(), seconds=options.seconds)
 
 
-def _lines(transport: str, names: Sequence[str]) -> tuple[dict[str, Line], dict[str, str]]:
-    made: dict[str, Callable[[], tuple[Line, str]]] = {"udp": _udp, "tcp": _tcp, "http": _http}
+def _lines(transport: str, names: Sequence[str]) -> tuple[dict[str, Line | RtspCamera], dict[str, str]]:
+    made: dict[str, Callable[[], tuple[Line | RtspCamera, str]]]
+    made = {"udp": _udp, "tcp": _tcp, "http": _http, "rtsp": _rtsp}
     pairs = {name: made[transport]() for name in names}
     return {name: line for name, (line, _) in pairs.items()}, {name: url for name, (_, url) in pairs.items()}
 
@@ -406,6 +413,11 @@ def _tcp() -> tuple[Line, str]:
 def _http() -> tuple[Line, str]:
     served = Served(http=True)
     return served, f"http://127.0.0.1:{served.port}/"
+
+
+def _rtsp() -> tuple[RtspCamera, str]:
+    camera = RtspCamera()
+    return camera, camera.url
 
 
 def _numbers() -> Iterator[int]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
@@ -79,7 +79,7 @@ class Dashboard:
 
     def _drawn(self) -> Panel:
         values = self._values()
-        parts = [Text(state_line(values)), Text(stages_line(values), style="dim")]
+        parts: list[RenderableType] = [Text(state_line(values)), Text(stages_line(values), style="dim")]
         if values.get("live") is not None:
             parts.append(cameras_table(values["live"]["cameras"]))
         parts += [Text(self._last), Text(self._step, style="dim")]

@@ -77,6 +77,17 @@ def open_live(scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream:
         return LiveSource(scene, stream, options)
 
 
+def run_metrics(source: "FrameStream", stream: Path) -> "RunMetrics":
+    """The metrics of a run that writes ``stream``."""
+    from structgstream.data.live.source import LiveSource
+    from structgstream.data.source import frame_count
+    from structgstream.run_metrics import RunMetrics
+
+    if isinstance(source, LiveSource):
+        return RunMetrics(stream, fps=source.fps, live=source.status, captured=source.captured)
+    return RunMetrics(stream, fps=source.fps, total=frame_count(source))
+
+
 @contextmanager
 def watched(source: "FrameStream", metrics: "RunMetrics", *, done: int) -> Iterator[Display]:
     """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame that is fitted."""

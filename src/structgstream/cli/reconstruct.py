@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
-from structgstream.cli.live_run import LiveChoice, open_live, watched
+from structgstream.cli.live_run import LiveChoice, open_live, run_metrics, watched
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -139,11 +139,10 @@ def run_reconstruction(
     """
     from structgstream.data.source import frame_count
     from structgstream.recorder import record
-    from structgstream.run_metrics import RunMetrics
     from structgstream.struct_gstream import stream_pipeline
 
     total = frame_count(source)
-    metrics = RunMetrics(output, fps=source.fps, total=total, live=getattr(source, "status", None))
+    metrics = run_metrics(source, output)
     run = record(
         output,
         source,

@@ -8,6 +8,7 @@ from contextlib import closing
 from typing import Any
 
 import av
+import av.error
 import numpy as np
 import pytest
 
@@ -218,3 +219,24 @@ def test_what_is_no_video_is_gone() -> None:
     received, faults = read(np.random.default_rng(0).bytes(20_000))
     assert received.pictures == []
     assert faults == {"gone": 1}
+
+
+def unstamped(stream: bytes, first: int) -> bytes:
+    """The stream with the first pictures' times taken out of their headers."""
+    packets, left = bytearray(stream), first
+    for start in range(0, len(packets), 188):
+        header = start + 4 + (packets[start + 4] + 1 if packets[start + 3] & 0x20 else 0)
+        if left and packets[start + 1] & 0x40 and packets[header : header + 4] == b"\0\0\1\xe0":
+            packets[header + 7] &= 0x3F
+            packets[header + 9 : header + 14] = b"\xff" * 5
+            left -= 1
+    return bytes(packets)
+
+
+@pytest.mark.parametrize("base", [TimeBase.ARRIVAL, TimeBase.STREAM])
+def test_the_first_pictures_of_a_connection_may_have_no_stamps(base: TimeBase) -> None:
+    received, faults = read(unstamped(sent_stream(), 3), base=base)
+    assert "jump" not in faults
+    assert len(received.pictures) >= 50
+    times = [p.seconds for p in received.pictures]
+    assert times == sorted(set(times))

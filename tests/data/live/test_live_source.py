@@ -102,6 +102,21 @@ def test_sets_of_one_instant_come_over_the_network(tmp_path: Path, transport: st
     assert 0.0 < delay < 30.0
 
 
+def test_network_cameras_are_asked_by_rtsp_and_asked_again(tmp_path: Path) -> None:
+    """Their stamps begin anew with each connection, so arrival says when a picture was taken."""
+    with sending("rtsp", "a:cut:1.5:0.5") as urls:
+        path = rig_file(tmp_path, urls, clock="arrival", deadline_seconds=0.3, silent_seconds=2)
+        source, seen = LiveSource(path, tmp_path / "x.sgs"), []
+        for frame in source.frames():
+            seen.append("a" in frame.images)
+            if False in seen and seen[-1]:
+                break
+            assert frame.index < 900
+    assert seen[0]
+    assert source.faults.counts["a"]["gone"] >= 1
+    assert "jump" not in source.faults.counts["b"]
+
+
 def test_latest_skips_what_was_filmed_while_nobody_asked(tmp_path: Path) -> None:
     with sending("udp") as urls:
         source = LiveSource(rig_file(tmp_path, urls, clock="unix"), tmp_path / "x.sgs", LiveOptions(frames=3))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 FIRST_WAIT_SECONDS, MOST_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_STAMPS = 2**33
+MOST_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000"}  # half of FFmpeg's, so that pictures come sooner
 
@@ -108,6 +109,7 @@ class CameraFeed:
         self._damaged, self._shown = True, False
         self._gone_since: float | None = None
         self._paced: float | None = None
+        self._without_stamp = 0
         self.ended = False
         self.decoded = 0
         self.changed_at = -float("inf")
@@ -217,14 +219,11 @@ class CameraFeed:
         """When the picture was taken, on the common clock; None if it must not be used."""
         unix = arrived + self._unix_offset
         if frame.pts is None or frame.time_base is None:
-            if self._base is not TimeBase.ARRIVAL:
-                text = 'sends pictures without time stamps; take clock = "arrival" for this rig'
-                self._faults.tell(self.name, Fault.NO_STAMP, text)
-                return None
-            self._faults.count(self.name, Fault.NO_STAMP)
-            stamp, wrap_seconds = unix, None
+            stamp, wrap_seconds = self._unstamped(unix), None
         else:
-            stamp = float(frame.pts * frame.time_base)
+            stamp, self._without_stamp = float(frame.pts * frame.time_base), 0
+        if stamp is None:
+            return None
         placed = self._stamps.place(stamp, arrived=unix, wrap_seconds=wrap_seconds)
         if placed.fault is Fault.JUMP:
             text = f"has set its clock by {placed.jump_seconds:+.3f} s; its pictures go on in step with their arrival"
@@ -234,6 +233,17 @@ class CameraFeed:
         elif placed.fault is Fault.REORDERED:
             self._faults.tell(self.name, placed.fault, "sends pictures whose time stamps go back; they are left out")
         return placed.seconds
+
+    def _unstamped(self, unix: float) -> float | None:
+        """What stands for the stamp of a picture without one; None if it must not be used."""
+        self._faults.count(self.name, Fault.NO_STAMP)
+        self._without_stamp += 1
+        if self._base is not TimeBase.ARRIVAL:
+            text = 'sends pictures without time stamps; take clock = "arrival" for this rig if all are'
+            self._faults.say(self.name, Fault.NO_STAMP.value, text)
+            return None
+        # The first ones of a connection may have none, and others that follow do.
+        return unix if self._without_stamp > MOST_UNSTAMPED else None
 
     def _fits(self, frame: "VideoFrame") -> bool:
         """Whether the picture has the proportions that were calibrated; a uniform reduction has."""

@@ -45,6 +45,7 @@ Policy = Literal["latest", "every"]
 POLL_SECONDS = 0.2
 QUEUE_GIGABYTES = 10.0
 HEARTBEAT_SECONDS = 5.0
+LATEST_KNOWN = 16  # frames of which it is remembered when they were filmed
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class LiveSource:
         self._arrivals: Arrivals | None = None
         self._handed: deque[float] = deque(maxlen=64)
         self._delay_seconds: float | None = None
+        self._captured: dict[int, float] = {}
 
     @property
     def newest_only(self) -> bool:
@@ -149,6 +151,10 @@ class LiveSource:
             index = frame.index + 1
         if (most is None or index < most) and not self.stopped:
             yield from self._live_frames(index)
+
+    def captured(self, index: int) -> float | None:
+        """When one of the last frames was filmed, Unix time; None if that is not known."""
+        return self._captured.get(index)
 
     def status(self) -> LiveStatus:
         """What cameras and queues do now."""
@@ -203,6 +209,8 @@ class LiveSource:
         self._handed.append(now)
         if frame.captured_unix_seconds is not None:
             self._delay_seconds = now + self._unix_offset - frame.captured_unix_seconds
+            self._captured[frame.index] = frame.captured_unix_seconds
+            self._captured.pop(frame.index - LATEST_KNOWN, None)
 
     def _calibrated(self, arrived: Iterator[MultiViewFrame]) -> FrameSource:
         options = self._options
