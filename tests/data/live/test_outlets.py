@@ -122,3 +122,19 @@ def test_what_an_earlier_run_left_is_removed(tmp_path: Path) -> None:
     outlet = DiskQueue(tmp_path, most_bytes=10**6, convert=convert)
     assert list(tmp_path.iterdir()) == []
     outlet.close()
+
+
+def test_a_resumed_run_takes_what_waited_when_it_was_killed(tmp_path: Path) -> None:
+    killed = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert)
+    for number in range(5):
+        killed.put(one_set(number))
+    assert taken(killed) == 0.0
+    while len(list((tmp_path / "q").glob("set-*"))) < 4:
+        threading.Event().wait(0.001)
+    (tmp_path / "q" / "set-00000005.part").write_bytes(b"half")
+    again = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert, resume=True)
+    again.put(one_set(9))
+    assert [taken(again) for _ in range(5)] == [1, 2, 3, 4, 9]
+    assert again.status.waiting_bytes == 0
+    again.close()
+    killed.close()

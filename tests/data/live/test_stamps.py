@@ -90,6 +90,20 @@ def test_cameras_whose_common_clock_is_set_stay_in_step_exactly() -> None:
     assert other.seconds == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("base", TimeBase)
+@pytest.mark.parametrize("stamp", [0.0, 3.0, 5000.0])
+def test_stamps_of_a_new_connection_may_begin_anew(base: TimeBase, stamp: float) -> None:
+    reader = StampReader(base)
+    placed(reader, np.arange(91) * PERIOD, UNIX + np.arange(91) * PERIOD)
+    reader.reconnect()
+    found = [reader.place(stamp + t, arrived=UNIX + 10 + t) for t in np.arange(30) * PERIOD]
+    assert {item.fault for item in found} == {None}
+    if base is TimeBase.ARRIVAL or stamp != 3.0:
+        assert np.allclose(seconds_of(found), found[0].seconds + np.arange(30) * PERIOD, atol=1e-5)
+    if base is TimeBase.ARRIVAL:
+        assert found[0].seconds == pytest.approx(UNIX + 10, abs=1e-3)
+
+
 def test_duplicates_and_stamps_that_go_back_are_left_out() -> None:
     reader = StampReader(TimeBase.STREAM)
     stamps = [0.0, 0.1, 0.1, 0.3, 0.2, 0.4]

@@ -110,6 +110,7 @@ class CameraFeed:
         self._gone_since: float | None = None
         self._paced: float | None = None
         self._without_stamp = 0
+        self._proper = True
         self.ended = False
         self.decoded = 0
         self.changed_at = -float("inf")
@@ -159,6 +160,7 @@ class CameraFeed:
         if stream.codec_context is None:
             raise ValueError("its coding is unknown to the installed PyAV")
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
+        self._stamps.reconnect()
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
         self._damaged, self._shown = True, False  # until the first key frame, before which it is none that counts
         for packet in container.demux(stream):
@@ -168,7 +170,8 @@ class CameraFeed:
             for frame in self._frames(packet):
                 wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
                 shift = self._picture(frame, wrap)
-            if self._keeper is not None and packet.size and not packet.is_corrupt and not self._damaged:
+            usable = self._proper and not self._damaged and not packet.is_corrupt
+            if self._keeper is not None and packet.size and usable:
                 self._keeper.keep(packet, shift_seconds=self._stamps.shift if shift is None else shift)
 
     def _frames(self, packet: "Packet") -> "Iterable[VideoFrame]":
@@ -203,7 +206,8 @@ class CameraFeed:
         self.decoded += 1
         self._back(arrived)
         seconds = self._placed(frame, arrived, wrap_seconds)
-        if seconds is not None and self._fits(frame) and not self._stands_still(frame, arrived):
+        self._proper = self._fits(frame)
+        if seconds is not None and self._proper and not self._stands_still(frame, arrived):
             self._receiver.deliver(self.name, LivePicture(seconds, arrived, frame))
         return self._stamps.shift
 

@@ -98,7 +98,8 @@ class DiskQueue:
     come faster than they can be written; both are told.
 
     Args:
-        folder: is made, and removed at the end; files of an earlier run in it are removed.
+        folder: is made, and removed at the end.
+        resume: whether sets that an earlier run was killed over are taken first; else they are removed.
         most_bytes: of its files.
         convert: makes a set's pictures.
 
@@ -108,7 +109,7 @@ class DiskQueue:
 
     newest_only = False
 
-    def __init__(self, folder: Path, *, most_bytes: int, convert: Convert) -> None:
+    def __init__(self, folder: Path, *, most_bytes: int, convert: Convert, resume: bool = False) -> None:
         self._folder, self._most, self._convert = folder, most_bytes, convert
         self._sets: deque[PictureSet] = deque()
         self._files: deque[tuple[Path, int]] = deque()
@@ -118,10 +119,15 @@ class DiskQueue:
         self._changed = threading.Condition()
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            for file in folder.glob("set-*"):
-                file.unlink()
+            for file in sorted(folder.glob("set-*")):
+                if resume and file.suffix != ".part":
+                    self._files.append((file, file.stat().st_size))
+                else:
+                    file.unlink()
         except OSError as error:
             raise StorageError(f"The queue {folder} cannot be used ({error.strerror}).") from None
+        self._bytes = sum(size for _, size in self._files)
+        self._number = int(self._files[-1][0].name.removeprefix("set-")) + 1 if self._files else 0
         self._writer = threading.Thread(target=self._write, name="queue", daemon=True)
         self._writer.start()
 
@@ -175,11 +181,10 @@ class DiskQueue:
         self._writer.join()
         for path in self._folder.glob("set-*"):
             path.unlink(missing_ok=True)
-        if not any(self._folder.iterdir()):
+        if self._folder.is_dir() and not any(self._folder.iterdir()):
             self._folder.rmdir()
 
     def _write(self) -> None:
-        number = 0
         while True:
             with self._changed:
                 while not self._sets and not self._closed:
@@ -189,8 +194,8 @@ class DiskQueue:
                 found = self._sets.popleft()
                 self._writing = True
             try:
-                path = self._folder / f"set-{number:08d}"
-                number += 1
+                path = self._folder / f"set-{self._number:08d}"
+                self._number += 1
                 size = write_pictures(path, self._convert(found), sync=False)
                 self._add(path, size)
             except BaseException as error:  # raised where the trainer asks for the next set

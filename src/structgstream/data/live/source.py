@@ -294,4 +294,5 @@ class LiveSource:
         if self._options.policy == "latest":
             return Latest(convert)
         most = round(self._options.queue_gigabytes * GIGABYTE)
-        return DiskQueue(self._stream.with_suffix(".queue"), most_bytes=most, convert=convert)
+        folder = self._stream.with_suffix(".queue")
+        return DiskQueue(folder, most_bytes=most, convert=convert, resume=self._options.resume)

@@ -95,12 +95,17 @@ class StampReader:
         self._stamp: float | None = None
         self._seconds = -float("inf")
         self._shift = self._turns = 0.0
+        self._fresh = False
 
     @property
     def shift(self) -> float:
         """What is added to a stamp as it comes, to get the time on the common clock."""
         least = self._least.value if self._base is TimeBase.ARRIVAL else self._shift
         return self._turns + least + self._offset
+
+    def reconnect(self) -> None:
+        """The next picture is the first of a new connection, whose stamps may begin anew without a fault."""
+        self._fresh = True
 
     def place(self, stamp: float, *, arrived: float, wrap_seconds: float | None = None) -> Placed:
         """Where the next picture lies.
@@ -115,7 +120,10 @@ class StampReader:
         if wrap_seconds is not None:  # the turn that brings it nearest: FFmpeg may have added one of its own
             self._turns = round((self._stamp - stamp) / wrap_seconds) * wrap_seconds
         stamp += self._turns
-        step, delay = stamp - self._stamp, arrived - stamp
+        step, delay, fresh = stamp - self._stamp, arrived - stamp, self._fresh
+        self._fresh = False
+        if fresh and (step <= 0 or delay < self._least.value - JUMP_SECONDS):
+            return Placed(self._jumped(stamp, delay, arrived).seconds)
         if abs(step) < SAME_SECONDS:
             return Placed(None, Fault.DUPLICATE)
         if step <= -JUMP_SECONDS or delay < self._least.value - JUMP_SECONDS:
