@@ -64,7 +64,7 @@ class RtspCamera:
                 client, _ = self._listener.accept()
             except OSError:
                 return
-            client.settimeout(30.0)
+            client.settimeout(120.0)  # twice as long as a session lives without a request
             with self._lock:
                 self._clients[client] = None
             threading.Thread(target=self._serve, args=(client,), daemon=True).start()

@@ -14,6 +14,7 @@ import pytest
 from rigs import arc_rig
 from senders import moving_pictures, sender, sent_loops, sent_stream
 from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.live import recording
 from structgstream.data.live.source import LiveOptions, LiveSource
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
@@ -240,6 +241,16 @@ def test_a_recording_that_is_cut_can_be_read_up_to_there(tmp_path: Path) -> None
     again = open_capture(folder)
     assert 15 <= len(again) < 30
     assert all(shown(frame.images["c"]) == frame.index % 12 for frame in again.frames() if "c" in frame.images)
+
+
+def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part ends within the first group of 12 frames, so the next begins with the second."""
+    monkeypatch.setattr(recording, "PART_SECONDS", recording.LEAD_SECONDS + 0.3)
+    folder = tmp_path / "take"
+    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    first, second = (list(open_capture(part).frames()) for part in (folder, folder / "part-001"))
+    assert [shown(frame.images["b"]) for frame in first] == list(range(12))
+    assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
 
 
 def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
