@@ -16,7 +16,7 @@ WRAP = 2**33
 
 
 def stamps(stream: bytes) -> list[int]:
-    with av.open(io.BytesIO(stream)) as container:
+    with av.open(io.BytesIO(stream), "r") as container:
         return [packet.pts for packet in container.demux(video=0) if packet.pts is not None]
 
 

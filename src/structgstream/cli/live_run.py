@@ -5,7 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -89,18 +89,21 @@ def run_metrics(source: "FrameStream", stream: Path) -> "RunMetrics":
 
 
 @contextmanager
-def watched(source: "FrameStream", metrics: "RunMetrics", *, done: int) -> Iterator[Display]:
+def watched(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> Iterator[Display]:
     """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame that is fitted."""
     from structgstream.cli.dashboard import live_display
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
 
-    if not isinstance(source, LiveSource):
-        with metrics.running(), display(frame_count(source), done=done) as shown:
-            yield shown
-        return
-    with metrics.running(), source, stopping(source), live_display(metrics.values, frames=None, done=done) as shown:
-        yield shown
+    with ExitStack() as stack:
+        if metrics is not None:
+            stack.enter_context(metrics.running())
+        if isinstance(source, LiveSource) and metrics is not None:
+            stack.enter_context(source)
+            stack.enter_context(stopping(source))
+            yield stack.enter_context(live_display(metrics.values, frames=None, done=done))
+        else:
+            yield stack.enter_context(display(frame_count(source), done=done))
 
 
 @contextmanager

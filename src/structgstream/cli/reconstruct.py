@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
+    from structgstream.run_metrics import RunMetrics
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,7 @@ def main(arguments: list[str]) -> None:
         backend=backend,
         metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
         resume=options.resume,
+        metrics=run_metrics(source, options.output),
     )
     if peaks:
         stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
@@ -127,8 +129,18 @@ def run_reconstruction(
     backend: "Backend",
     metadata: Mapping[str, object],
     resume: bool = False,
+    metrics: "RunMetrics | None" = None,
 ) -> dict[str, int]:
     """Reconstructs ``source`` into the file ``output``, replacing what is there unless it is resumed.
+
+    Args:
+        source: the capture, or live cameras, which need ``metrics``.
+        config: of the stream.
+        output: the stream file.
+        backend: the compute back-end.
+        metadata: for the header.
+        resume: continue after the last whole frame.
+        metrics: what the run does is written beside ``output``, too.
 
     Returns:
         the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
@@ -142,7 +154,6 @@ def run_reconstruction(
     from structgstream.struct_gstream import stream_pipeline
 
     total = frame_count(source)
-    metrics = run_metrics(source, output)
     run = record(
         output,
         source,
@@ -151,7 +162,7 @@ def run_reconstruction(
         resume=resume,
         metadata=metadata,
         on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
-        remarks=metrics.frame,
+        remarks=None if metrics is None else metrics.frame,
     )
     done = run.done
     peaks: dict[str, int] = {}

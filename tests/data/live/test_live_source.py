@@ -19,7 +19,7 @@ from structgstream.data.live.source import LiveOptions, LiveSource
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.source import frame_count, may_read_ahead
-from structgstream.errors import CaptureError, ConfigError
+from structgstream.errors import CaptureError, ConfigError, StorageError
 
 NAMES = ("a", "b", "c")
 FPS = 30.0
@@ -251,6 +251,20 @@ def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeyp
     first, second = (list(open_capture(part).frames()) for part in (folder, folder / "part-001"))
     assert [shown(frame.images["b"]) for frame in first] == list(range(12))
     assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
+
+
+def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(self: object, number: int, file: str, line: str) -> None:
+        raise StorageError("no room")
+
+    monkeypatch.setattr(recording.Recording, "note", full)
+    options = LiveOptions(policy="every", record=tmp_path / "take", frames=4)
+    with caplog.at_level(logging.WARNING):
+        frames = list(LiveSource(files(tmp_path), tmp_path / "x.sgs", options).frames())
+    assert len(frames) == 4
+    assert "camera 'b' is no longer recorded (no room); the stream goes on" in caplog.text
 
 
 def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from structgstream.data.source import FrameSource
 from structgstream.data.timeline import LEAST_CAMERAS
 from structgstream.data.video_index import load_av
 from structgstream.data.video_pictures import srgb
-from structgstream.errors import ConfigError
+from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 
 log = logging.getLogger(__name__)
@@ -189,11 +189,17 @@ class LiveSource:
                 frame = replace(frame, index=index, pts_seconds=pts)
                 self._kept.keep(frame, origin_seconds=origin)
                 if recording is not None:
-                    recording.frame(frame, common_seconds=seconds)
+                    self._note(recording, frame, seconds)
                 self._hand(frame)
                 yield frame
                 if self._options.frames is not None and index + 1 >= self._options.frames:
                     return
+
+    def _note(self, recording: Recording, frame: MultiViewFrame, seconds: float) -> None:
+        try:
+            recording.frame(frame, common_seconds=seconds)
+        except StorageError as error:  # the stream is worth more than notes on it
+            self.faults.say("all", "recording", f"are no longer noted in the recording: {error}")
 
     def _origin(self, origin: float | None, seconds: float, before: float | None) -> float:
         """The common clock at presentation time 0; it is set anew where it would not let time rise."""
