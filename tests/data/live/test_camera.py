@@ -5,6 +5,7 @@ import io
 import itertools
 import logging
 from contextlib import closing
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from senders import moving_pictures, sent_stream
-from structgstream.data.live.camera import CameraFeed
+from structgstream.data.live.camera import MOST_UNSTAMPED, CameraFeed
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.live.matching import LivePicture
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
@@ -60,13 +61,32 @@ class Received:
         return [round((b - a) / PERIOD) for a, b in itertools.pairwise(times)]
 
 
+def camera_feed(received: Received, *, base: TimeBase, **opening: Any) -> tuple[CameraFeed, FaultLog]:
+    """A camera of 128x96 pixels in a time of its own, and its faults."""
+    ticks, faults = itertools.count(), FaultLog("rig", now=lambda: 0.0)
+    feed = CameraFeed(
+        "a",
+        LiveCamera("udp://nowhere"),
+        size=(128, 96),
+        receiver=received,
+        stamps=StampReader(base),
+        faults=faults,
+        base=base,
+        now=lambda: next(ticks) * PERIOD / 2,
+        unix_offset=1000.0,
+        silent_seconds=5.0,
+        stuck_seconds=1.0,
+        **opening,
+    )
+    return feed, faults
+
+
 def read(
     *streams: bytes | Exception, base: TimeBase = TimeBase.STREAM, received: Received | None = None
 ) -> tuple[Received, dict[str, int]]:
     """What a camera delivers that is opened for each of ``streams``, and its faults."""
     received = Received() if received is None else received
-    waiting, ticks = list(streams), itertools.count()
-    faults = FaultLog("rig", now=lambda: 0.0)
+    waiting = list(streams)
     waits: list[float] = []
 
     def opens(camera: LiveCamera, timeout: float) -> Any:
@@ -80,21 +100,7 @@ def read(
         if not waiting:
             feed.stop()
 
-    feed = CameraFeed(
-        "a",
-        LiveCamera("udp://nowhere"),
-        size=(128, 96),
-        receiver=received,
-        stamps=StampReader(base),
-        faults=faults,
-        base=base,
-        now=lambda: next(ticks) * PERIOD / 2,
-        unix_offset=1000.0,
-        silent_seconds=5.0,
-        stuck_seconds=1.0,
-        opens=opens,
-        wait=wait,
-    )
+    feed, faults = camera_feed(received, base=base, opens=opens, wait=wait)
     feed.start()
     feed.join(WAIT)
     received.waits = waits
@@ -221,22 +227,20 @@ def test_what_is_no_video_is_gone() -> None:
     assert faults == {"gone": 1}
 
 
-def unstamped(stream: bytes, first: int) -> bytes:
-    """The stream with the first pictures' times taken out of their headers."""
-    packets, left = bytearray(stream), first
-    for start in range(0, len(packets), 188):
-        header = start + 4 + (packets[start + 4] + 1 if packets[start + 3] & 0x20 else 0)
-        if left and packets[start + 1] & 0x40 and packets[header : header + 4] == b"\0\0\1\xe0":
-            packets[header + 7] &= 0x3F
-            packets[header + 9 : header + 14] = b"\xff" * 5
-            left -= 1
-    return bytes(packets)
-
-
 @pytest.mark.parametrize("base", [TimeBase.ARRIVAL, TimeBase.STREAM])
-def test_the_first_pictures_of_a_connection_may_have_no_stamps(base: TimeBase) -> None:
-    received, faults = read(unstamped(sent_stream(), 3), base=base)
-    assert "jump" not in faults
-    assert len(received.pictures) >= 50
-    times = [p.seconds for p in received.pictures]
-    assert times == sorted(set(times))
+def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixture) -> None:
+    """The first ones of a connection wait for stamps; a camera that has none is timed by arrival, if that is asked."""
+    feed, faults = camera_feed(Received(), base=base)
+    frames = [SimpleNamespace(pts=None, time_base=None)] * 60
+    with caplog.at_level(logging.WARNING):
+        placed = [feed._placed(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
+    assert placed[:MOST_UNSTAMPED] == [None] * MOST_UNSTAMPED
+    assert faults.counts["a"] == {"no stamp": 60}
+    if base is TimeBase.ARRIVAL:
+        steps = np.diff(np.array(placed[MOST_UNSTAMPED:], np.float64))
+        assert np.allclose(steps, PERIOD)
+    else:
+        assert placed == [None] * 60
+        assert 'take clock = "arrival"' in caplog.text
+    stamped = SimpleNamespace(pts=90, time_base=1)
+    assert feed._placed(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
