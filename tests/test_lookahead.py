@@ -65,3 +65,18 @@ def test_leaving_early_waits_for_the_maker_and_closes_the_items() -> None:
         work()
     assert closed == [threading.main_thread()]
     assert not any(thread.name.startswith("lookahead") for thread in threading.enumerate())
+
+
+def test_without_looking_ahead_an_item_is_made_when_it_is_asked_for() -> None:
+    made: list[int] = []
+
+    def items() -> Iterator[int]:
+        for number in range(3):
+            made.append(number)
+            yield number
+
+    with Lookahead(items(), ahead=False) as asked:
+        assert made == []
+        assert next(asked) == 0
+        assert made == [0]
+        assert list(asked) == [1, 2]

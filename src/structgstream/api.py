@@ -14,7 +14,7 @@ from typing import Literal
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.data.open import open_capture
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
 from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
@@ -87,7 +87,7 @@ def check(capture: Path | str, *, report: Path | str | None = None) -> CheckRepo
 
 
 def reconstruct(
-    capture: FrameSource | Path | str,
+    capture: FrameStream | Path | str,
     path: Path | str,
     *,
     preset: StreamConfig | str = DEFAULT_PRESET,
@@ -113,7 +113,7 @@ def reconstruct(
     has seconds by stage and memory of each frame.
 
     Args:
-        capture: the folder of a capture, or an opened one.
+        capture: the folder of a capture, or an opened one, such as a ``LiveSource``, which is read until it ends.
         path: the stream file to write; the folder, if it is written as segments.
         preset: name of a preset, or a configuration (``dataclasses.replace`` on one of ``PRESETS``).
         quality: of compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.

@@ -20,12 +20,14 @@ class MultiViewFrame:
             delivers them; training never reads them.
         masks: camera name to ``[H, W]`` bool, True where the picture counts. A camera that is missing here counts
             everywhere.
+        captured_unix_seconds: when it was filmed, Unix time, if the cameras are live.
     """
 
     index: int
     pts_seconds: float
     images: Mapping[str, NDArray[np.uint8]]
     masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    captured_unix_seconds: float | None = None
 
     def present(self, names: Iterable[str]) -> tuple[str, ...]:
         """Those of the cameras ``names`` whose picture counts somewhere, in their order."""

@@ -5,7 +5,7 @@ import torch
 
 from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig, initial_points
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameStream
 from structgstream.data.timeline import LEAST_CAMERAS
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
@@ -33,7 +33,7 @@ def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -
 
 
 def initial_points_of(
-    source: FrameSource, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
+    source: FrameStream, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
 ) -> torch.Tensor:
     """Normalised points ``[P, 3]`` of the capture, or estimated from ``frame``, after checking the poses."""
     from structgstream.data.pose_check import check_poses

@@ -12,17 +12,21 @@ T = TypeVar("T")
 class Lookahead(Generic[T]):
     """An iterator over ``items`` that prefetches one item.
 
+    With ``ahead=False`` nothing is prefetched: each item is computed when it is asked for, by who asks.
+
     An exception raised by ``items`` surfaces from the ``next`` call that would have returned that item. Leaving the
     ``with`` block waits for the item being computed, and calls ``items.close`` if it exists.
     """
 
-    def __init__(self, items: Iterator[T]) -> None:
+    def __init__(self, items: Iterator[T], *, ahead: bool = True) -> None:
         self._items = items
+        self._ahead = ahead
         self._maker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lookahead")
         self._next: Future[tuple[T] | None] | None = None
 
     def __enter__(self) -> "Lookahead[T]":
-        self._next = self._maker.submit(self._made)
+        if self._ahead:
+            self._next = self._maker.submit(self._made)
         return self
 
     def __exit__(
@@ -41,6 +45,8 @@ class Lookahead(Generic[T]):
         Raises:
             StopIteration: there is none.
         """
+        if not self._ahead:
+            return next(self._items)
         if self._next is None:
             raise StopIteration
         ready, self._next = self._next, None

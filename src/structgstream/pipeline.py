@@ -180,8 +180,8 @@ class StreamCodec(Protocol[State]):
         """Frames from one key packet to the next."""
         ...
 
-    def file(self, path: Path, *, frames: int, resume: bool) -> tuple[PacketSink, StoredStream[State] | None]:
-        """A sink to the file, which will have ``frames`` frames, and its existing frames if it is resumed."""
+    def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[PacketSink, StoredStream[State] | None]:
+        """A sink to the file, which will have ``frames`` frames (None: unknown), and its existing frames if resumed."""
         ...
 
     def prepare(self, fitted: State, task: FrameTask, facts: StreamFacts) -> tuple[State, StreamHeader]:

@@ -13,8 +13,8 @@ from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.stored_segments import StoredSegments, resume_segments
-from structgstream.data.prefetch import Prefetch
-from structgstream.data.source import FrameSource
+from structgstream.data.prefetch import read_ahead
+from structgstream.data.source import FrameStream, frame_count
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
 from structgstream.frame_report import FrameReport
@@ -45,7 +45,7 @@ class Run:
 
 def record(
     path: Path,
-    source: FrameSource,
+    source: FrameStream,
     pipeline: Pipeline[State, Memory],
     backend: Backend,
     *,
@@ -61,7 +61,7 @@ def record(
 
     Args:
         path: the file; an existing one is replaced unless it is resumed.
-        source: the capture; its frames are read ahead.
+        source: the capture; frames of a recording are read ahead.
         pipeline: fits and stores frames.
         backend: the compute back-end.
         resume: continue after the last whole frame of an existing file.
@@ -76,10 +76,10 @@ def record(
         StorageError: the file or the log cannot be written; whole frames stay in the file.
     """
     if storage is None:
-        sink, resumed = pipeline.codec.file(path, frames=len(source), resume=resume)
+        sink, resumed = pipeline.codec.file(path, frames=frame_count(source), resume=resume)
     else:
         sink, resumed = storage(resume)
-    session = Session(Prefetch(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
+    session = Session(read_ahead(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
     return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
 

@@ -52,7 +52,7 @@ class SceneCodec(ABC):
         """Frames from one key packet to the next."""
         return max(1, round(fps * self.config.key_interval_seconds))
 
-    def file(self, path: Path, *, frames: int, resume: bool) -> tuple[FileSink, StreamReader | None]:
+    def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[FileSink, StreamReader | None]:
         """A sink to the file, which is replaced unless it is resumed; ``frames`` is not used.
 
         Raises:

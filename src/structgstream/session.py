@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The frame loop: fit, encode, write; the next frame starts from the decoded one (Note [Closed loop]).
 
-While a frame is fitted, the next one is read and its pictures preprocessed (``lookahead``).
+While a frame is fitted, the next one is read and its pictures preprocessed (``lookahead``); a live source that
+hands out its newest frame is asked only when the frame before is stored.
 """
 
 from collections import deque
@@ -12,7 +13,7 @@ from typing import Generic
 
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameStream, frame_count, may_read_ahead
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
@@ -31,7 +32,7 @@ class Session(Generic[State, Memory]):
     """Reconstructs a capture into a sink, frame by frame.
 
     Args:
-        source: the capture.
+        source: the capture, or a live one, which is read until it ends or the loop is stopped.
         sink: where packets go.
         pipeline: how frames are fitted and stored, such as ``stream_pipeline(PRESETS["compact"])``.
         backend: the compute back-end.
@@ -46,7 +47,7 @@ class Session(Generic[State, Memory]):
 
     def __init__(
         self,
-        source: FrameSource,
+        source: FrameStream,
         sink: PacketSink,
         pipeline: Pipeline[State, Memory],
         backend: Backend,
@@ -84,15 +85,15 @@ class Session(Generic[State, Memory]):
         A complete stream is not changed. Otherwise the sink is closed, with its index, however the loop ends; after a
         failed write there is no index.
         """
-        resumed = self._resumed
-        if resumed is not None and resumed.complete and len(resumed) >= len(self._source):
+        resumed, total = self._resumed, frame_count(self._source)
+        if resumed is not None and resumed.complete and total is not None and len(resumed) >= total:
             return
         try:
             if resumed is None:
                 yield from self._frames(None, 0)
             else:
                 self._reopen(resumed)
-                if len(resumed) < len(self._source):
+                if total is None or len(resumed) < total:
                     yield from self._frames(self._restore_past(resumed), len(resumed))
         except BaseException:
             with suppress(StorageError):  # The first error is the one to report.
@@ -102,7 +103,7 @@ class Session(Generic[State, Memory]):
 
     def _frames(self, past: Past[State, Memory] | None, start: int) -> Iterator[FrameReport]:
         method = self._pipeline.method
-        with Lookahead(self._observe_frames(start)) as observed:
+        with Lookahead(self._observe_frames(start), ahead=may_read_ahead(self._source)) as observed:
             for meter, task in metered(self._tasks(observed), self._backend.device):
                 fit = method.first(task) if past is None else method.next(past, task)
                 meter.end("fit", peak="fit")

@@ -32,11 +32,11 @@ class Display(AbstractContextManager["Display"], Protocol):
         ...
 
 
-def display(frames: int, *, done: int = 0, console: Console | None = None) -> Display:
+def display(frames: int | None, *, done: int = 0, console: Console | None = None) -> Display:
     """Bars when ``console`` (default: standard output) is a terminal, else plain lines.
 
     Args:
-        frames: number of frames of the stream when it is finished.
+        frames: number of frames of the stream when it is finished; None where that is unknown.
         done: how many of them are stored already.
         console: where to write.
     """
@@ -44,11 +44,12 @@ def display(frames: int, *, done: int = 0, console: Console | None = None) -> Di
     return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
 
 
-def summary(report: "FrameReport", frames: int) -> str:
-    """One frame in one line."""
+def summary(report: "FrameReport", frames: int | None) -> str:
+    """One frame in one line, of ``frames`` where that is known."""
+    number = str(report.index + 1) if frames is None else f"{report.index + 1:>{len(str(frames))}}/{frames}"
     moving = f" ({report.moving:,} moving)" if report.index and report.moving < report.anchors else ""
     return (
-        f"frame {report.index + 1:>{len(str(frames))}}/{frames}  train {report.train_psnr:5.2f} dB  "
+        f"frame {number}  train {report.train_psnr:5.2f} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
         f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}{absences(report.absent)}"
@@ -92,7 +93,7 @@ def human_bytes(count: float) -> str:
 class Lines:
     """Plain lines, for files and pipes."""
 
-    def __init__(self, frames: int, done: int, *, console: Console) -> None:
+    def __init__(self, frames: int | None, done: int, *, console: Console) -> None:
         self._frames, self._current, self._console = frames, done, console
         self._spoken = time.monotonic()
 
@@ -107,8 +108,9 @@ class Lines:
     def step(self, step: "Step") -> None:
         """Prints a line if the frame takes long."""
         if time.monotonic() - self._spoken > QUIET_SECONDS:
+            of = "" if self._frames is None else f"/{self._frames}"
             self._print(
-                f"frame {self._current + 1}/{self._frames}: iteration {step.iteration}/{step.iterations}, "
+                f"frame {self._current + 1}{of}: iteration {step.iteration}/{step.iterations}, "
                 f"loss {step.loss:.4f}, {step.anchors:,} anchors"
             )
 
@@ -126,7 +128,7 @@ class Lines:
 class Bars:
     """A bar of frames, a bar of the running frame's iterations, and the last frame's numbers."""
 
-    def __init__(self, frames: int, done: int, *, console: Console) -> None:
+    def __init__(self, frames: int | None, done: int, *, console: Console) -> None:
         self._frames = frames
         self._progress = Progress(
             TextColumn("{task.description:<10}"),

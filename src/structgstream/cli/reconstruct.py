@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.live_run import LiveChoice, ending_of, open_live, run_metrics, watched
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -20,15 +21,16 @@ from structgstream.cli.options import (
     parse_known_options,
     resolve_config,
 )
-from structgstream.cli.progress import display, human_bytes
+from structgstream.cli.progress import human_bytes
 from structgstream.cli.segment_options import SegmentOptions
 from structgstream.cli.termination import Terminated, Termination
 
 if TYPE_CHECKING:
-    from structgstream.data.source import FrameSource
+    from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
     from structgstream.recorder import Storage
+    from structgstream.run_metrics import RunMetrics
     from structgstream.scene.scene import Scene
 
 
@@ -48,10 +50,13 @@ class Reconstruct:
     Example: structgstream reconstruct basketball -o ball.sgs --mbits 5
 
     Example: structgstream reconstruct basketball -o ball --sink segments --window 600
+
+    Example: structgstream reconstruct rig.toml -o now.sgs --live --preset fast --record take1
     """
 
     scene: tyro.conf.Positional[Folder]
-    """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them."""
+    """The capture: a folder of pictures or videos with their calibration, as docs/captures.md lists them; with --live
+    the rig file of cameras that send now (docs/live.md)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write; with --sink segments, a folder."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
@@ -73,6 +78,7 @@ class Reconstruct:
     """List the fields of the configuration with the preset's values."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
     segments: SegmentOptions = field(default_factory=SegmentOptions)
+    live: LiveChoice = field(default_factory=LiveChoice)
 
 
 def main(arguments: list[str]) -> None:
@@ -89,23 +95,38 @@ def main(arguments: list[str]) -> None:
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
     console = Console()
     may_exist = options.resume or options.overwrite
-    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(_say, console)) as storage:
-        _reconstruct(options, config, preset=preset, storage=storage, console=console)
+    live = None
+    if options.live.live:
+        live = open_live(options.scene, options.capture, options.live, stream=options.output, resume=options.resume)
+    else:
+        options.live.check(options.scene)
+    captured = None if live is None else live.captured
+    tell = partial(_say, console)
+    with options.segments.storage(options.output, may_exist=may_exist, tell=tell, captured=captured) as storage:
+        source = live or open_selected_capture(options.scene, options.capture)
+        _reconstruct(source, options, config, preset=preset, storage=storage, console=console)
     _say(console, f"Wrote {options.output}")
 
 
 def _reconstruct(
-    options: Reconstruct, config: "StreamConfig", *, preset: str, storage: "Storage[Scene] | None", console: Console
+    source: "FrameStream",
+    options: Reconstruct,
+    config: "StreamConfig",
+    *,
+    preset: str,
+    storage: "Storage[Scene] | None",
+    console: Console,
 ) -> None:
+    from structgstream.data.source import frame_count
     from structgstream.kernels.backend import select_backend
     from structgstream.presets import departures
 
-    source = open_selected_capture(options.scene, options.capture)
     backend = select_backend(options.device)
+    length = "live" if options.live.live else f"{frame_count(source)} frames"
     _say(
         console,
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
-        f"{', '.join(source.rig.testing) or 'none'}; {len(source)} frames; preset {preset}, back-end {backend.name}.",
+        f"{', '.join(source.rig.testing) or 'none'}; {length}; preset {preset}, back-end {backend.name}.",
     )
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
@@ -117,6 +138,7 @@ def _reconstruct(
         metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
         resume=options.resume,
         storage=storage,
+        metrics=run_metrics(source, options.output),
     )
     if peaks:
         stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
@@ -128,7 +150,7 @@ def _say(console: Console, text: str) -> None:
 
 
 def run_reconstruction(
-    source: "FrameSource",
+    source: "FrameStream",
     config: "StreamConfig",
     *,
     output: Path,
@@ -136,8 +158,18 @@ def run_reconstruction(
     metadata: Mapping[str, object],
     resume: bool = False,
     storage: "Storage[Scene] | None" = None,
+    metrics: "RunMetrics | None" = None,
 ) -> dict[str, int]:
     """Reconstructs ``source`` into the file ``output`` or other storage, replacing what is there unless it is resumed.
+
+    Args:
+        source: the capture, or live cameras, which need ``metrics``.
+        config: of the stream.
+        output: the stream file.
+        backend: the compute back-end.
+        metadata: for the header.
+        resume: continue after the last whole frame.
+        metrics: what the run does is written beside ``output``, too.
 
     Returns:
         the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
@@ -147,9 +179,11 @@ def run_reconstruction(
         Terminated: SIGTERM came; the frame that was being fitted is in the file, too.
         StructGStreamError: any other error; whole frames stay in the file.
     """
+    from structgstream.data.source import frame_count
     from structgstream.recorder import record
     from structgstream.struct_gstream import stream_pipeline
 
+    total = frame_count(source)
     run = record(
         output,
         source,
@@ -159,21 +193,29 @@ def run_reconstruction(
         storage=storage,
         metadata=metadata,
         on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
+        remarks=None if metrics is None else metrics.frame,
     )
     done = run.done
     peaks: dict[str, int] = {}
     try:
-        with Termination() as ending, display(len(source), done=done) as progress, closing(run.reports) as reports:
+        with (
+            Termination(on_ask=ending_of(source)) as ending,
+            watched(source, metrics, done=done) as progress,
+            closing(run.reports) as reports,
+        ):
             for report in reports:
                 on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
                 for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
                     peaks[stage] = max(size, peaks.get(stage, 0))
                 progress.frame(report)
                 done = report.index + 1
-                if ending.asked and done < len(source):
+                if ending.asked and done != total:
                     raise Terminated
+            if ending.asked and done != total:  # Live cameras had nothing to give any more.
+                raise Terminated
     except (KeyboardInterrupt, Terminated) as error:
-        kept = f"{output} has {done} of {len(source)} frames; continue with the same command and --resume."
+        of = "" if total is None else f" of {total}"
+        kept = f"{output} has {done}{of} frames; continue with the same command and --resume."
         ended = Terminated if isinstance(error, Terminated) else Interrupted
         raise ended(kept if done else "No frame was done, so nothing was written.") from None
     return peaks

@@ -53,25 +53,32 @@ class SegmentOptions:
 
     @contextmanager
     def storage(
-        self, output: Path, *, may_exist: bool, tell: Callable[[str], object]
+        self,
+        output: Path,
+        *,
+        may_exist: bool,
+        tell: Callable[[str], object],
+        captured: Callable[[int], float | None] | None = None,
     ) -> Iterator["Storage[Scene] | None"]:
         """Where the stream goes, checked before anything takes time; None for the file ``output``.
 
+        ``captured`` gives the Unix time at which a frame was filmed, for live cameras.
         At the end of the block what is to be published is waited for, and ``tell`` gets a sentence if it is not done.
 
         Raises:
             StorageError: it exists and may not be replaced, or cannot be written.
             MissingExtraError: a package is missing that the URL needs.
         """
-        from structgstream.codec.segments.sink import SegmentsOptions
+        from structgstream.codec.segments.sink import Clocks, SegmentsOptions
         from structgstream.recorder import check_output, segments_at, segments_folder
 
         options = SegmentsOptions(self.window, self.keep)
+        clocks = Clocks() if captured is None else Clocks(captured=captured)
         if self.chosen(output) == "file":
             check_output(output, may_exist=may_exist)
             yield None
         elif self.publish is None:
-            yield segments_at(segments_folder(output, may_exist=may_exist), options=options)
+            yield segments_at(segments_folder(output, may_exist=may_exist), options=options, clocks=clocks)
         else:
             from structgstream.codec.segments.cloud_store import CloudStore
             from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
@@ -81,7 +88,7 @@ class SegmentOptions:
             mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, tell))
             mirror.copy_all()  # What an earlier run has left, also if there is nothing to do now.
             try:
-                yield segments_at(mirror, options=options)
+                yield segments_at(mirror, options=options, clocks=clocks)
             finally:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
                     tell(

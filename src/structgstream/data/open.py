@@ -71,6 +71,24 @@ def open_capture(
         ConfigError: an argument is invalid.
     """
     source = _recognized(Path(path))
+    sized = selected(source, held_out=held_out, scale=scale, near=near)
+    if recognizes_prepared(Path(path)) and not sized.rig.held_out <= source.rig.held_out:
+        sized = WithoutPoints(sized)  # its points come from pictures of a camera that is held out now
+    return section(sized, start=start, frames=frames)
+
+
+def selected(
+    source: FrameSource,
+    *,
+    held_out: tuple[str, ...] | Literal["auto"] | None = None,
+    scale: float = 1.0,
+    near: float | None = None,
+) -> FrameSource:
+    """The capture with other cameras held out, reduced pictures, another near plane; see :func:`open_capture`.
+
+    Raises:
+        ConfigError: an argument is invalid.
+    """
     rig = source.rig
     if held_out is not None:
         rig = rig.with_held_out(_chosen(held_out, rig))
@@ -83,9 +101,7 @@ def open_capture(
         sizes = {name: (sized.rig[name].width, sized.rig[name].height) for name in rig}
         rig = rig.mapped({name: rig[name].resized(*sizes[name]) for name in rig})
         sized = WithRig(sized, rig)
-    if recognizes_prepared(Path(path)) and not rig.held_out <= source.rig.held_out:
-        sized = WithoutPoints(sized)  # its points come from pictures of a camera that is held out now
-    return section(sized, start=start, frames=frames)
+    return sized
 
 
 def _chosen(held_out: tuple[str, ...] | Literal["auto"], rig: CameraRig) -> frozenset[str]:

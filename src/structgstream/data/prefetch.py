@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from structgstream.data.source import FrameStream, is_recording
 from structgstream.data.wrappers import SourceWrapper
 from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
@@ -63,3 +64,8 @@ class Prefetch(SourceWrapper):
             stop.set()
             room.release()
             thread.join()
+
+
+def read_ahead(source: FrameStream) -> FrameStream:
+    """A recording decoded ahead; a live source, which has threads and queues of its own, as it is."""
+    return Prefetch(source) if is_recording(source) else source

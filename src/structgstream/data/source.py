@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of captures."""
+"""The protocols of captures: recordings, whose length is known, and streams that are still being filmed."""
 
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Iterator, Sized
+from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 
 
-class FrameSource(Protocol):
-    """A capture: a calibrated rig and its frames, in order.
+class FrameStream(Protocol):
+    """A calibrated rig and its frames, in order; how many there will be may be unknown.
 
     ``frames(start)`` may be called again, each time from the given stream index; it opens its own decoders, and the
     pictures it yields have the size the rig states. Cameras without a picture of an instant are absent from its frame,
@@ -33,8 +33,37 @@ class FrameSource(Protocol):
         """Points ``[P, 3]`` that come with the capture (a COLMAP model), in its units; None without any."""
         ...
 
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]: ...
+
+
+class FrameSource(FrameStream, Protocol):
+    """A recording: a stream of frames whose number is known."""
+
     def __len__(self) -> int:
         """Number of frames, from the one in which the last camera begins (``timeline.common_slots``)."""
         ...
 
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]: ...
+
+@runtime_checkable
+class ArrivingFrames(Protocol):
+    """What a stream adds whose frames arrive while it is read; it has no length."""
+
+    @property
+    def newest_only(self) -> bool:
+        """Whether a frame is the newest when it is asked for, so that one that is asked for early is old when used."""
+        ...
+
+
+def is_recording(source: FrameStream) -> TypeGuard[FrameSource]:
+    """Whether the number of frames is known."""
+    return isinstance(source, Sized)
+
+
+def frame_count(source: FrameStream) -> int | None:
+    """Number of frames; None where it is unknown before the end."""
+    return len(source) if is_recording(source) else None
+
+
+def may_read_ahead(source: FrameStream) -> bool:
+    """Whether the next frame may be read while one is fitted, which changes no frame of a recording."""
+    return not (isinstance(source, ArrivingFrames) and source.newest_only)

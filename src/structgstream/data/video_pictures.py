@@ -142,12 +142,12 @@ def _key_before(track: VideoTrack, stamp: int) -> int | None:
 def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
     """The picture as it is shown, at ``size``."""
     if not track.quarter_turns:
-        return _srgb(frame, reformatter, width=size[0], height=size[1])
+        return srgb(frame, reformatter, width=size[0], height=size[1])
     width, height = size[::-1] if track.quarter_turns % 2 else size
-    return np.ascontiguousarray(np.rot90(_srgb(frame, reformatter, width=width, height=height), track.quarter_turns))
+    return np.ascontiguousarray(np.rot90(srgb(frame, reformatter, width=width, height=height), track.quarter_turns))
 
 
-def _srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:
+def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:
     """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
 
     A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one

@@ -212,7 +212,7 @@ class SegmentsSink:
         self._put(draft.files)
         present = self._present_with(draft.manifest)
         gone = self._leaving_segments(draft.manifest, present)
-        manifest = self._dressed(draft.manifest, present[:gone])
+        manifest = self._with_window(draft.manifest, present[:gone])
         self._put([(MANIFEST, manifest_to_json(manifest))])
         self._draft = Draft(manifest, draft.records)
         self._present = present[gone:]
@@ -234,7 +234,7 @@ class SegmentsSink:
         start = manifest.edge.pts_seconds - seconds
         return next((i for i, entry in enumerate(present) if entry.pts_seconds[1] >= start), len(present))
 
-    def _dressed(self, manifest: Manifest, left: Sequence[SegmentEntry]) -> Manifest:
+    def _with_window(self, manifest: Manifest, left: Sequence[SegmentEntry]) -> Manifest:
         """The manifest with its next number, its window without the segments that ``left``, and the pace of late."""
         window = replace(manifest.window, seconds=self._options.window_seconds)
         if left:

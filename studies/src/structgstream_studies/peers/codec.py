@@ -60,7 +60,7 @@ class PeerCodec(Generic[State, Memory]):
         """1 if every frame is a key frame; otherwise only the first one is."""
         return 1 if self.method.stands_alone else sys.maxsize
 
-    def file(self, path: Path, *, frames: int, resume: bool) -> tuple[PeerSink, PeerReader[State] | None]:
+    def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[PeerSink, PeerReader[State] | None]:
         """The file, which is replaced unless it is resumed and holds a whole frame.
 
         Raises:

@@ -226,11 +226,11 @@ class PeerSink:
 
     Args:
         path: the file; an existing one is replaced, unless it is resumed.
-        frames: number of frames of the finished file, which is then marked as complete.
+        frames: number of frames of the finished file, which is then marked as complete; None marks none.
         resumed: a reader of the file to continue after its last whole frame.
     """
 
-    def __init__(self, path: Path | str, *, frames: int, resumed: "PeerReader[Any] | None" = None) -> None:
+    def __init__(self, path: Path | str, *, frames: int | None, resumed: "PeerReader[Any] | None" = None) -> None:
         self._path, self._frames, self._resumed = Path(path), frames, resumed
         self._file: FileIO | None = None
         self._count = self._end = 0

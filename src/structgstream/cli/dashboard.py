@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the user sees of a live run: a table of cameras and queues on a terminal, plain lines elsewhere."""
+
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from structgstream.cli.progress import Display, Lines, human_bytes, summary
+
+if TYPE_CHECKING:
+    from structgstream.frame_report import FrameReport
+    from structgstream.training.result import Step
+
+REFRESH = 4  # a second
+Values = Callable[[], Mapping[str, Any]]
+
+
+def live_display(values: Values, *, frames: int | None, done: int = 0, console: Console | None = None) -> Display:
+    """A dashboard when ``console`` (default: standard output) is a terminal, else a line a frame.
+
+    Args:
+        values: of ``RunMetrics``.
+        frames: number of frames of the stream when it is finished; None where that is unknown.
+        done: how many of them are stored already.
+        console: where to write.
+    """
+    console = Console() if console is None else console
+    if console.is_terminal:
+        return Dashboard(values, frames, console=console)
+    return LiveLines(values, frames, done, console=console)
+
+
+class LiveLines(Lines):
+    """Plain lines, each with what the cameras and queues do."""
+
+    def __init__(self, values: Values, frames: int | None, done: int, *, console: Console) -> None:
+        super().__init__(frames, done, console=console)
+        self._values = values
+
+    def frame(self, report: "FrameReport") -> None:
+        """Prints the frame's line."""
+        self._current = report.index + 1
+        self._print(f"{summary(report, self._frames)}  {state_line(self._values())}")
+
+
+class Dashboard:
+    """Cameras, queues, stages and the last frame, drawn again a few times a second."""
+
+    def __init__(self, values: Values, frames: int | None, *, console: Console) -> None:
+        self._values, self._frames = values, frames
+        self._step = self._last = ""
+        self._live = Live(
+            console=console, refresh_per_second=REFRESH, get_renderable=self._drawn, vertical_overflow="crop"
+        )
+
+    def __enter__(self) -> "Dashboard":
+        self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def step(self, step: "Step") -> None:
+        """Notes the iteration."""
+        self._step = f"iteration {step.iteration}/{step.iterations}  loss {step.loss:.4f}"
+
+    def frame(self, report: "FrameReport") -> None:
+        """Notes the frame."""
+        self._step, self._last = "", summary(report, self._frames)
+
+    def _drawn(self) -> Panel:
+        values = self._values()
+        parts: list[RenderableType] = [Text(state_line(values)), Text(stages_line(values), style="dim")]
+        if values.get("live") is not None:
+            parts.append(cameras_table(values["live"]["cameras"]))
+        parts += [Text(self._last), Text(self._step, style="dim")]
+        title = f"{values['stream']}  {values['state']}  {_duration(values['running_seconds'])}"
+        return Panel(Group(*parts), title=title, title_align="left")
+
+
+def state_line(values: Mapping[str, Any]) -> str:
+    """Rates, queues, room and delay in one line."""
+    live = values.get("live")
+    parts = []
+    if live is not None:
+        present = sum(camera["present"] for camera in live["cameras"].values())
+        parts += [
+            f"{present}/{len(live['cameras'])} cameras",
+            f"in {_number(values['frames_in_per_second'])}/s out {_number(values['frames_out_per_second'], 2)}/s",
+            f"skipped {live['skipped_sets']:,}",
+        ]
+        if live["waiting_bytes"]:
+            parts.append(f"waiting {live['waiting_sets']:,} ({human_bytes(live['waiting_bytes'])})")
+        if live["delay_seconds"] is not None:
+            parts.append(f"pictures {live['delay_seconds']:.2f} s old")
+    if values["bits_per_second"] is not None:
+        parts.append(f"{values['bits_per_second'] / 1e3:,.1f} kbit/s")
+    if values["disk_free_bytes"] is not None:
+        parts.append(f"disk {human_bytes(values['disk_free_bytes'])} free")
+    if values["resident_bytes"] is not None:
+        parts.append(f"memory {human_bytes(values['resident_bytes'])}")
+    return "  ".join(parts)
+
+
+def stages_line(values: Mapping[str, Any]) -> str:
+    """Seconds by stage of the last frames' mean, the longest first."""
+    stages = sorted(values["seconds_by_stage"].items(), key=lambda item: -item[1])
+    return "  ".join(f"{name} {seconds:.2f} s" for name, seconds in stages[:8])
+
+
+def cameras_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A row a camera: whether it sends, its pictures, and what went wrong how often."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("camera", "", "pictures", "queue", "faults"):
+        table.add_column(title, justify="right" if title in ("pictures", "queue") else "left")
+    for name, camera in cameras.items():
+        faults = "  ".join(f"{kind} {count:,}" for kind, count in camera["faults"].items())
+        state = Text("sends", style="green") if camera["present"] else Text("absent", style="red")
+        table.add_row(Text(name), state, f"{camera['decoded']:,}", str(camera["queued"]), Text(faults))
+    return table
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _duration(seconds: float) -> str:
+    return time.strftime("%H:%M:%S", time.gmtime(seconds % 86400)) + (
+        f" + {int(seconds // 86400)} d" if seconds >= 86400 else ""
+    )

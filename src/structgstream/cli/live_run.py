@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``reconstruct --live`` adds: its options, the opened cameras, how they are watched and how they end."""
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from structgstream.cli.app import UsageError, usage_errors
+from structgstream.cli.options import CaptureOptions
+from structgstream.cli.progress import Display, display
+
+if TYPE_CHECKING:
+    from structgstream.data.live.source import LiveSource
+    from structgstream.data.source import FrameStream
+    from structgstream.run_metrics import RunMetrics
+
+
+@dataclass(frozen=True)
+class LiveChoice:
+    """Options of cameras that send now."""
+
+    live: bool = False
+    """SCENE is a rig file of cameras that send now; the stream ends after --frames, or with Ctrl-C."""
+    policy: Literal["latest", "every"] = "latest"
+    """Live only, when training is slower than the cameras: latest takes the newest pictures, every keeps all of them in
+    a queue on the disk."""
+    queue_gigabytes: float = 10.0
+    """Live only: room of the queue of every."""
+    record: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """Live only: keep what the cameras send, as a capture that can be reconstructed again."""
+
+    def check(self, scene: Path) -> None:
+        """Check the options of a run that is not live.
+
+        Raises:
+            UsageError: one is for live runs, or the scene is a rig file.
+        """
+        if self != LiveChoice():
+            raise UsageError(
+                "--policy, --queue-gigabytes and --record are for live cameras: give --live and a rig file."
+            )
+        if scene.suffix == ".toml":
+            raise UsageError(f"{scene} is a rig file of live cameras: give --live, too.")
+
+
+def open_live(scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream: Path, resume: bool) -> "LiveSource":
+    """The cameras of a rig file; they are not opened yet.
+
+    Raises:
+        UsageError: an option that live cameras do not have.
+    """
+    from structgstream.data.live.source import LiveOptions, LiveSource
+
+    if capture.start:
+        raise UsageError("--start chooses from a recording; live cameras begin now.")
+    if capture.frames is not None and capture.frames < 1:
+        raise UsageError(f"--frames must be at least 1, got {capture.frames}.")
+    options = LiveOptions(
+        policy=live.policy,
+        frames=capture.frames,
+        held_out=capture.held_out,
+        scale=capture.scale,
+        near=capture.near,
+        queue_gigabytes=live.queue_gigabytes,
+        record=live.record,
+        resume=resume,
+    )
+    with usage_errors():
+        return LiveSource(scene, stream, options)
+
+
+def run_metrics(source: "FrameStream", stream: Path) -> "RunMetrics":
+    """The metrics of a run that writes ``stream``."""
+    from structgstream.data.live.source import LiveSource
+    from structgstream.data.source import frame_count
+    from structgstream.run_metrics import RunMetrics
+
+    if isinstance(source, LiveSource):
+        return RunMetrics(stream, fps=source.fps, live=source.status, captured=source.captured)
+    return RunMetrics(stream, fps=source.fps, total=frame_count(source))
+
+
+def ending_of(source: "FrameStream") -> Callable[[], object]:
+    """What wakes a run that waits for live cameras, so that it ends; nothing for a recording."""
+    from structgstream.data.live.source import LiveSource
+
+    return source.stop if isinstance(source, LiveSource) else lambda: None
+
+
+@contextmanager
+def watched(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> Iterator[Display]:
+    """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame that is fitted."""
+    from structgstream.cli.dashboard import live_display
+    from structgstream.data.live.source import LiveSource
+    from structgstream.data.source import frame_count
+
+    with ExitStack() as stack:
+        if metrics is not None:
+            stack.enter_context(metrics.running())
+        if isinstance(source, LiveSource) and metrics is not None:
+            stack.enter_context(source)
+            stack.enter_context(stopping(source))
+            yield stack.enter_context(live_display(metrics.values, frames=None, done=done))
+        else:
+            yield stack.enter_context(display(frame_count(source), done=done))
+
+
+@contextmanager
+def stopping(source: "LiveSource") -> Iterator[None]:
+    """The first Ctrl-C ends the stream after the frame that is fitted, the second one at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupted(number: int, frame: FrameType | None) -> None:
+        if source.stopped:
+            raise KeyboardInterrupt
+        source.stop()
+        print("Ends after this frame; Ctrl-C again ends at once.", file=sys.stderr, flush=True)
+
+    before = signal.signal(signal.SIGINT, interrupted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

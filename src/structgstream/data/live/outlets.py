@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where complete sets wait for the trainer: the newest one in memory, or all of them in a queue on the disk."""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from structgstream.data.live.matching import PictureSet
+from structgstream.data.live.picture_file import read_pictures, write_pictures
+from structgstream.errors import StorageError
+from structgstream.frames import MultiViewFrame
+
+log = logging.getLogger(__name__)
+
+Convert = Callable[[PictureSet], MultiViewFrame]
+"""Pictures of a set as sRGB; the presentation time is the common clock's."""
+GIGABYTE = 10**9
+MOST_UNWRITTEN = 8  # sets whose pictures wait in memory
+ROOM_AGAIN = 0.5  # of the queue must be empty before sets are taken again, so that gaps are few
+
+
+@dataclass(frozen=True)
+class QueueStatus:
+    """What became of complete sets.
+
+    Args:
+        waiting: sets that wait.
+        waiting_bytes: of the files they wait in.
+        skipped: sets that no frame was made of, because there was a newer one or no room.
+    """
+
+    waiting: int
+    waiting_bytes: int
+    skipped: int
+
+
+class Outlet(Protocol):
+    """Takes complete sets from the cameras' side and gives frames to the trainer's."""
+
+    newest_only: bool
+
+    def put(self, found: PictureSet) -> None:
+        """Takes a set."""
+        ...
+
+    def take(self, timeout_seconds: float) -> MultiViewFrame | None:
+        """The next frame; None if none came in time."""
+        ...
+
+    @property
+    def status(self) -> QueueStatus: ...
+
+    def close(self) -> None:
+        """Removes what waits."""
+        ...
+
+
+class Latest:
+    """Holds the newest set; who asks gets that, and the ones before are skipped."""
+
+    newest_only = True
+
+    def __init__(self, convert: Convert) -> None:
+        self._convert = convert
+        self._held: PictureSet | None = None
+        self._skipped = 0
+        self._ready = threading.Condition()
+
+    def put(self, found: PictureSet) -> None:
+        with self._ready:
+            self._skipped += self._held is not None
+            self._held = found
+            self._ready.notify()
+
+    def take(self, timeout_seconds: float) -> MultiViewFrame | None:
+        with self._ready:
+            if self._held is None:
+                self._ready.wait(timeout_seconds)
+            found, self._held = self._held, None
+        return None if found is None else self._convert(found)
+
+    @property
+    def status(self) -> QueueStatus:
+        return QueueStatus(int(self._held is not None), 0, self._skipped)
+
+    def close(self) -> None:
+        self._held = None
+
+
+class DiskQueue:
+    """Keeps every set in a file until the trainer takes it; a thread writes them.
+
+    When the files reach ``most_bytes``, further sets are skipped until half of them are taken, and so are sets that
+    come faster than they can be written; both are told.
+
+    Args:
+        folder: is made, and removed at the end.
+        resume: whether sets that an earlier run was killed over are taken first; else they are removed.
+        most_bytes: of its files.
+        convert: makes a set's pictures.
+
+    Raises:
+        StorageError: the folder cannot be used.
+    """
+
+    newest_only = False
+
+    def __init__(self, folder: Path, *, most_bytes: int, convert: Convert, resume: bool = False) -> None:
+        self._folder, self._most, self._convert = folder, most_bytes, convert
+        self._sets: deque[PictureSet] = deque()
+        self._files: deque[tuple[Path, int]] = deque()
+        self._bytes = self._skipped = 0
+        self._full = self._slow = self._writing = self._closed = False
+        self._failed: BaseException | None = None
+        self._changed = threading.Condition()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for file in sorted(folder.glob("set-*")):
+                if resume and file.suffix != ".part":
+                    self._files.append((file, file.stat().st_size))
+                else:
+                    file.unlink()
+        except OSError as error:
+            raise StorageError(f"The queue {folder} cannot be used ({error.strerror}).") from None
+        self._bytes = sum(size for _, size in self._files)
+        self._number = int(self._files[-1][0].name.removeprefix("set-")) + 1 if self._files else 0
+        self._writer = threading.Thread(target=self._write, name="queue", daemon=True)
+        self._writer.start()
+
+    def put(self, found: PictureSet) -> None:
+        with self._changed:
+            self._full = self._full and self._bytes > ROOM_AGAIN * self._most
+            slow = len(self._sets) >= MOST_UNWRITTEN
+            if self._full or slow or self._failed is not None:
+                self._skipped += 1
+                if slow and not self._slow:
+                    self._slow = True
+                    log.warning(
+                        "The queue %s takes sets of pictures more slowly than they come, so some are skipped; take "
+                        "smaller pictures (--scale), a faster disk, or --policy latest.",
+                        self._folder,
+                    )
+                return
+            self._sets.append(found)
+            self._changed.notify_all()
+
+    def take(self, timeout_seconds: float) -> MultiViewFrame | None:
+        """The oldest set.
+
+        Raises:
+            StorageError: the disk is full.
+        """
+        with self._changed:
+            if not self._files and self._failed is None:
+                self._changed.wait(timeout_seconds)
+            if not self._files:
+                if self._failed is not None:
+                    raise self._failed
+                return None
+            path, size = self._files.popleft()
+        frame, _ = read_pictures(path)
+        path.unlink(missing_ok=True)
+        with self._changed:
+            self._bytes -= size
+        return frame
+
+    @property
+    def status(self) -> QueueStatus:
+        with self._changed:
+            waiting = len(self._files) + len(self._sets) + self._writing
+            return QueueStatus(waiting, self._bytes, self._skipped)
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._writer.join()
+        for path in self._folder.glob("set-*"):
+            path.unlink(missing_ok=True)
+        if self._folder.is_dir() and not any(self._folder.iterdir()):
+            self._folder.rmdir()
+
+    def _write(self) -> None:
+        while True:
+            with self._changed:
+                while not self._sets and not self._closed:
+                    self._changed.wait()
+                if self._closed:
+                    return
+                found = self._sets.popleft()
+                self._writing = True
+            try:
+                path = self._folder / f"set-{self._number:08d}"
+                self._number += 1
+                size = write_pictures(path, self._convert(found), sync=False)
+                self._add(path, size)
+            except BaseException as error:  # raised where the trainer asks for the next set
+                with self._changed:
+                    self._failed = error
+                    self._changed.notify_all()
+            finally:
+                with self._changed:
+                    self._writing = False
+
+    def _add(self, path: Path, size: int) -> None:
+        with self._changed:
+            self._files.append((path, size))
+            self._bytes += size
+            if self._bytes >= self._most and not self._full:
+                self._full = True
+                log.warning(
+                    "The queue %s is full: %d sets of pictures wait in %.2f GB, because training is slower than the "
+                    "cameras; further sets are skipped until half of them are done. Give it more room with "
+                    "--queue-gigabytes, or take --policy latest.",
+                    self._folder, len(self._files), self._bytes / GIGABYTE,
+                )  # fmt: skip
+            self._changed.notify_all()

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rig file of a live run: where each camera's pictures come from, and their calibration (docs/live.md)."""
+
+import math
+import re
+import tomllib
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, TypeVar
+
+from structgstream.errors import CaptureError
+
+Made = TypeVar("Made")
+SECRET = re.compile(r"(?<=://)[^/@\s]*@")
+SCHEME = re.compile(r"^[a-z][a-z0-9+.-]+:", re.IGNORECASE)
+
+
+class TimeBase(StrEnum):
+    """What says when a picture was taken."""
+
+    ARRIVAL = "arrival"  # when it came here, smoothed by the stamps' spacing
+    STREAM = "stream"  # its stamp: the cameras share a clock
+    UNIX = "unix"  # its stamp, which is Unix time, as far as the container's bits go
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """How a camera is read.
+
+    Args:
+        url: whatever PyAV opens: ``rtsp://``, ``udp://``, ``http://``, ``rtp://``, an ``.sdp`` file, a device, a file.
+        offset_seconds: added to the times of its pictures.
+        format: the container or device driver, where the URL does not tell (``mpegts``, ``v4l2``); None to be probed.
+        options: of FFmpeg's protocol and demuxer, by name.
+        follow: whether a file is still being written, so that its end is waited at.
+    """
+
+    url: str
+    offset_seconds: float = 0.0
+    format: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+    follow: bool = False
+
+    @property
+    def shown_url(self) -> str:
+        """The URL without user and password, for messages."""
+        return SECRET.sub("", self.url)
+
+    @property
+    def is_file(self) -> bool:
+        """Whether it is a file, which ends for good, and not a stream, which may come back."""
+        return self.format is None and not self.follow and not SCHEME.match(self.url)
+
+
+@dataclass(frozen=True)
+class LiveRig:
+    """The content of a rig file.
+
+    Args:
+        name: of the stream.
+        calibration: folder of the capture that has the cameras' calibration.
+        cameras: by name, in the order of the file.
+        fps: frames a second at most, and of the header; None for the calibration's.
+        clock: what says when a picture was taken.
+        tolerance_seconds: how far a picture of a set may lie from its instant; None for half a frame.
+        deadline_seconds: how long a set waits for pictures of cameras that are present.
+        queue_frames: pictures of a camera that wait to be matched; the oldest are dropped.
+        stuck_seconds: a camera is absent when its picture has been the same for so long while others changed.
+        silent_seconds: a camera without packets for so long is opened again.
+        start_seconds: how long frame 0 waits for all cameras.
+        end_seconds: the stream ends when no camera has sent for so long; None for never.
+        without: cameras of the calibration that are not used.
+    """
+
+    name: str
+    calibration: Path
+    cameras: Mapping[str, LiveCamera]
+    fps: float | None = None
+    clock: TimeBase = TimeBase.ARRIVAL
+    tolerance_seconds: float | None = None
+    deadline_seconds: float = 0.5
+    queue_frames: int = 32
+    stuck_seconds: float = 5.0
+    silent_seconds: float = 5.0
+    start_seconds: float = 30.0
+    end_seconds: float | None = None
+    without: tuple[str, ...] = ()
+
+
+def read_rig(path: Path) -> LiveRig:
+    """The content of a rig file.
+
+    Raises:
+        CaptureError: it is missing or not TOML, has a key that is not known, lacks one, or has a value of another kind.
+    """
+    try:
+        content = tomllib.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise CaptureError(f"The rig file {path} cannot be read ({reason}); docs/live.md shows one.") from None
+    entries = content.pop("cameras", None)
+    if not isinstance(entries, dict) or not entries:
+        raise CaptureError(f"The rig file {path} has no cameras; give each a table [cameras.NAME] with its url.")
+    cameras = {name: _made(LiveCamera, entry, where=f"camera {name!r} of {path}") for name, entry in entries.items()}
+    settings = {"name": path.stem, **content, "cameras": cameras}
+    rig = _made(LiveRig, settings, where=f"the rig file {path}")
+    return _resolved(rig, path)
+
+
+def check_cameras(rig: LiveRig, calibrated: Collection[str], path: Path) -> None:
+    """Check that the rig file names the cameras of the calibration, each once.
+
+    Raises:
+        CaptureError: naming one that the calibration, or the file, lacks.
+    """
+    if unknown := [name for name in (*rig.cameras, *rig.without) if name not in calibrated]:
+        raise CaptureError(
+            f"The rig file {path} names camera {unknown[0]!r}, which the calibration {rig.calibration} lacks; its "
+            f"cameras are {', '.join(calibrated)}."
+        )
+    if both := [name for name in rig.without if name in rig.cameras]:
+        raise CaptureError(f"The rig file {path} has camera {both[0]!r} under cameras and in without; choose one.")
+    if missing := [name for name in calibrated if name not in rig.cameras and name not in rig.without]:
+        raise CaptureError(
+            f"The rig file {path} lacks camera {missing[0]!r} of the calibration {rig.calibration}; give it a table "
+            f"[cameras.{missing[0]}] with its url, or name it in without."
+        )
+
+
+def _resolved(rig: LiveRig, path: Path) -> LiveRig:
+    """Files and folders are relative to the rig file; names of devices stay."""
+    folder = path.parent
+    cameras = {
+        name: camera if camera.format is not None or SCHEME.match(camera.url) else _in_folder(camera, folder)
+        for name, camera in rig.cameras.items()
+    }
+    return replace(rig, calibration=folder / rig.calibration, cameras=cameras)
+
+
+def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:
+    return replace(camera, url=str(folder / camera.url))
+
+
+def _made(kind: type[Made], entry: Any, *, where: str) -> Made:
+    """A dataclass from a table, each of whose values is checked."""
+    if not isinstance(entry, dict):
+        raise CaptureError(f"The entry of {where} must be a table, got {entry!r}.")
+    known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]
+    if unknown := [key for key in entry if key not in known]:
+        raise CaptureError(f"There is no key {unknown[0]!r} in {where}; its keys are {', '.join(known)}.")
+    for name, item in known.items():
+        if name not in entry and item.default is MISSING and item.default_factory is MISSING:
+            raise CaptureError(f"The key {name!r} is missing in {where}.")
+    return kind(**{key: _checked(key, value, where) for key, value in entry.items()})
+
+
+def _checked(key: str, value: Any, where: str) -> Any:
+    try:
+        return CHECKS[key](value)
+    except (ValueError, TypeError):
+        raise CaptureError(f"{key} = {value!r} in {where} is invalid; expected {EXPECTED[key]}.") from None
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value:
+        raise TypeError
+    return value
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise TypeError
+    return float(value)
+
+
+def _positive(value: Any) -> float:
+    if _number(value) <= 0:
+        raise ValueError
+    return float(value)
+
+
+def _count(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 2 <= value <= 10_000:
+        raise ValueError
+    return value
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise TypeError
+    return value
+
+
+def _names(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise TypeError
+    return tuple(_text(item) for item in value)
+
+
+def _texts(value: Any) -> dict[str, str]:
+    if not isinstance(value, dict):
+        raise TypeError
+    return {_text(key): _text(item) for key, item in value.items()}
+
+
+SECONDS = "seconds, more than 0"
+CHECKS: Mapping[str, Any] = {
+    "url": _text,
+    "offset_seconds": _number,
+    "format": _text,
+    "options": _texts,
+    "follow": _flag,
+    "name": _text,
+    "calibration": lambda value: Path(_text(value)),
+    "cameras": dict,
+    "fps": _positive,
+    "clock": TimeBase,
+    "tolerance_seconds": _positive,
+    "deadline_seconds": _positive,
+    "queue_frames": _count,
+    "stuck_seconds": _positive,
+    "silent_seconds": _positive,
+    "start_seconds": _positive,
+    "end_seconds": _positive,
+    "without": _names,
+}
+EXPECTED = {
+    "url": "a text, such as rtsp://10.0.0.11/stream",
+    "offset_seconds": "seconds",
+    "format": "the name of a container or device, such as mpegts",
+    "options": "a table of texts",
+    "follow": "true or false",
+    "name": "a text",
+    "calibration": "the folder of a capture",
+    "fps": "frames a second, more than 0",
+    "clock": "arrival, stream or unix",
+    "queue_frames": "a whole number from 2 to 10000",
+    "without": "a list of names",
+    **{
+        f"{key}_seconds": SECONDS for key in ("tolerance", "deadline", "stuck", "silent", "start", "end")
+    },
+}  # fmt: skip

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras and queues on a terminal, and in lines."""
+
+import io
+from pathlib import Path
+
+from rich.console import Console
+
+from reports import frame_report
+from structgstream.cli.dashboard import Dashboard, LiveLines, live_display
+from structgstream.data.live.status import CameraStatus, LiveStatus
+from structgstream.run_metrics import RunMetrics
+from structgstream.training.result import Step
+
+STATUS = LiveStatus(
+    {"cam00": CameraStatus(True, 1234, 2), "cam01": CameraStatus(False, 7, 0, {"stuck": 3, "gone": 1})},
+    sets=900,
+    skipped_sets=880,
+    waiting_sets=4,
+    waiting_bytes=5_000_000,
+    delay_seconds=0.25,
+)
+REPORT = frame_report(4, bytes=2000, train_psnr=31.2, anchors=10, moving=10, free=0, seconds={"fit": 2.0, "total": 3.0})
+
+
+def console(*, terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=150, height=30, color_system=None)
+
+
+def text(of: Console) -> str:
+    assert isinstance(of.file, io.StringIO)
+    return of.file.getvalue()
+
+
+def metrics(folder: Path) -> RunMetrics:
+    made = RunMetrics(folder / "x.sgs", fps=30.0, live=lambda: STATUS)
+    made.frame(REPORT)
+    return made
+
+
+def test_the_place_decides_how_a_live_run_looks(tmp_path: Path) -> None:
+    values = metrics(tmp_path).values
+    assert isinstance(live_display(values, frames=None, console=console(terminal=False)), LiveLines)
+    assert isinstance(live_display(values, frames=None, console=console(terminal=True)), Dashboard)
+
+
+def test_a_line_tells_of_cameras_and_queues(tmp_path: Path) -> None:
+    out = console(terminal=False)
+    with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
+        shown.step(Step(1, 100, 0.5, 10, 0))
+        shown.frame(REPORT)
+    (line,) = text(out).splitlines()
+    assert line.startswith("frame 5  train 31.20 dB")
+    assert "1/2 cameras" in line
+    assert "skipped 880  waiting 4 (5.0 MB)  pictures 0.25 s old" in line
+
+
+def test_the_dashboard_names_each_camera_with_its_faults(tmp_path: Path) -> None:
+    out = console(terminal=True)
+    with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
+        shown.step(Step(7, 100, 0.5, 10, 0))
+        shown.frame(REPORT)
+        shown.step(Step(8, 100, 0.5, 10, 0))
+    drawn = text(out)
+    for part in (
+        "x.sgs  running",
+        "cam00",
+        "sends",
+        "1,234",
+        "absent",
+        "stuck 3  gone 1",
+        "iteration 8/100",
+        "frame 5",
+    ):
+        assert part in drawn
+    assert "total 3.00 s  fit 2.00 s" in drawn

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``reconstruct --live`` from files that are read as cameras."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from small_presets import few_points
+from structgstream.cli.app import INTERRUPTED, PROBLEM, USAGE, main
+from structgstream.cli.live_run import stopping
+from structgstream.codec.reader import open_stream
+from structgstream.data.open import open_capture
+from test_live_source import files
+
+QUICKLY = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2", "--device", "cpu"]
+
+
+def live(folder: Path, *options: str, rig: Path | None = None) -> int:
+    scene = files(folder, frames=60) if rig is None else rig
+    with few_points("tiny"):
+        return main(["reconstruct", str(scene), "-o", str(folder / "x.sgs"), "--live", *QUICKLY, *options])
+
+
+def test_a_live_run_is_a_stream_a_log_metrics_and_a_recording(tmp_path: Path, capsys) -> None:
+    assert live(tmp_path, "--policy", "every", "--frames", "3", "--record", str(tmp_path / "take")) == 0
+    out = capsys.readouterr().out
+    assert "2 training cameras, held out: a; live; preset tiny" in out
+    assert "/3 cameras  in " in out
+    with open_stream(tmp_path / "x.sgs") as reader:
+        assert reader.complete
+        assert len(reader) == 3
+        times = [info.pts_seconds for info in reader.packets]
+        assert times[0] == 0.0 < times[1] < times[2]
+    metrics = json.loads((tmp_path / "x.metrics.json").read_text())
+    assert (metrics["state"], metrics["frames"]) == ("finished", 3)
+    last = json.loads((tmp_path / "x.log.jsonl").read_text().splitlines()[-1])
+    assert set(last["run"]["live"]["cameras"]) == {"a", "b", "c"}
+    assert len(open_capture(tmp_path / "take")) >= 3
+
+
+def test_resume_goes_on_live(tmp_path: Path) -> None:
+    rig = files(tmp_path, frames=60)
+    assert live(tmp_path, "--frames", "2", rig=rig) == 0
+    assert live(tmp_path, "--frames", "4", "--resume", rig=rig) == 0
+    with open_stream(tmp_path / "x.sgs") as reader:
+        assert len(reader) == 4
+        times = [info.pts_seconds for info in reader.packets]
+        assert times == sorted(set(times))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--start", "3"], "--start chooses from a recording"),
+        (["--frames", "0"], "--frames must be at least 1"),
+        (["--queue-gigabytes", "0"], "needs room"),
+        (["--held-out", "zz"], "zz"),
+    ],
+)
+def test_options_that_live_cameras_do_not_have(tmp_path: Path, capsys, options: list[str], said: str) -> None:
+    assert live(tmp_path, *options) in (USAGE, PROBLEM)
+    assert said in capsys.readouterr().err
+
+
+def test_options_of_live_cameras_need_the_word(tmp_path: Path, capsys) -> None:
+    rig = files(tmp_path)
+    for options in (["--policy", "every"], ["--record", str(tmp_path / "take")], []):
+        assert main(["reconstruct", str(rig), "-o", str(tmp_path / "x.sgs"), *options]) == USAGE
+        assert "give --live" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_after_the_frame_and_twice_at_once(capsys) -> None:
+    class Source:
+        stopped = False
+
+        def stop(self) -> None:
+            self.stopped = True
+
+    source, before = Source(), signal.getsignal(signal.SIGINT)
+    with stopping(source):  # type: ignore[arg-type]
+        os.kill(os.getpid(), signal.SIGINT)
+        assert source.stopped
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert "Ends after this frame" in capsys.readouterr().err
+    assert INTERRUPTED == 130

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One camera whose stream is in memory: what is delivered of it, with every fault."""
+
+import io
+import itertools
+import logging
+from contextlib import closing
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import av.error
+import numpy as np
+import pytest
+
+from senders import moving_pictures, sent_stream
+from structgstream.data.live.camera import MOST_UNSTAMPED, CameraFeed
+from structgstream.data.live.faults import FaultLog
+from structgstream.data.live.matching import LivePicture
+from structgstream.data.live.rig_file import LiveCamera, TimeBase
+from structgstream.data.live.stamps import StampReader
+
+WAIT = 20.0
+PERIOD = 1 / 30
+
+
+class Received:
+    """Notes what a camera delivers."""
+
+    def __init__(self) -> None:
+        self.pictures: list[LivePicture] = []
+        self.losses = 0
+        self.waits: list[float] = []
+        self.others = -float("inf")
+
+    def deliver(self, camera: str, picture: LivePicture) -> None:
+        self.pictures.append(picture)
+
+    def lost(self, camera: str) -> None:
+        self.losses += 1
+
+    def others_changed_at(self, camera: str) -> float:
+        return self.others
+
+    @property
+    def numbers(self) -> list[int]:
+        """Which pictures of the film they are, by their content."""
+        films = np.stack(moving_pictures()).astype(np.float64)
+        found = []
+        for picture in self.pictures:
+            shown = picture.content.to_ndarray(format="rgb24").astype(np.float64)
+            errors = ((films - shown) ** 2).mean((1, 2, 3))
+            assert errors.min() < 60.0, "a picture that was never filmed"
+            found.append(int(errors.argmin()))
+        return found
+
+    @property
+    def steps(self) -> list[int]:
+        """Pictures from one to the next, by their times."""
+        times = [picture.seconds for picture in self.pictures]
+        return [round((b - a) / PERIOD) for a, b in itertools.pairwise(times)]
+
+
+def camera_feed(received: Received, *, base: TimeBase, **opening: Any) -> tuple[CameraFeed, FaultLog]:
+    """A camera of 128x96 pixels in a time of its own, and its faults."""
+    ticks, faults = itertools.count(), FaultLog("rig", now=lambda: 0.0)
+    feed = CameraFeed(
+        "a",
+        LiveCamera("udp://nowhere"),
+        size=(128, 96),
+        receiver=received,
+        stamps=StampReader(base),
+        faults=faults,
+        base=base,
+        now=lambda: next(ticks) * PERIOD / 2,
+        unix_offset=1000.0,
+        silent_seconds=5.0,
+        stuck_seconds=1.0,
+        **opening,
+    )
+    return feed, faults
+
+
+def read(
+    *streams: bytes | Exception, base: TimeBase = TimeBase.STREAM, received: Received | None = None
+) -> tuple[Received, dict[str, int]]:
+    """What a camera delivers that is opened for each of ``streams``, and its faults."""
+    received = Received() if received is None else received
+    waiting = list(streams)
+    waits: list[float] = []
+
+    def opens(camera: LiveCamera, timeout: float) -> Any:
+        stream = waiting.pop(0)
+        if isinstance(stream, Exception):
+            raise stream
+        return closing(av.open(io.BytesIO(stream)))
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        if not waiting:
+            feed.stop()
+
+    feed, faults = camera_feed(received, base=base, opens=opens, wait=wait)
+    feed.start()
+    feed.join(WAIT)
+    received.waits = waits
+    return received, faults.counts.get("a", {})
+
+
+def test_a_clean_stream_is_delivered_whole() -> None:
+    received, faults = read(sent_stream())
+    assert received.numbers == [n % 12 for n in range(60)]
+    assert received.steps == [1] * 59
+    assert received.pictures[0].seconds == pytest.approx(1000.0, abs=1e-4)
+    assert faults == {"gone": 1}
+
+
+def test_a_stream_that_is_joined_late_begins_with_a_key_frame_and_tells_nothing() -> None:
+    received, faults = read(sent_stream()[188 * 40 :])
+    assert received.numbers[0] == 0
+    assert faults == {"gone": 1}
+
+
+def test_of_garbage_nothing_is_delivered_until_the_next_key_frame(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(sent_stream("garbage:0.5:0.2"))
+    lost = set(range(60)) - {round((p.seconds - 1000) / PERIOD) for p in received.pictures}
+    assert set(range(15, 21)) <= lost <= set(range(14, 25))  # up to the key frame 24
+    assert received.numbers == [n % 12 for n in range(60) if n not in lost]
+    assert faults["garbage"] >= 1
+    assert received.losses >= 1
+    assert sum("until its next key frame" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_lost_datagrams_are_a_damage() -> None:
+    stream = sent_stream()
+    middle = len(stream) // 2 // 188 * 188
+    received, faults = read(stream[:middle] + stream[middle + 188 * 3 :])
+    assert received.numbers == [n % 12 for n in (round((p.seconds - 1000) / PERIOD) for p in received.pictures)]
+    assert faults["garbage"] >= 1
+    assert 40 <= len(received.pictures) < 60
+
+
+def test_a_picture_of_other_proportions_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(sent_stream("shape:0.8:0.4"))
+    assert {(p.content.width, p.content.height) for p in received.pictures} == {(128, 96)}
+    assert faults["other size"] == 12
+    assert "64x96 pixels, its calibration is for 128x96" in caplog.text
+
+
+def test_a_reduced_picture_is_taken_and_told(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(sent_stream("size:0.8:0.4"))
+    assert {(p.content.width, p.content.height) for p in received.pictures} == {(128, 96), (64, 48)}
+    assert faults["other size"] == 12
+    assert "it is resampled" in caplog.text
+
+
+@pytest.mark.parametrize("still", [True, False])
+def test_a_picture_that_stands_still_is_left_out_if_others_change(still: bool) -> None:
+    received = Received()
+    received.others = -float("inf") if still else 1e9
+    received, faults = read(sent_stream("stuck:0.4:1.2"), received=received)
+    if still:
+        assert "stuck" not in faults
+        assert len(received.pictures) >= 57  # another muxer's first packets do not follow the ones before
+    else:
+        assert faults["stuck"] >= 30
+        assert len(received.pictures) <= 60 - faults["stuck"]
+        assert received.losses >= 30
+        assert received.numbers[-6:] == [6, 7, 8, 9, 10, 11]
+
+
+@pytest.mark.parametrize("fault", ["jump", "back"])
+def test_a_clock_that_is_set_is_told_and_the_pictures_go_on(fault: str, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(sent_stream(f"{fault}:0.8:0.4"))
+    assert faults["jump"] == 2
+    assert len(received.pictures) == 60
+    times = [p.seconds for p in received.pictures]
+    assert max(times) - min(times) < 5.0
+    assert "has set its clock by " + ("+" if fault == "jump" else "-") in caplog.text
+
+
+def test_of_two_pictures_with_one_stamp_the_first_is_taken() -> None:
+    received, faults = read(sent_stream("duplicate:0.4:0.4"))
+    assert faults["duplicate"] == 12
+    assert received.steps == [1] * 59
+
+
+def test_stamps_that_go_back_are_left_out() -> None:
+    received, faults = read(sent_stream("reorder:0.4:0.4"))
+    assert faults["reordered"] >= 3
+    times = [p.seconds for p in received.pictures]
+    assert times == sorted(set(times))
+    assert len(times) == 60 - faults["reordered"] - faults.get("duplicate", 0)
+
+
+def test_a_camera_that_ends_or_cannot_be_opened_is_opened_again(caplog: pytest.LogCaptureFixture) -> None:
+    refused = ConnectionRefusedError(111, "Connection refused")
+    streams = [sent_stream(frames=24), refused, refused, refused, sent_stream(frames=24, begun=1000.8)]
+    with caplog.at_level(logging.WARNING):
+        received, faults = read(*streams)
+    assert faults == {"gone": 5}
+    assert received.numbers == [n % 12 for n in range(24)] * 2
+    assert received.steps == [1] * 47
+    assert received.waits == [0.5, 1.0, 2.0, 4.0, 0.5]
+    assert "udp://nowhere is gone (it ended)" in caplog.text
+    assert "is back after" in caplog.text
+
+
+def test_waits_grow_to_a_limit() -> None:
+    received, _ = read(*[OSError(111, "refused")] * 8)
+    assert received.waits == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0, 8.0, 8.0]
+
+
+def test_an_error_of_the_network_is_told_in_words(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        read(av.error.ExitError(1414092869, "Immediate exit requested", "udp://nowhere"))
+    assert "is gone (nothing came for 5 s)" in caplog.text
+
+
+def test_what_is_no_video_is_gone() -> None:
+    received, faults = read(np.random.default_rng(0).bytes(20_000))
+    assert received.pictures == []
+    assert faults == {"gone": 1}
+
+
+@pytest.mark.parametrize("base", [TimeBase.ARRIVAL, TimeBase.STREAM])
+def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixture) -> None:
+    """The first ones of a connection wait for stamps; a camera that has none is timed by arrival, if that is asked."""
+    feed, faults = camera_feed(Received(), base=base)
+    frames = [SimpleNamespace(pts=None, time_base=None)] * 60
+    with caplog.at_level(logging.WARNING):
+        placed = [feed._placed(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
+    assert placed[:MOST_UNSTAMPED] == [None] * MOST_UNSTAMPED
+    assert faults.counts["a"] == {"no stamp": 60}
+    if base is TimeBase.ARRIVAL:
+        steps = np.diff(np.array(placed[MOST_UNSTAMPED:], np.float64))
+        assert np.allclose(steps, PERIOD)
+    else:
+        assert placed == [None] * 60
+        assert 'take clock = "arrival"' in caplog.text
+    stamped = SimpleNamespace(pts=90, time_base=1)
+    assert feed._placed(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+import logging
+
+import pytest
+
+from structgstream.data.live.faults import Fault, FaultLog
+
+
+def test_each_kind_of_each_camera_is_told_once_in_a_while_and_counted_always(caplog: pytest.LogCaptureFixture) -> None:
+    now = [0.0]
+    faults = FaultLog("studio", now=lambda: now[0], quiet_seconds=60.0)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(100):
+            faults.tell("a", Fault.GARBAGE, "sends garbage")
+        faults.tell("b", Fault.GARBAGE, "sends garbage")
+        faults.tell("a", Fault.STUCK, "stands still")
+        now[0] = 61.0
+        faults.tell("a", Fault.GARBAGE, "sends garbage")
+        faults.count("a", Fault.OVERFLOW, 3)
+    assert [record.getMessage() for record in caplog.records] == [
+        "studio: camera 'a' sends garbage",
+        "studio: camera 'b' sends garbage",
+        "studio: camera 'a' stands still",
+        "studio: camera 'a' sends garbage",
+    ]
+    assert faults.counts == {"a": {"garbage": 101, "stuck": 1, "overflow": 3}, "b": {"garbage": 1}}

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from structgstream.data.live.kept import LAST, KeptFrames, kept_folder
+from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame
+from test_picture_file import some_frame
+
+
+def frame(index: int) -> MultiViewFrame:
+    return replace(some_frame(index), pts_seconds=index / 4)
+
+
+def kept(folder: Path, *, resume: bool = False) -> KeptFrames:
+    return KeptFrames(folder, cameras=("a",), resume=resume)
+
+
+def test_the_folder_lies_beside_the_stream() -> None:
+    assert kept_folder(Path("takes/one.sgs")) == Path("takes/one.live")
+
+
+def test_frame_0_and_the_last_frames_are_kept_and_no_more(tmp_path: Path) -> None:
+    frames = kept(tmp_path / "x.live")
+    for index in range(20):
+        frames.keep(frame(index), origin_seconds=100.0)
+        assert len(list((tmp_path / "x.live").iterdir())) <= 1 + LAST
+    again = kept(tmp_path / "x.live", resume=True)
+    assert [one.index for one in again.following(18)] == [18, 19]
+    first = next(again.following(0))
+    assert (first.images["a"] == frame(0).images["a"]).all()
+    assert [*first.images] == ["a"]  # no held-out camera
+    assert again.last() == (19 / 4, 100.0)
+    assert list(again.following(20)) == []
+
+
+def test_frames_of_a_run_that_was_resumed_earlier_are_removed(tmp_path: Path) -> None:
+    """A stream that lost its last frames goes on before those that are kept."""
+    frames = kept(tmp_path / "x.live")
+    for index in (*range(6), 4):
+        frames.keep(frame(index), origin_seconds=0.0)
+    assert [one.index for one in frames.following(3)] == [3, 4]
+
+
+def test_another_stream_begins_without_them(tmp_path: Path) -> None:
+    kept(tmp_path / "x.live").keep(frame(0), origin_seconds=0.0)
+    assert list(kept(tmp_path / "x.live").following(0)) == []
+
+
+def test_without_the_pictures_a_stream_cannot_go_on(tmp_path: Path) -> None:
+    frames = kept(tmp_path / "x.live")
+    with pytest.raises(CaptureError, match="frame 5 are not in .* cannot be resumed"):
+        list(frames.following(5))
+    frames.keep(frame(5), origin_seconds=0.0)
+    (file,) = (tmp_path / "x.live").iterdir()
+    file.write_bytes(file.read_bytes()[:-5])
+    with pytest.raises(CaptureError, match="damaged.*begin another"):
+        list(frames.following(5))

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lenses, tone, masks and sizes of a calibration on pictures that arrive."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from captures import small_rig
+from structgstream.data.clip import bundled_clip, bundled_clip_path
+from structgstream.data.lenses import LensCamera, RadialTangential
+from structgstream.data.live.calibration import (
+    Arriving,
+    as_calibrated,
+    chosen_cameras,
+    filmed_rig,
+    filmed_sizes,
+    read_calibration,
+)
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.undistortion import Undistortion
+from structgstream.frames import MultiViewFrame
+
+
+def prepared(folder: Path) -> PreparedCapture:
+    """A prepared capture of one lens that distorts, whose videos are not there."""
+    rig = small_rig()
+    lens = RadialTangential(k1=-0.15)
+    cameras = {
+        name: PreparedCamera(
+            f"{name}.mp4", LensCamera(rig[name], lens if number == 1 else RadialTangential()), rig[name]
+        )
+        for number, name in enumerate(rig)
+    }
+    capture = PreparedCapture(cameras, 25.0, 0.1, held_out=frozenset([next(iter(rig))]))
+    write_prepared(folder, capture)
+    return capture
+
+
+def test_a_prepared_capture_needs_its_file_alone(tmp_path: Path) -> None:
+    capture = prepared(tmp_path)
+    read = read_calibration(tmp_path)
+    assert (read.fps, read.held_out, [*read.cameras]) == (25.0, capture.held_out, [*capture.cameras])
+
+
+def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> None:
+    capture = prepared(tmp_path)
+    filmed = filmed_rig(capture, tmp_path)
+    random = np.random.default_rng(0)
+    images = {
+        name: random.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
+        for name, size in filmed_sizes(capture).items()
+    }
+    frames = [MultiViewFrame(0, 3.25, images, captured_unix_seconds=5.0)]
+    arriving = Arriving("live", filmed, 25.0, iter(frames))
+    source = as_calibrated(arriving, capture, tmp_path, held_out=None, scale=1.0, near=0.3)
+    (frame,) = source.frames()
+    second = [*images][1]
+    expected = Undistortion(capture.cameras[second].filmed, capture.cameras[second].pinhole)(images[second])
+    assert (frame.images[second] == expected).all()
+    assert (expected != images[second]).any()
+    assert (frame.pts_seconds, frame.captured_unix_seconds) == (3.25, 5.0)
+    assert source.rig[second].near == 0.3
+    half = as_calibrated(
+        replace(arriving, arrived=iter(frames)), capture, tmp_path, held_out=(second,), scale=0.5, near=None
+    )
+    assert half.rig.testing == (second,)
+    (small,) = half.frames()
+    assert small.images[second].shape == (half.rig[second].height, half.rig[second].width, 3)
+    assert half.rig[second].width == round(filmed[second].width / 2)
+
+
+def test_a_capture_of_another_layout_gives_its_rig() -> None:
+    capture = read_calibration(bundled_clip_path())
+    clip = bundled_clip()
+    assert capture.held_out == clip.rig.held_out
+    assert capture.near == pytest.approx(clip.rig["cam03"].near)
+    chosen = chosen_cameras(capture, ["cam02", "cam01", "cam05"])
+    assert [*chosen.cameras] == ["cam01", "cam02", "cam05"]
+    assert chosen.held_out == frozenset()
+    rig = filmed_rig(capture, bundled_clip_path())
+    assert (rig["cam03"].K == clip.rig["cam03"].K).all()
+    assert (rig["cam03"].viewmat == clip.rig["cam03"].viewmat).all()

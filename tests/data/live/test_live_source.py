@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole live sources over loopback and over files: small streams, a second or two each."""
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rigs import arc_rig
+from senders import moving_pictures, sender, sent_loops, sent_stream
+from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.live import recording
+from structgstream.data.live.source import LiveOptions, LiveSource
+from structgstream.data.open import open_capture
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.source import frame_count, may_read_ahead
+from structgstream.errors import CaptureError, ConfigError, StorageError
+
+NAMES = ("a", "b", "c")
+FPS = 30.0
+
+
+def calibrated(folder: Path) -> Path:
+    """The calibration of three cameras of 128x96 pixels, the first of which is held out."""
+    rig = arc_rig(3, width=128, height=96)
+    cameras = dict(zip(NAMES, rig.cameras.values(), strict=True))
+    capture = PreparedCapture(
+        {name: PreparedCamera(f"{name}.mp4", LensCamera(own, Pinhole()), own) for name, own in cameras.items()},
+        FPS,
+        0.1,
+        held_out=frozenset("a"),
+    )
+    folder.mkdir()
+    write_prepared(folder, capture)
+    return folder
+
+
+def rig_file(folder: Path, urls: dict[str, str], **settings: object) -> Path:
+    path = folder / "rig.toml"
+    text = sender().rig_text(urls, calibrated(folder / "calibration"), **settings)
+    path.write_text(text if "://" in text else text.replace('format = "mpegts"\n', ""))
+    return path
+
+
+def files(folder: Path, frames: int = 30, **troubles: str) -> Path:
+    """A rig file of three files."""
+    for name in NAMES:
+        own = [troubles[name]] if name in troubles else []
+        (folder / f"{name}.ts").write_bytes(sent_stream(*own, frames=frames))
+    urls = {name: f"{name}.ts" for name in NAMES}
+    return rig_file(folder, urls, clock="stream", deadline_seconds=2.0, queue_frames=100)
+
+
+@contextmanager
+def sending(transport: str, *troubles: str) -> Iterator[dict[str, str]]:
+    """Three cameras that send until the end of the block, and their URLs."""
+    module, stop = sender(), threading.Event()
+    lines, urls = module._lines(transport, NAMES)
+    parsed = [module.Trouble.parsed(trouble) for trouble in troubles]
+    cameras = [
+        module.SentCamera(name, sent_loops(), lines[name], FPS, [one for one in parsed if one.camera == name])
+        for name in NAMES
+    ]
+    thread = threading.Thread(target=module.film, args=(cameras, stop))
+    thread.start()
+    try:
+        yield urls
+    finally:
+        stop.set()
+        thread.join()
+        for line in lines.values():
+            line.close()
+
+
+def shown(image: np.ndarray) -> int:
+    """Which picture of the film it is."""
+    errors = ((np.stack(moving_pictures()).astype(float) - image) ** 2).mean((1, 2, 3))
+    assert errors.min() < 60
+    return int(errors.argmin())
+
+
+@pytest.mark.parametrize("transport", ["udp", "tcp", "http"])
+def test_sets_of_one_instant_come_over_the_network(tmp_path: Path, transport: str) -> None:
+    with sending(transport) as urls:
+        source = LiveSource(rig_file(tmp_path, urls, clock="unix"), tmp_path / "x.sgs", LiveOptions(frames=5))
+        assert frame_count(source) is None
+        assert not may_read_ahead(source)
+        frames = list(source.frames())
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
+    assert frames[0].pts_seconds == 0.0
+    assert all(one.pts_seconds < other.pts_seconds for one, other in pairwise(frames))
+    for frame in frames:
+        assert len({shown(image) for image in frame.images.values()}) == 1, "pictures of one instant"
+        assert frame.captured_unix_seconds is not None
+    assert [*frames[0].images] == list(NAMES)
+    delay = source.status().delay_seconds
+    assert delay is not None
+    assert 0.0 < delay < 30.0
+
+
+def test_network_cameras_are_asked_by_rtsp_and_asked_again(tmp_path: Path) -> None:
+    """Their stamps begin anew with each connection, so arrival says when a picture was taken."""
+    with sending("rtsp", "a:cut:1.5:0.5") as urls:
+        path = rig_file(tmp_path, urls, clock="arrival", deadline_seconds=0.3, silent_seconds=2)
+        source, seen = LiveSource(path, tmp_path / "x.sgs"), []
+        for frame in source.frames():
+            seen.append("a" in frame.images)
+            if False in seen and seen[-1]:
+                break
+            assert frame.index < 900
+    assert seen[0]
+    assert source.faults.counts["a"]["gone"] >= 1
+    assert all("jump" not in counts for counts in source.faults.counts.values())
+
+
+def test_latest_skips_what_was_filmed_while_nobody_asked(tmp_path: Path) -> None:
+    with sending("udp") as urls:
+        source = LiveSource(rig_file(tmp_path, urls, clock="unix"), tmp_path / "x.sgs", LiveOptions(frames=3))
+        frames = source.frames()
+        first = next(frames)
+        threading.Event().wait(0.5)
+        second = next(frames)
+        status = source.status()
+        frames.close()  # type: ignore[attr-defined]
+    assert second.pts_seconds - first.pts_seconds > 0.3
+    assert status.skipped_sets >= 5
+    assert all(camera.present for camera in status.cameras.values())
+
+
+def test_a_camera_that_is_cut_is_absent_and_comes_back(tmp_path: Path) -> None:
+    with sending("http", "a:cut:1.0:1.0") as urls:
+        path = rig_file(tmp_path, urls, clock="unix", deadline_seconds=0.2, silent_seconds=1)
+        source = LiveSource(path, tmp_path / "x.sgs")
+        seen = []
+        for frame in source.frames():
+            seen.append("a" in frame.images)
+            if False in seen and seen[-1]:
+                break
+            assert len(seen) < 600
+    assert seen[0]
+    assert source.faults.counts["a"]["gone"] >= 1
+
+
+def test_sets_of_fewer_than_two_training_cameras_are_no_frames(tmp_path: Path) -> None:
+    """A camera is held out, so without b only one is left."""
+    with sending("http", "b:cut:0.8:1.0") as urls:
+        path = rig_file(tmp_path, urls, clock="unix", deadline_seconds=0.2, silent_seconds=1)
+        source = LiveSource(path, tmp_path / "x.sgs")
+        last, gap = 0.0, 0.0
+        for frame in source.frames():
+            assert {"b", "c"} <= set(frame.images)
+            gap, last = max(gap, frame.pts_seconds - last), frame.pts_seconds
+            if gap > 0.5:
+                break
+            assert frame.index < 600
+        assert source.status().small_sets >= 5
+
+
+def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every"))
+    assert may_read_ahead(source)
+    with caplog.at_level(logging.WARNING):
+        frames = list(source.frames())
+    numbers = [round(frame.pts_seconds * FPS) for frame in frames]
+    assert [shown(frame.images["a"]) for frame in frames] == [n % 12 for n in numbers]
+    assert np.allclose([frame.pts_seconds for frame in frames], np.array(numbers) / FPS, atol=1e-4)
+    assert all(len(frame.images) == 3 for frame in frames)
+    skipped = source.status().skipped_sets
+    assert len(frames) == 30 - skipped, "every set, or it is counted"
+    assert "have come to their end" in caplog.text
+    assert not (tmp_path / "x.queue").exists()
+
+
+def test_a_resumed_stream_gets_the_pictures_that_no_camera_sends_again(tmp_path: Path) -> None:
+    path, stream = files(tmp_path), tmp_path / "x.sgs"
+    source = LiveSource(path, stream, LiveOptions(policy="every"))
+    first = list(islice(source.frames(), 6))
+    again = LiveSource(path, stream, LiveOptions(policy="every", resume=True, frames=8))
+    (zero,) = islice(again.frames(0), 1)
+    assert (zero.images["b"] == first[0].images["b"]).all()
+    frames = list(again.frames(4))
+    assert [frame.index for frame in frames] == [4, 5, 6, 7]
+    assert all((frames[0].images[name] == first[4].images[name]).all() for name in "bc")
+    assert frames[0].pts_seconds == first[4].pts_seconds
+    # The files begin anew, as a camera's clock may: time goes on.
+    assert frames[2].pts_seconds == pytest.approx(frames[1].pts_seconds + 1 / FPS)
+    with pytest.raises(CaptureError, match="cannot be resumed"):
+        next(again.frames(30))
+
+
+def test_a_stream_is_stopped_between_two_frames(tmp_path: Path) -> None:
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs")
+    frames = source.frames()
+    next(frames)
+    source.stop()
+    assert list(frames) == []
+    assert [thread for thread in threading.enumerate() if thread.name.startswith(("camera", "sets"))] == []
+
+
+def test_what_is_recorded_is_a_capture_of_the_same_instants(tmp_path: Path) -> None:
+    path, folder = files(tmp_path, b="garbage:0.5:0.2"), tmp_path / "take"
+    options = LiveOptions(policy="every", record=folder)
+    live = list(LiveSource(path, tmp_path / "x.sgs", options).frames())
+    again = open_capture(folder)
+    recorded = list(again.frames())
+    assert [*again.rig] == list(NAMES)
+    assert again.rig.held_out == frozenset("a")
+    assert again.fps == FPS
+    assert len(recorded) == 30
+    for frame in recorded:
+        assert {shown(image) for image in frame.images.values()} == {frame.index % 12}
+    # What was lost live is lost again, and nothing else.
+    for frame in live:  # fewer where this machine was too slow
+        assert ("b" in frame.images) == ("b" in recorded[round(frame.pts_seconds * FPS)].images)
+    lines = (folder / "timestamps.csv").read_text().splitlines()
+    assert lines[0] == "camera,recorded_seconds,common_seconds,key"
+    assert sum(line.startswith("a,") for line in lines) == 30
+    assert 0 < len((folder / "frames.jsonl").read_text().splitlines()) == len(live)
+
+
+def test_pictures_of_other_proportions_are_not_recorded(tmp_path: Path) -> None:
+    path, folder = files(tmp_path, frames=48, c="shape:0.4:0.4"), tmp_path / "take"
+    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    recorded = list(open_capture(folder).frames())
+    assert {frame.index for frame in recorded if "c" not in frame.images} >= set(range(12, 24))
+    for frame in recorded:
+        assert all(shown(image) == frame.index % 12 for image in frame.images.values())
+
+
+def test_a_recording_that_is_cut_can_be_read_up_to_there(tmp_path: Path) -> None:
+    folder = tmp_path / "take"
+    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    for name in NAMES:
+        file = folder / f"{name}.ts"
+        file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3 // 188 * 188])
+    again = open_capture(folder)
+    assert 15 <= len(again) < 30
+    assert all(shown(frame.images["c"]) == frame.index % 12 for frame in again.frames() if "c" in frame.images)
+
+
+def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part ends within the first group of 12 frames, so the next begins with the second."""
+    monkeypatch.setattr(recording, "PART_SECONDS", recording.LEAD_SECONDS + 0.3)
+    folder = tmp_path / "take"
+    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    first, second = (list(open_capture(part).frames()) for part in (folder, folder / "part-001"))
+    assert [shown(frame.images["b"]) for frame in first] == list(range(12))
+    assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
+
+
+def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(self: object, number: int, file: str, line: str) -> None:
+        raise StorageError("no room")
+
+    monkeypatch.setattr(recording.Recording, "note", full)
+    options = LiveOptions(policy="every", record=tmp_path / "take", frames=4)
+    with caplog.at_level(logging.WARNING):
+        frames = list(LiveSource(files(tmp_path), tmp_path / "x.sgs", options).frames())
+    assert len(frames) == 4
+    assert "camera 'b' is no longer recorded (no room); the stream goes on" in caplog.text
+
+
+def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
+    path, folder = files(tmp_path), tmp_path / "take"
+    options = LiveOptions(policy="every", record=folder, frames=6)
+    list(LiveSource(path, tmp_path / "x.sgs", options).frames())
+    before = (folder / "a.ts").read_bytes()
+    list(LiveSource(path, tmp_path / "y.sgs", options).frames())
+    assert (folder / "a.ts").read_bytes() == before
+    assert len(open_capture(folder / "part-001")) >= 5
+
+
+def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+    path = files(tmp_path)
+    with pytest.raises(ConfigError, match="needs room"):
+        LiveSource(path, tmp_path / "x.sgs", LiveOptions(queue_gigabytes=0))
+    with pytest.raises(ConfigError, match="scale"):
+        LiveSource(path, tmp_path / "x.sgs", LiveOptions(scale=2.0))
+    path.write_text(path.read_text().replace("[cameras.c]", "[cameras.d]"))
+    with pytest.raises(CaptureError, match="names camera 'd'"):
+        LiveSource(path, tmp_path / "x.sgs")

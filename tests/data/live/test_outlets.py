@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The newest set, or all of them through files."""
+
+import logging
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from structgstream.data.live.matching import LivePicture, PictureSet
+from structgstream.data.live.outlets import MOST_UNWRITTEN, DiskQueue, Latest
+from structgstream.errors import StorageError
+from structgstream.frames import MultiViewFrame
+
+WAIT = 10.0
+
+
+def one_set(number: int) -> PictureSet:
+    return PictureSet(float(number), {"a": LivePicture(float(number), float(number), number)})
+
+
+def convert(found: PictureSet) -> MultiViewFrame:
+    """Pictures that do not compress, so that files have a known size: 3 kB."""
+    number = found.pictures["a"].content
+    image = np.random.default_rng(number).integers(0, 256, (32, 32, 3)).astype(np.uint8)
+    return MultiViewFrame(0, found.seconds, {"a": image})
+
+
+def test_latest_hands_out_the_newest_and_counts_the_others() -> None:
+    outlet = Latest(convert)
+    assert outlet.take(0.0) is None
+    for number in range(5):
+        outlet.put(one_set(number))
+    frame = outlet.take(0.0)
+    assert frame is not None
+    assert frame.pts_seconds == 4.0
+    assert outlet.take(0.0) is None
+    assert outlet.status.skipped == 4
+
+
+def test_latest_wakes_who_waits() -> None:
+    outlet, found = Latest(convert), []
+    waiting = threading.Thread(target=lambda: found.append(outlet.take(WAIT)))
+    waiting.start()
+    outlet.put(one_set(3))
+    waiting.join(WAIT)
+    assert found[0].pts_seconds == 3.0
+
+
+def taken(outlet: DiskQueue) -> float:
+    frame = outlet.take(WAIT)
+    assert frame is not None
+    return frame.pts_seconds
+
+
+def test_every_set_comes_in_order_from_the_disk(tmp_path: Path) -> None:
+    outlet = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert)
+    for number in range(20):
+        outlet.put(one_set(number))
+        if number % 5 == 4:
+            assert [taken(outlet) for _ in range(5)] == list(range(number - 4, number + 1))
+    assert outlet.status.skipped == 0
+    outlet.close()
+    assert not (tmp_path / "q").exists()
+
+
+def test_a_full_queue_is_told_once_and_takes_sets_again_when_half_is_done(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    outlet = DiskQueue(tmp_path / "q", most_bytes=20_000, convert=convert)
+    with caplog.at_level(logging.WARNING):
+        for number in range(30):
+            outlet.put(one_set(number))
+            while number < 7 and outlet.status.waiting_bytes < (number + 1) * 3_000:
+                threading.Event().wait(0.001)
+    assert outlet.status.skipped >= 20
+    first = [taken(outlet) for _ in range(5)]
+    assert first == [0, 1, 2, 3, 4]
+    outlet.put(one_set(100))
+    rest = []
+    while (frame := outlet.take(0.2)) is not None:
+        rest.append(frame.pts_seconds)
+    assert rest[-1] == 100.0
+    assert sum("is full" in record.getMessage() for record in caplog.records) == 1
+    outlet.close()
+
+
+def test_sets_that_come_faster_than_they_are_written_are_skipped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    held = threading.Event()
+
+    def slowly(found: PictureSet) -> MultiViewFrame:
+        held.wait(WAIT)
+        return convert(found)
+
+    outlet = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=slowly)
+    with caplog.at_level(logging.WARNING):
+        for number in range(50):
+            outlet.put(one_set(number))
+    assert outlet.status.skipped >= 50 - MOST_UNWRITTEN - 1
+    assert sum("more slowly than they come" in record.getMessage() for record in caplog.records) == 1
+    held.set()
+    assert taken(outlet) == 0.0
+    outlet.close()
+
+
+def test_a_full_disk_is_an_error_for_who_takes(tmp_path: Path) -> None:
+    def full(found: PictureSet) -> MultiViewFrame:
+        raise StorageError("no room")
+
+    outlet = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=full)
+    outlet.put(one_set(0))
+    with pytest.raises(StorageError, match="no room"):
+        outlet.take(WAIT)
+    outlet.close()
+
+
+def test_what_an_earlier_run_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "set-00000099").write_bytes(b"old")
+    outlet = DiskQueue(tmp_path, most_bytes=10**6, convert=convert)
+    assert list(tmp_path.iterdir()) == []
+    outlet.close()
+
+
+def test_a_resumed_run_takes_what_waited_when_it_was_killed(tmp_path: Path) -> None:
+    killed = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert)
+    for number in range(5):
+        killed.put(one_set(number))
+    assert taken(killed) == 0.0
+    while len(list((tmp_path / "q").glob("set-*"))) < 4:
+        threading.Event().wait(0.001)
+    (tmp_path / "q" / "set-00000005.part").write_bytes(b"half")
+    again = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert, resume=True)
+    again.put(one_set(9))
+    assert [taken(again) for _ in range(5)] == [1, 2, 3, 4, 9]
+    assert again.status.waiting_bytes == 0
+    again.close()
+    killed.close()

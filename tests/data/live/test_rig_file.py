@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+import pytest
+
+from structgstream.data.live.rig_file import LiveCamera, TimeBase, check_cameras, read_rig
+from structgstream.errors import CaptureError
+
+WHOLE = """
+name = "studio"
+calibration = "capture"
+fps = 25
+clock = "stream"
+tolerance_seconds = 0.01
+queue_frames = 16
+end_seconds = 60
+without = ["c"]
+
+[cameras.a]
+url = "rtsp://user:secret@10.0.0.11/stream"
+offset_seconds = -0.04
+options = {rtsp_transport = "tcp"}
+
+[cameras.b]
+url = "take/b.ts"
+follow = true
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "rig.toml"
+    path.write_text(text)
+    return path
+
+
+def test_everything_that_a_file_can_say(tmp_path: Path) -> None:
+    rig = read_rig(written(tmp_path, WHOLE))
+    assert (rig.name, rig.fps, rig.clock, rig.queue_frames) == ("studio", 25.0, TimeBase.STREAM, 16)
+    assert (rig.tolerance_seconds, rig.end_seconds, rig.without) == (0.01, 60.0, ("c",))
+    assert rig.calibration == tmp_path / "capture"
+    a, b = rig.cameras.values()
+    assert (a.offset_seconds, a.options, a.is_file) == (-0.04, {"rtsp_transport": "tcp"}, False)
+    assert (b.url, b.follow, b.is_file) == (str(tmp_path / "take/b.ts"), True, False)
+
+
+def test_a_password_is_in_no_message() -> None:
+    assert LiveCamera("rtsp://user:secret@10.0.0.11/stream").shown_url == "rtsp://10.0.0.11/stream"
+
+
+def test_little_is_needed(tmp_path: Path) -> None:
+    rig = read_rig(written(tmp_path, 'calibration = "/calibrated"\n[cameras.a]\nurl = "/dev/video0"\nformat = "v4l2"'))
+    assert (rig.name, rig.calibration, rig.clock) == ("rig", Path("/calibrated"), TimeBase.ARRIVAL)
+    assert rig.cameras["a"].url == "/dev/video0"
+    assert not rig.cameras["a"].is_file
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "studio"', "nmae = 1", "no key 'nmae'"),
+        ('calibration = "capture"', "", "'calibration' is missing"),
+        ("fps = 25", "fps = 0", "fps = 0.*more than 0"),
+        ("fps = 25", 'fps = "25"', "fps = '25'"),
+        ("fps = 25", "fps = nan", "fps = nan"),
+        ('clock = "stream"', 'clock = "ntp"', "arrival, stream or unix"),
+        ("queue_frames = 16", "queue_frames = 1", "from 2 to 10000"),
+        ("offset_seconds = -0.04", "offset = 1", "no key 'offset' in camera 'a'"),
+        ('url = "take/b.ts"', "", "'url' is missing in camera 'b'"),
+        ("follow = true", 'follow = "yes"', "true or false"),
+        ('options = {rtsp_transport = "tcp"}', "options = {timeout = 5}", "a table of texts"),
+        ("[cameras.a]", "[camera.a]", "no key 'camera'"),
+        ("[cameras.b]", "[cameras.a]", "cannot be read"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in WHOLE
+    path = written(tmp_path, WHOLE.replace(old, new))
+    with pytest.raises(CaptureError, match=said) as raised:
+        read_rig(path)
+    assert "\n" not in str(raised.value)
+    assert "rig.toml" in str(raised.value)
+
+
+def test_a_file_without_cameras_or_without_itself(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="has no cameras"):
+        read_rig(written(tmp_path, 'calibration = "capture"'))
+    with pytest.raises(CaptureError, match="cannot be read"):
+        read_rig(tmp_path / "none.toml")
+
+
+def test_cameras_are_those_of_the_calibration(tmp_path: Path) -> None:
+    path = written(tmp_path, WHOLE)
+    rig = read_rig(path)
+    check_cameras(rig, ["a", "b", "c"], path)
+    with pytest.raises(CaptureError, match="names camera 'c', which"):
+        check_cameras(rig, ["a", "b"], path)
+    with pytest.raises(CaptureError, match="lacks camera 'd'"):
+        check_cameras(rig, ["a", "b", "c", "d"], path)
+    both = read_rig(written(tmp_path, WHOLE.replace('["c"]', '["a"]')))
+    with pytest.raises(CaptureError, match="under cameras and in without"):
+        check_cameras(both, ["a", "b"], path)

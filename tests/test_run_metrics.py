@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from reports import frame_report
+from structgstream.data.live.status import CameraStatus, LiveStatus
+from structgstream.run_metrics import RunMetrics, free_bytes, metrics_path
+
+CAMERAS = {"a": CameraStatus(True, 40, 1, {"jump": 1}), "b": CameraStatus()}
+
+
+class Clock:
+    """Seconds that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def read(stream: Path) -> dict:
+    return json.loads(metrics_path(stream).read_text(), parse_constant=lambda name: pytest.fail(name))
+
+
+def test_rates_stages_and_sizes_are_of_the_last_frames(tmp_path: Path) -> None:
+    clock, sets, stream = Clock(), [0], tmp_path / "x.sgs"
+    metrics = RunMetrics(
+        stream,
+        fps=10.0,
+        live=lambda: LiveStatus(CAMERAS, sets[0], skipped_sets=5),
+        captured=lambda index: 1.7e9 - index,
+        now=clock,
+        unix=lambda: 1.7e9,
+    )
+    extras = {}
+    for index in range(5):
+        clock.now += 2.0
+        sets[0] += 20
+        report = frame_report(index, bytes=1000, train_psnr=30.0, seconds={"fit": 1.5, "total": 2.0})
+        extras = metrics.frame(replace(report, pts_seconds=0.5 * index, absent=("b",)))
+    values = read(stream)
+    assert (values["format"], values["version"], values["state"]) == ("structgstream-metrics", 1, "running")
+    assert (values["frames"], values["frames_total"], values["bytes"]) == (5, None, 5000)
+    assert values["frames_out_per_second"] == pytest.approx(0.5)
+    assert values["frames_in_per_second"] == pytest.approx(10.0)
+    assert values["bits_per_second"] == pytest.approx(8 * 5000 / 2.1)
+    assert values["seconds_by_stage"] == {"fit": 1.5, "total": 2.0}
+    assert (values["train_psnr"], values["absent"], values["pts_seconds"]) == (30.0, ["b"], 2.0)
+    assert values["live"]["cameras"]["a"] == {"present": True, "decoded": 40, "queued": 1, "faults": {"jump": 1}}
+    assert values["disk_free_bytes"] > 0
+    assert values["stored_after_seconds"] == extras["run"]["stored_after_seconds"] == 4.0
+    assert extras["run"]["live"]["skipped_sets"] == 5
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_before_the_first_frame_and_of_a_recording_what_is_unknown_is_null(tmp_path: Path) -> None:
+    metrics = RunMetrics(tmp_path / "x.sgs", fps=30.0, total=12)
+    metrics.write()
+    values = read(tmp_path / "x.sgs")
+    assert (values["state"], values["frames_total"], values["live"]) == ("waiting", 12, None)
+    assert values["train_psnr"] is values["bits_per_second"] is values["frames_out_per_second"] is None
+    report = frame_report(0, train_psnr=float("nan"), seconds={"total": 1.0})
+    assert metrics.frame(report) == {}
+    assert read(tmp_path / "x.sgs")["train_psnr"] is None
+
+
+@pytest.mark.parametrize(("error", "state"), [(None, "finished"), (KeyboardInterrupt, "finished"), (OSError, "failed")])
+def test_how_a_run_ended_is_the_last_word(tmp_path: Path, error: type[BaseException] | None, state: str) -> None:
+    metrics = RunMetrics(tmp_path / "x.sgs", fps=30.0)
+
+    def run() -> None:
+        with metrics.running():
+            if error is not None:
+                raise error
+
+    if error is None:
+        run()
+    else:
+        with pytest.raises(error):
+            run()
+    assert read(tmp_path / "x.sgs")["state"] == state
+
+
+def test_a_disk_that_is_full_does_not_end_the_run(tmp_path: Path) -> None:
+    (tmp_path / "x.metrics.json.part").mkdir()
+    RunMetrics(tmp_path / "x.sgs", fps=30.0).write()
+    assert free_bytes(tmp_path / "not" / "yet" / "there") == pytest.approx(free_bytes(tmp_path), rel=0.2)
