@@ -4,8 +4,9 @@
 import type { StreamHeader } from "@structgstream/core";
 import { type Camera, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
-import { Engine, type Pipeline } from "./engine/engine.js";
+import { Engine } from "./engine/engine.js";
 import type { EngineEvents } from "./engine/events.js";
+import type { Pipeline } from "./engine/pipeline.js";
 import type { SourceDescription } from "./source/description.js";
 import { Flight } from "./view/flight.js";
 import { carried, type View, viewOf } from "./view/navigator.js";

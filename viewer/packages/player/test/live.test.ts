@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Live streams from segments folders: engine, decoder and fetcher together, without a browser. */
 
+import { existsSync, readdirSync, readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
 import { Ladder } from "../src/decode/ladder.ts";
@@ -306,7 +307,7 @@ test("periods are crossed without a break, in both directions", async () => {
   const stalls: boolean[] = [];
   play.engine.on("stall", ({ stalled }) => stalls.push(stalled));
   play.engine.play();
-  await play.until(() => play.engine.buffered.at(-1)?.[1]! > 0.7, "buffer");
+  await play.until(() => (play.engine.buffered.at(-1)?.[1] ?? 0) > 0.7, "buffer");
   while (!play.engine.ended) {
     play.seconds += 1 / 60;
     take();
@@ -433,4 +434,19 @@ test("the address's token goes along with every file, and news are asked for by 
   await play.until(() => play.engine.frames.count === 11);
   expect(host.requests.every(({ query }) => new URLSearchParams(query).get("token") === "secret")).toBe(true);
   expect(host.requests.some(({ query }) => new URLSearchParams(query).get("after") === "10")).toBe(true);
+});
+
+const GOLDEN = new URL("../../../../tests/vectors/segments-1/", import.meta.url);
+
+test.skipIf(!existsSync(GOLDEN))("the golden folder of the writer is played to its edge", async () => {
+  const files = new Map(readdirSync(GOLDEN).map((name) => [name, new Uint8Array(readFileSync(new URL(name, GOLDEN)))]));
+  const host = new Host({ "": { files, live: false, sequence: 0 } });
+  const play = opened(host, 0);
+  await play.settled();
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1) === play.engine.frames.count - 1, "edge");
+  expect(play.shown.slice(0, 1)).toEqual([0]);
+  expect(play.shown.length).toBe(play.engine.frames.count);
+  expect(play.errors).toEqual([]);
 });

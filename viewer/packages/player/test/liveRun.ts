@@ -238,7 +238,7 @@ export class Host {
   /** What is there instead of a folder's own file. */
   readonly instead = new Map<string, Uint8Array>();
 
-  constructor(readonly folders: Readonly<Record<string, LiveRun>>) {}
+  constructor(readonly folders: Readonly<Record<string, Pick<LiveRun, "files" | "sequence" | "live">>>) {}
 
   asked(name: string): number {
     return this.requests.filter(({ path }) => path.includes(name)).length;

@@ -21,8 +21,11 @@ const FASTEST = 1.1;
 const JUMP_SECONDS = 5;
 const LEAST_GAIN_SECONDS = 1;
 
-/** How the clock is to go on: so many times as fast as the media, or from another key frame. */
-export type Pace = { readonly rate: number; readonly jump: number | undefined };
+/** What is shown may leave the window: from its beginning it is gone on so much of it later. */
+const LEFT_SHARE = 0.1;
+
+/** How the clock is to go on: so many times as fast as the media, or from another frame, and why. */
+export type Pace = { readonly rate: number; readonly to?: undefined } | { readonly to: number; readonly why: string };
 
 export class Edge {
   /** Whether the clock is to keep to the edge of a live stream; otherwise it plays what the viewer has chosen. */
@@ -46,6 +49,11 @@ export class Edge {
       if (this.arrivals.length > REMEMBERED) this.arrivals.shift();
     }
     this.count = count;
+  }
+
+  /** Whether frames may still be appended, and all that there are have been read. */
+  get grows(): boolean {
+    return this.reached && !this.timeline.complete;
   }
 
   /** Whether frames still come to a stream that has a manifest. */
@@ -84,13 +92,19 @@ export class Edge {
     return found;
   }
 
-  /** How the clock, which is at `seconds`, is to go on. */
-  pace(seconds: number): Pace {
+  /** How the clock, which is at `seconds`, is to go on; `rate` is what the viewer wants. */
+  pace(seconds: number, rate: number): Pace {
+    const { timeline } = this;
+    if (timeline.first > 0 && seconds < timeline.start) {
+      const to = timeline.frameAt(timeline.start + LEFT_SHARE * (timeline.duration - timeline.start));
+      return { to, why: "The host no longer has this part of the stream: went on after it." };
+    }
+    if (!this.following || rate !== 1) return { rate };
     const behind = this.seconds - this.distance - seconds;
-    const key = behind > JUMP_SECONDS ? this.start : 0;
-    const jump = this.timeline.ptsOf(key) > seconds + LEAST_GAIN_SECONDS ? key : undefined;
+    if (behind > JUMP_SECONDS && timeline.ptsOf(this.start) > seconds + LEAST_GAIN_SECONDS)
+      return { to: this.start, why: "This was too slow to keep up: went on with the newest frames." };
     this.catching = behind > (this.catching ? 0 : SLACK_SECONDS);
-    return { rate: this.catching ? Math.min(1 + behind / 10, FASTEST) : 1, jump };
+    return { rate: this.catching ? Math.min(1 + behind / 10, FASTEST) : 1 };
   }
 
   /** The clock had to wait. */
@@ -98,12 +112,12 @@ export class Edge {
     if (this.following && this.flows) this.stalls = Math.min(this.stalls + STALL_SECONDS, MOST_STALL_SECONDS);
   }
 
-  /** Seconds until the next frame; undefined while that is not known. */
+  /** Seconds until the next frame; undefined while that is not known, or where none comes. */
   nextIn(now: number): number | undefined {
     const last = this.arrivals.at(-1);
     const lately = this.arrivals.slice(-PACE);
     const mean = lately.length > 1 ? (last! - lately[0]!) / (lately.length - 1) : undefined;
     const step = this.timeline.live?.frameSeconds ?? mean;
-    return step === undefined || last === undefined ? undefined : Math.max(last + step - now, 0);
+    return step === undefined || last === undefined || !this.grows ? undefined : Math.max(last + step - now, 0);
   }
 }

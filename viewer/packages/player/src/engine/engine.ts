@@ -2,7 +2,7 @@
 /** Playback without a page: a clock, frames that come from a decoder, and what to do when they do not. */
 
 import type { StreamHeader } from "@structgstream/core";
-import type { Demand, FromDecoder, ToDecoder } from "../decode/messages.js";
+import type { Demand, FromDecoder } from "../decode/messages.js";
 import type { SourceDescription } from "../source/description.js";
 import { demandOf } from "./ahead.js";
 import { MediaClock } from "./clock.js";
@@ -11,15 +11,10 @@ import { Emitter } from "./emitter.js";
 import type { EngineEvents, TimeRange } from "./events.js";
 import { type DueUpdate, FrameQueue } from "./frameQueue.js";
 import { PacketLog } from "./packetLog.js";
+import type { Pipeline } from "./pipeline.js";
+import { Rebuffering } from "./rebuffering.js";
 import { StoredFrames } from "./storedFrames.js";
 import { Timeline } from "./timeline.js";
-
-/** The decoder's end of the line. */
-export interface Pipeline {
-  send(message: ToDecoder): void;
-  onmessage: ((message: FromDecoder) => void) | undefined;
-  close(): void;
-}
 
 export interface EngineOptions {
   /** Packets are kept in no more bytes than these. */
@@ -29,11 +24,6 @@ export interface EngineOptions {
 }
 
 const BUDGET_BYTES = 64 * 2 ** 20;
-/** After a stall so much is waited for, or the next one would follow at once. */
-const REBUFFER_SECONDS = 0.5;
-const MOST_REBUFFER_SECONDS = 3;
-/** What is shown may leave the window of a live stream: from its beginning it is gone on so much of it later. */
-const LEFT_SHARE = 0.1;
 const RATES: readonly [number, number] = [0.05, 16];
 
 export class Engine extends Emitter<EngineEvents> {
@@ -41,9 +31,9 @@ export class Engine extends Emitter<EngineEvents> {
   header: StreamHeader | undefined;
   private readonly clock = new MediaClock();
   private readonly queue = new FrameQueue();
-  private readonly timeline = new Timeline();
+  readonly frames = new Timeline();
   /** The end of the stream while it grows. */
-  readonly edge = new Edge(this.timeline);
+  readonly edge = new Edge(this.frames);
   readonly packets = new PacketLog();
   /** Names of the qualities, and which of them frames are of; none where there is only one. */
   qualities: { readonly names: readonly string[]; readonly at: number } = { names: [], at: 0 };
@@ -51,7 +41,8 @@ export class Engine extends Emitter<EngineEvents> {
   quality: number | undefined;
   private opened = false;
   private rate = 1;
-  private readonly stored = new StoredFrames(this.timeline);
+  readonly stored = new StoredFrames(this.frames);
+  private readonly waiting = new Rebuffering(this.frames, this.stored, this.edge);
   private startSeconds: number | undefined;
   private name = "The stream";
   private serial = 0;
@@ -63,8 +54,6 @@ export class Engine extends Emitter<EngineEvents> {
   private isSeeking = false;
   private isStalled = false;
   private hasEnded = false;
-  /** Since when a stalled clock could go on. */
-  private readySince: number | undefined;
   private failed = false;
 
   /** @param now seconds of a clock that only goes forward */
@@ -93,7 +82,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.wantsToPlay = true;
     if (this.hasEnded) this.seekFrame(0);
     else if (this.opened && this.edge.following) this.goLive();
-    else if (!this.isSeeking && this.timeline.count) this.clock.start(this.now());
+    else if (!this.isSeeking && this.frames.count) this.clock.start(this.now());
     this.emit("state", {});
   }
 
@@ -108,7 +97,7 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** Goes to a time; the frame there is drawn when it has come, the key frame before it as soon as that has. */
   seek(seconds: number): void {
-    const { timeline } = this;
+    const { frames: timeline } = this;
     if (!this.opened || !timeline.count) {
       this.startSeconds = seconds;
       return;
@@ -120,7 +109,7 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   seekFrame(index: number): void {
-    const { timeline } = this;
+    const { frames: timeline } = this;
     const frame = Math.min(Math.max(Math.round(index), timeline.first), Math.max(timeline.count - 1, 0));
     this.edge.follow = frame === timeline.count - 1;
     this.begin(frame, timeline.ptsOf(frame));
@@ -129,7 +118,7 @@ export class Engine extends Emitter<EngineEvents> {
   /** Goes to the edge of a live stream, and keeps to it. */
   goLive(): void {
     this.edge.follow = true;
-    this.begin(this.edge.start, this.timeline.ptsOf(this.edge.start));
+    this.begin(this.edge.start, this.frames.ptsOf(this.edge.start));
   }
 
   /** Seconds from the clock to the newest frame. */
@@ -163,20 +152,16 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   get currentTime(): number {
-    return Math.min(this.clock.at(this.now()), Math.max(this.timeline.duration, 0));
+    return Math.min(this.clock.at(this.now()), Math.max(this.frames.duration, 0));
   }
 
   /** The frame that the clock is at, or that is sought. */
   get frameIndex(): number {
-    return this.isSeeking ? this.target : this.timeline.frameAt(this.clock.at(this.now()));
+    return this.isSeeking ? this.target : this.frames.frameAt(this.clock.at(this.now()));
   }
 
   get durationSeconds(): number {
-    return this.timeline.duration;
-  }
-
-  get frames(): Timeline {
-    return this.timeline;
+    return this.frames.duration;
   }
 
   get paused(): boolean {
@@ -197,26 +182,22 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** Whether frames may still be appended to the stream, and all that there are have been read. */
   get growing(): boolean {
-    return !this.timeline.complete && this.edge.reached;
+    return this.edge.grows;
   }
 
   /** Of a growing stream: seconds until its next frame, where its pace is known. */
   get nextFrameSeconds(): number | undefined {
-    return this.growing ? this.edge.nextIn(this.now()) : undefined;
+    return this.edge.nextIn(this.now());
   }
 
   get buffered(): readonly TimeRange[] {
     return this.stored.times;
   }
 
-  get fetchedBytes(): number {
-    return this.stored.fetchedBytes;
-  }
-
   /** The next picture comes with everything that can change: for a renderer that has lost what it had. */
   refresh(): void {
     this.pipeline.send({ type: "refresh" });
-    if (this.timeline.count) this.begin(this.frameIndex, this.clock.at(this.now()));
+    if (this.frames.count) this.begin(this.frameIndex, this.clock.at(this.now()));
   }
 
   /** To be called before each picture: moves the clock, and gives what has to be drawn, if anything new has. */
@@ -225,7 +206,7 @@ export class Engine extends Emitter<EngineEvents> {
     const now = this.now();
     if (this.wantsToPlay && !this.isSeeking) this.advance(now);
     this.ask();
-    const update = this.queue.take(this.timeline.frameAt(this.clock.at(now)));
+    const update = this.queue.take(this.frames.frameAt(this.clock.at(now)));
     if (update) this.emit("frame", { index: update.index, ptsSeconds: update.ptsSeconds });
     return update;
   }
@@ -252,26 +233,21 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private advance(now: number): void {
-    const { clock, timeline } = this;
-    const keeping = this.edge.following && this.rate === 1;
-    const { rate, jump } = keeping ? this.edge.pace(clock.at(now)) : { rate: this.rate, jump: undefined };
-    if (jump !== undefined) {
-      this.emit("notice", { message: "This was too slow to keep up: went on with the newest frames." });
-      this.begin(jump, timeline.ptsOf(jump));
+    const { clock, frames: timeline } = this;
+    const pace = this.edge.pace(clock.at(now), this.rate);
+    if (pace.to !== undefined) {
+      this.emit("notice", { message: pace.why });
+      this.begin(pace.to, timeline.ptsOf(pace.to));
       return;
     }
-    if (rate !== clock.rate) clock.setRate(rate, now);
-    if (timeline.first > 0 && clock.at(now) < timeline.start) {
-      this.emit("notice", { message: "The host no longer has this part of the stream: went on after it." });
-      this.seek(timeline.start + LEFT_SHARE * (timeline.duration - timeline.start));
-      return;
-    }
-    if (this.isStalled && this.mayGoOn(clock.at(now), now)) {
+    if (pace.rate !== clock.rate) clock.setRate(pace.rate, now);
+    const time = clock.at(now);
+    const ahead = this.demanded?.ahead ?? 1;
+    if (this.isStalled && this.waiting.isOver(time, clock.rate, this.reached, ahead, now)) {
       this.setStalled(false);
       clock.start(now);
     }
     if (!clock.running) return;
-    const time = clock.at(now);
     if (time >= timeline.duration) this.stopAtEnd(now);
     else if (timeline.frameAt(time) > this.reached && !this.stored.has(this.reached + 1)) {
       clock.stop(now);
@@ -281,7 +257,7 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private stopAtEnd(now: number): void {
-    const { clock, timeline } = this;
+    const { clock, frames: timeline } = this;
     if (timeline.complete && this.loop) {
       this.seekFrame(0);
       return;
@@ -300,22 +276,9 @@ export class Engine extends Emitter<EngineEvents> {
     this.emit("state", {});
   }
 
-  private mayGoOn(time: number, now: number): boolean {
-    const { timeline, reached, clock } = this;
-    const frame = timeline.frameAt(time);
-    if (reached <= frame) return frame >= timeline.count - 1 && timeline.complete;
-    this.readySince ??= now;
-    const wanted = timeline.frameAt(time + REBUFFER_SECONDS * clock.rate);
-    const enough = Math.min(wanted, (this.demanded?.ahead ?? 1) - 1);
-    // A store may be too small for that much.
-    if (now - this.readySince > MOST_REBUFFER_SECONDS) return true;
-    if (this.edge.flows) return this.behindSeconds >= Math.min(this.edge.distance, REBUFFER_SECONDS);
-    return this.growing || reached >= enough || this.stored.has(enough);
-  }
-
   /** Tells the decoder what is wanted, if that has changed. */
   private ask(): void {
-    const { timeline, clock, serial } = this;
+    const { frames: timeline, clock, serial } = this;
     const at = this.isSeeking ? this.target : timeline.frameAt(clock.at(this.now()));
     const rate = this.wantsToPlay ? clock.rate : undefined;
     const { until, ahead } = demandOf(timeline, serial, at, rate, this.options.aheadSeconds);
@@ -346,7 +309,7 @@ export class Engine extends Emitter<EngineEvents> {
 
   private hearHeader(header: StreamHeader, ranged: boolean): void {
     this.header = header;
-    this.timeline.fps = header.fps;
+    this.frames.fps = header.fps;
     this.emit("header", header);
     if (ranged) return;
     this.emit("notice", {
@@ -355,7 +318,7 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private hearCatalog({ facts }: FromDecoder & { type: "catalog" }): void {
-    const { timeline, edge } = this;
+    const { frames: timeline, edge } = this;
     const wasLive = edge.live;
     timeline.take(facts);
     edge.changed(this.now());
@@ -376,7 +339,7 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private startIfThere(): void {
-    const { startSeconds, timeline } = this;
+    const { startSeconds, frames: timeline } = this;
     if (this.opened || !timeline.count) return;
     if ((startSeconds ?? 0) > timeline.duration && !timeline.complete && !this.edge.reached) return;
     this.opened = true;
@@ -414,16 +377,16 @@ export class Engine extends Emitter<EngineEvents> {
     if (this.isStalled === stalled) return;
     this.isStalled = stalled;
     if (stalled) this.edge.stalled();
-    this.readySince = undefined;
+    this.waiting.begin();
     this.emit("stall", { stalled });
   }
 
   private tellProgress(): void {
     this.emit("progress", {
       buffered: this.buffered,
-      fetchedBytes: this.fetchedBytes,
+      fetchedBytes: this.stored.fetchedBytes,
       durationSeconds: this.durationSeconds,
-      complete: this.timeline.complete,
+      complete: this.frames.complete,
     });
   }
 

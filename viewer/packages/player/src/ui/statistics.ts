@@ -34,7 +34,7 @@ export class Statistics {
     this.set("Frame", `${index} of ${engine.frames.count}`);
     this.set("Pictures a second", pictureSeconds ? (1 / pictureSeconds).toFixed(0) : "–");
     this.set("Bit rate, last second", this.rateText(index));
-    this.set("Fetched", bytesText(engine.fetchedBytes));
+    this.set("Fetched", bytesText(engine.stored.fetchedBytes));
     this.set("Splats drawn", stats ? countText(stats.splats) : "–");
     this.set("Decoding, worker", `${engine.packets.decodeMilliseconds.toFixed(1)} ms`);
     this.set("Sorting, worker", stats ? `${stats.sortMilliseconds.toFixed(1)} ms` : "–");
