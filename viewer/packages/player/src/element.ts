@@ -288,7 +288,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const linked = this.link?.src;
     const own = this.getAttribute("src");
     // A link names a stream of its own origin, and no redirection leads out of it.
-    if (linked !== undefined) this.open(sourceAt(linked, true, true));
+    if (linked !== undefined) this.open(this.sourceAt(new URL(linked), true));
     else if (own !== null) this.open(this.described(own));
     else this.running?.surface.invite();
   }
@@ -298,14 +298,31 @@ export class StructgstreamPlayer extends HTMLElement {
       const text = document.getElementById(source.slice(1))?.textContent;
       return { kind: "base64", text: text ?? "", name: `The page's ${source}` };
     }
-    const url = new URL(source, document.baseURI);
+    return this.sourceAt(new URL(source, document.baseURI), false);
+  }
+
+  /** A manifest, or a list of several, is JSON; everything else is a stream's file. */
+  private sourceAt(url: URL, sameOrigin: boolean): SourceDescription {
     const own = url.origin === location.origin;
-    const token = new URLSearchParams(location.search).get("token");
+    const token = this.token();
     // What opens this page opens its streams; no other host is told of it.
-    if (own && token !== null && !this.hasAttribute("isolated") && !url.searchParams.has("token")) {
-      url.searchParams.set("token", token);
-    }
-    return sourceAt(url.href, own, false);
+    if (own && token !== null && !url.searchParams.has("token")) url.searchParams.set("token", token);
+    const found = { url: url.href, name: nameOf(url.href), sameOrigin };
+    return url.pathname.endsWith(".json") ? { kind: "segments", own, ...found } : { kind: "url", ...found };
+  }
+
+  /** What the page's address says that opens streams. */
+  private token(): string | null {
+    return this.hasAttribute("isolated") ? null : new URLSearchParams(location.search).get("token");
+  }
+
+  /** The address of a stream where a link can lead to it: the page's own token is in the link anyway. */
+  private linkable(source: SourceDescription): string | undefined {
+    if (!("url" in source)) return undefined;
+    const url = new URL(source.url);
+    if (url.origin !== location.origin) return undefined;
+    if (url.searchParams.get("token") === this.token()) url.searchParams.delete("token");
+    return url.href;
   }
 
   private open(source: SourceDescription, seconds?: number): void {
@@ -315,7 +332,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const at = seconds ?? link?.seconds;
     const view = link?.view;
     this.link = undefined; // a link is of the first stream only
-    this.linked = "url" in source && new URL(source.url).origin === location.origin ? source.url : undefined;
+    this.linked = this.linkable(source);
     const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
     surface.begin(source.name);
     if (this.hasAttribute("autoplay")) engine.play();
@@ -340,13 +357,6 @@ export class StructgstreamPlayer extends HTMLElement {
       this.running?.surface.say(error instanceof Error ? error.message : String(error), true);
     }
   }
-}
-
-/** A manifest, or a list of several, is JSON; everything else is a stream's file. */
-function sourceAt(url: string, own: boolean, sameOrigin: boolean): SourceDescription {
-  const isManifest = new URL(url).pathname.endsWith(".json");
-  if (isManifest) return { kind: "segments", url, name: nameOf(url), own, sameOrigin };
-  return { kind: "url", url, name: nameOf(url), sameOrigin };
 }
 
 function nameOf(url: string): string {

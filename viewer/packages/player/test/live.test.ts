@@ -134,6 +134,17 @@ test("who is far behind jumps to a key frame, who is a little behind goes a litt
   expect(play.engine.behindSeconds).toBeLessThan(5);
 });
 
+test("who plays up to the edge follows it", async () => {
+  const live = run(12, { frameSeconds: 2 });
+  const play = opened(new Host({ "": live }), 0);
+  play.engine.play();
+  await play.settled();
+  expect(play.engine.edge.following).toBe(false);
+  const on = goingOn(play);
+  await play.until(() => on() && play.engine.stalled && play.shown.at(-1) === 11, "edge");
+  expect(play.engine.edge.following).toBe(true);
+});
+
 test("scrubbing back leaves the edge, and LIVE goes back to it", async () => {
   const live = run(90, { pageSegments: 4 });
   const host = new Host({ "": live });

@@ -264,7 +264,8 @@ export class Engine extends Emitter<EngineEvents> {
     }
     clock.stop(now);
     if (!timeline.complete) {
-      // The last frame is held until the next one has been written.
+      // The last frame is held until the next one has been written: who has come to the edge follows it.
+      this.edge.follow = true;
       clock.set(Math.max(timeline.duration - 1e-3, 0), now);
       this.setStalled(true);
       return;

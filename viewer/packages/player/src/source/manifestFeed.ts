@@ -19,6 +19,10 @@ const ANSWER_SECONDS = 45;
 const WAITED_SECONDS = 2;
 const HELD_SECONDS = 0.25;
 
+/** So often a host that does not wait is asked for each frame, until one takes so many times as long as those before. */
+const POLLS = 4;
+const OVERDUE = 3;
+
 export interface FeedEvents {
   manifest(manifest: Manifest): void;
   qualities(qualities: readonly Quality[]): void;
@@ -49,7 +53,7 @@ export class ManifestFeed {
    */
   async follow(events: FeedEvents, signal: AbortSignal): Promise<void> {
     const { firstPoll, longestPoll, backOff, stillAfter } = this.patience;
-    let [wait, troubled] = [firstPoll, 0];
+    let [wait, troubled, fresh] = [firstPoll, 0, performance.now()];
     while (!signal.aborted) {
       const began = performance.now();
       try {
@@ -62,7 +66,8 @@ export class ManifestFeed {
         if (found) events.manifest(found);
         if (found && !found.live) return;
         const took = (performance.now() - began) / 1000;
-        wait = found ? firstPoll : Math.min(wait * backOff, longestPoll);
+        if (found) fresh = performance.now();
+        wait = found ? firstPoll : Math.min(wait * backOff, this.longest((performance.now() - fresh) / 1000));
         // A host that held the answer back is one that waits for news.
         if (!asked || took < (found ? HELD_SECONDS : WAITED_SECONDS)) await pause(wait, signal);
       } catch (error) {
@@ -74,6 +79,13 @@ export class ManifestFeed {
         await pause(wait, signal);
       }
     }
+  }
+
+  /** The longest wait for a frame that is expected soon; one that is overdue for long is asked for less often. */
+  private longest(sinceNews: number): number {
+    const { firstPoll, longestPoll } = this.patience;
+    const pace = this.last?.frame_seconds ?? 0;
+    return sinceNews > OVERDUE * pace ? longestPoll : Math.min(Math.max(pace / POLLS, firstPoll), longestPoll);
   }
 
   /** The next manifest; undefined where it is still the last one. */

@@ -223,7 +223,7 @@ export class Surface {
     const { engine } = this.options.player;
     if (!engine?.growing || engine.edge.flows || engine.paused || !engine.stalled) return;
     const seconds = engine.nextFrameSeconds;
-    const when = seconds === undefined ? "the next is awaited" : `next in about ${Math.ceil(seconds)} s`;
+    const when = !seconds ? "the next is awaited" : `next in about ${Math.ceil(seconds)} s`;
     this.notes.status(`Frame ${engine.frames.count - 1}, ${when}`, performance.now() / 1000);
   }
 
