@@ -117,7 +117,7 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.durationSeconds ?? Number.NaN;
   }
 
-  /** Goes to the edge of a live stream and keeps to it. */
+  /** Goes to the edge of a live stream, and plays it from now on. */
   goLive(): void {
     this.engine?.goLive();
   }

@@ -5,6 +5,7 @@ import { existsSync, readdirSync, readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
 import { Ladder } from "../src/decode/ladder.ts";
+import { Throughput } from "../src/decode/throughput.ts";
 import { Host, LiveRun, type RunOptions } from "./liveRun.ts";
 import { CLIP, type Playing, playing } from "./served.ts";
 
@@ -390,6 +391,51 @@ describe("qualities", () => {
     expect(play.shown).toEqual([...Array(60).keys()].filter((index) => play.shown.includes(index)));
     expect(play.shown.length).toBeGreaterThan(50);
     expect(play.errors).toEqual([]);
+  });
+
+  test("follow what the connection bears, up and down", async () => {
+    const [high, low] = [run(3000).finish(), run(3000).finish()];
+    const host = new Host({ high, low });
+    host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second: 5e5 }, ENTRIES[1]]));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.play();
+    const began = performance.now();
+    const on = () => {
+      play.seconds = 100 + (performance.now() - began) / 1000;
+      return true;
+    };
+    await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
+    expect(performance.now() - began).toBeGreaterThan(3000);
+    host.bytesPerSecond = 4000;
+    await play.until(() => on() && play.engine.qualities.at === 0, "lower quality");
+    host.bytesPerSecond = undefined;
+    const at = play.shown.at(-1)!;
+    await play.until(() => on() && play.shown.at(-1)! > at + 10, "frames");
+    expect(play.shown).toEqual([...play.shown].sort((a, b) => a - b));
+    expect(play.errors).toEqual([]);
+  });
+
+  test("throughput is what comes while anything is waited for", () => {
+    const clock = { seconds: 0 };
+    const throughput = new Throughput(() => clock.seconds);
+    expect(throughput.bitsPerSecond).toBeUndefined();
+    throughput.begin();
+    clock.seconds = 1;
+    throughput.begin();
+    throughput.take(25_000);
+    throughput.end();
+    expect(throughput.bitsPerSecond).toBeUndefined(); // too little to know
+    clock.seconds = 2;
+    throughput.take(25_000);
+    throughput.end();
+    expect(throughput.bitsPerSecond).toBe(2e5);
+    clock.seconds = 100; // nothing was waited for
+    expect(throughput.bitsPerSecond).toBe(2e5);
+    throughput.begin();
+    clock.seconds = 120; // and now nothing comes
+    expect(throughput.bitsPerSecond).toBeLessThan(2e4);
+    throughput.end();
   });
 
   test("one that cannot be had is told and left alone", async () => {

@@ -235,6 +235,8 @@ export class Host {
   waits = false;
   /** Every request fails like this, while it does. */
   trouble: "offline" | number | undefined;
+  /** Of a file; without it at once. */
+  bytesPerSecond: number | undefined;
   /** What is there instead of a folder's own file. */
   readonly instead = new Map<string, Uint8Array>();
 
@@ -270,6 +272,20 @@ export class Host {
     const end = found[2] ? Math.min(Number(found[2]) + 1, bytes.length) : bytes.length;
     if (start >= bytes.length) return new Response("", { status: 416 });
     const headers = { "Content-Range": `bytes ${start}-${end - 1}/${bytes.length}` };
-    return new Response(bytes.slice(start, end), { status: 206, headers });
+    return new Response(this.body(bytes.slice(start, end)), { status: 206, headers });
   };
+
+  private body(bytes: Uint8Array<ArrayBuffer>): BodyInit {
+    let at = 0;
+    return new ReadableStream({
+      pull: async (controller) => {
+        const { bytesPerSecond } = this;
+        if (bytesPerSecond !== undefined) await new Promise((resolve) => setTimeout(resolve, 20));
+        const next = at + Math.max(Math.round((bytesPerSecond ?? Number.POSITIVE_INFINITY) / 50), 1);
+        controller.enqueue(bytes.slice(at, next));
+        at = next;
+        if (at >= bytes.length) controller.close();
+      },
+    });
+  }
 }

@@ -115,8 +115,10 @@ export class Engine extends Emitter<EngineEvents> {
     this.begin(frame, timeline.ptsOf(frame));
   }
 
-  /** Goes to the edge of a live stream, and keeps to it. */
-  goLive(): void {
+  /** Goes to the edge of a live stream, and plays it from now on. */
+  goLive(playing = true): void {
+    if (!this.edge.live) return;
+    this.wantsToPlay = playing && !this.failed;
     this.edge.follow = true;
     this.begin(this.edge.start, this.frames.ptsOf(this.edge.start));
   }
@@ -344,7 +346,7 @@ export class Engine extends Emitter<EngineEvents> {
     if (this.opened || !timeline.count) return;
     if ((startSeconds ?? 0) > timeline.duration && !timeline.complete && !this.edge.reached) return;
     this.opened = true;
-    if (startSeconds === undefined && this.edge.live) this.goLive();
+    if (startSeconds === undefined && this.edge.live) this.goLive(this.wantsToPlay);
     else this.seek(startSeconds ?? timeline.start);
   }
 

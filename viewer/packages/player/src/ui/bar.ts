@@ -131,7 +131,8 @@ export class Bar {
     const fine = engine.durationSeconds < 60;
     const now = timeText(engine.currentTime, fine);
     const total = timeText(engine.durationSeconds, fine);
-    const text = `${now} / ${total}`;
+    // Of a live stream the button beside it says how far its end is.
+    const text = engine.edge.live ? now : `${now} / ${total}`;
     const frame = ` · frame ${engine.frameIndex}`;
     if (this.time.textContent === text + frame) return;
     this.time.replaceChildren(text, made("span", { class: "soft" }, frame));

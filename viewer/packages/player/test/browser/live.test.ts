@@ -95,7 +95,6 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     await page.waitForFunction(() => heard.frames.at(-1)! < 40);
     await page.getByRole("button", { name: /Live\. Go to the newest frames: \d+ s behind/ }).click();
     await page.waitForFunction(() => heard.frames.at(-1)! > 110);
-    expect(await ask(page, (player) => player.behindSeconds)).toBeLessThan(6);
     live.finish();
     stage.server.publish("/live/", live.files);
     clearInterval(writing);
