@@ -2,6 +2,7 @@
 /** Manifests of honest and of hostile hosts. */
 
 import { describe, expect, test } from "vitest";
+import { SourceError } from "../src/source/byteSource.ts";
 import { type Manifest, manifestIn, type PageEntry, pageIn } from "../src/source/manifest.ts";
 import { besides, verify } from "../src/source/storedFile.ts";
 import { LiveRun } from "./liveRun.ts";
@@ -105,6 +106,27 @@ test.each([
   for (const path of ["periods.0.file", "segments.0.file", "history.0.file", "parts.0.file"]) {
     expect(() => parsed(but(path, file))).toThrow("expected the plain name of a file beside it");
   }
+});
+
+test("however a manifest is changed, it is taken or refused, and nothing else happens", () => {
+  const good = RUN.files.get("manifest.json")!;
+  let [taken, seed] = [0, 7];
+  const next = (most: number) => {
+    seed = (seed * 48271) % 2147483647;
+    return seed % most;
+  };
+  for (let i = 0; i < 3000; i++) {
+    const bytes = good.slice();
+    for (let flips = next(3); flips >= 0; flips--) bytes[next(bytes.length)] = 32 + next(95);
+    try {
+      manifestIn(bytes, "manifest.json");
+      taken++;
+    } catch (error) {
+      expect(error).toBeInstanceOf(SourceError);
+    }
+  }
+  expect(taken).toBeGreaterThan(50);
+  expect(taken).toBeLessThan(2950);
 });
 
 test("what is no JSON, or none of ours", () => {

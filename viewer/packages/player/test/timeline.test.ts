@@ -60,6 +60,13 @@ test("what is known grows with the number of pages, and not of frames", () => {
   expect(catalog.facts().frames!.length).toBeLessThan(150);
 });
 
+test("the pace of the media is that of the last frames, whether in parts or in segments", () => {
+  for (const frames of [1, 2, 3, 8, 9, 10, 40, 41]) {
+    const { catalog } = made(frames, { fps: 12.5 });
+    expect(catalog.facts().live!.mediaSeconds).toBeCloseTo(0.08, 9);
+  }
+});
+
 test("times of a hostile manifest rise all the same", () => {
   const live = new LiveRun(CLIP).write(20);
   const value = JSON.parse(new TextDecoder().decode(live.files.get("manifest.json")!));

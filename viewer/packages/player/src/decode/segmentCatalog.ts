@@ -7,8 +7,8 @@ import type { CatalogFacts, LiveFacts } from "./messages.js";
 
 /** Pages are kept no more than these: the ones used last. */
 const MOST_PAGES = 12;
-/** The pace of the media is that of so many of the last frames. */
-const PACE_FRAMES = 32;
+/** The pace of the media is that of so many of the last frames, or a few more: writers state theirs over as many. */
+const PACE_FRAMES = 8;
 
 export class SegmentCatalog extends Catalog {
   private manifest: Manifest | undefined;
@@ -190,16 +190,25 @@ function covering<Entry extends PageEntry | SegmentEntry>(
   return entry && index >= entry.first_frame && index < entry.first_frame + entry.frames ? entry : undefined;
 }
 
-function liveFacts({ live, target_latency_seconds, frame_seconds, parts, segments, fps }: Manifest): LiveFacts {
-  const last = segments.at(-1);
-  const times = parts.slice(-PACE_FRAMES).map((part) => part.pts_seconds);
-  let pace = times.length > 1 ? (times.at(-1)! - times[0]!) / (times.length - 1) : 0;
-  if (!(pace > 0) && last && last.frames > 1) pace = (last.pts_seconds[1] - last.pts_seconds[0]) / (last.frames - 1);
+function liveFacts(manifest: Manifest): LiveFacts {
+  const { live, target_latency_seconds, frame_seconds, fps } = manifest;
   return {
     live,
     targetSeconds: target_latency_seconds,
     frameSeconds: frame_seconds ?? undefined,
-    mediaSeconds: pace > 0 ? pace : 1 / fps,
+    mediaSeconds: mediaPace(manifest) ?? 1 / fps,
     fps,
   };
+}
+
+/** Time of the media from frame to frame, over at least the last few frames where there are so many. */
+function mediaPace({ parts, segments, edge }: Manifest): number | undefined {
+  const since =
+    [...segments].reverse().find(({ first_frame }) => edge.frame - first_frame >= PACE_FRAMES) ?? segments[0];
+  const part = parts[parts.length - 1 - PACE_FRAMES] ?? (since ? undefined : parts[0]);
+  const [frame, seconds] = part
+    ? [part.frame, part.pts_seconds]
+    : [since?.first_frame ?? 0, since?.pts_seconds[0] ?? 0];
+  const pace = (edge.pts_seconds - seconds) / (edge.frame - frame);
+  return pace > 0 && Number.isFinite(pace) ? pace : undefined;
 }

@@ -6,8 +6,9 @@ import type { Timeline } from "./timeline.js";
 const REMEMBERED = 8;
 /** The pace of a growing file is that of so many last frames. */
 const PACE = 4;
-/** A stream whose frames take more than this many times as long as they play is slower than its media. */
-const SLOWER = 1.15;
+/** A stream whose frames take so many times as long as they play is slower than its media, until they take less again. */
+const SLOWER = 1.3;
+const QUICK_AGAIN = 1.1;
 /** Frames come in steps: so many of the longest step of late, and so much more, should lie between clock and edge. */
 const STEPS = 1.5;
 const SPARE_SECONDS = 0.25;
@@ -36,6 +37,7 @@ export class Edge {
   private count = 0;
   private stalls = 0;
   private catching = false;
+  private slow = false;
 
   constructor(private readonly timeline: Timeline) {}
 
@@ -43,6 +45,7 @@ export class Edge {
   changed(now: number): void {
     const { count, live } = this.timeline;
     this.reached ||= live?.live === true;
+    if (live) this.slow = (live.frameSeconds ?? 0) > (this.slow ? QUICK_AGAIN : SLOWER) * live.mediaSeconds;
     // What was there when the stream was opened says nothing of how fast it grows.
     if (this.reached && this.count && count > this.count) {
       this.arrivals.push(now);
@@ -63,8 +66,7 @@ export class Edge {
 
   /** Whether they come about as fast as they play, so that a distance to the edge can be kept. */
   get flows(): boolean {
-    const { live } = this.timeline;
-    return this.live && (live!.frameSeconds ?? 0) <= SLOWER * live!.mediaSeconds;
+    return this.live && !this.slow;
   }
 
   /** Whether the clock keeps to the edge. */
