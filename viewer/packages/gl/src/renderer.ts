@@ -75,13 +75,15 @@ export class SplatRenderer implements Renderer {
     return { ...(this.pipeline?.resources.counts ?? none), workers: this.destroyed ? 0 : 1 };
   }
 
-  load(header: StreamHeader): void {
+  load(header: StreamHeader, goesOn = false): void {
     this.alive();
     this.scene = new LiveScene(header);
+    this.orders.forget();
+    // The picture of before stays until there is one of the new scene.
+    if (goesOn) return;
     this.sorted = undefined;
     this.shown = undefined;
     this.pipeline?.forget();
-    this.orders.forget();
   }
 
   update(update: SceneUpdate): void {

@@ -97,8 +97,11 @@ export interface Renderer {
   /** Settable at any time; applies from the next `render` on. */
   maxSplats: number;
   pixelScale: number;
-  /** The static fields; forgets a stream loaded before. Dynamic fields come by `update`. Throws GlError. */
-  load(header: StreamHeader): void;
+  /**
+   * The static fields; forgets a stream loaded before. Dynamic fields come by `update`. A stream that `goesOn` with another
+   * header keeps its picture until there is one of the new scene. Throws GlError.
+   */
+  load(header: StreamHeader, goesOn?: boolean): void;
   /** The scene as it is now; shown as soon as the order for it has come, the latest winning. Throws GlError. */
   update(update: SceneUpdate): void;
   render(camera: Camera, options?: RenderOptions): RenderStats;

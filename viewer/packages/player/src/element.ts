@@ -4,7 +4,7 @@
  *
  * | attribute | meaning |
  * |---|---|
- * | `src` | address of a stream, or `#id` of an element of the page that holds one as base64 |
+ * | `src` | address of a stream, of a manifest of segments (`.json`), or `#id` of an element of the page that holds one as base64 |
  * | `autoplay`, `loop` | as of a video |
  * | `controls="off"` | no controls; the picture can still be turned |
  * | `embed` | few controls |
@@ -66,7 +66,7 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   /** Opens a stream: an address, a file, or bytes. */
-  load(source: string | Blob, seconds = 0): void {
+  load(source: string | Blob, seconds?: number): void {
     if (typeof source === "string") this.open(this.described(source), seconds);
     else this.open({ kind: "blob", blob: source, name: source instanceof File ? source.name : "The stream" }, seconds);
   }
@@ -117,6 +117,21 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.durationSeconds ?? Number.NaN;
   }
 
+  /** Goes to the edge of a live stream, and plays it from now on. */
+  goLive(): void {
+    this.engine?.goLive();
+  }
+
+  /** Whether frames still come to a stream of segments. */
+  get live(): boolean {
+    return this.engine?.edge.live ?? false;
+  }
+
+  /** Seconds to the newest frame of a stream that grows. */
+  get behindSeconds(): number {
+    return this.engine?.behindSeconds ?? 0;
+  }
+
   get paused(): boolean {
     return this.engine?.paused ?? true;
   }
@@ -155,7 +170,7 @@ export class StructgstreamPlayer extends HTMLElement {
 
   /** What decoding a packet took in its worker, on the way to the last frame. */
   get decodeMilliseconds(): number {
-    return this.engine?.decodeMilliseconds ?? 0;
+    return this.engine?.packets.decodeMilliseconds ?? 0;
   }
 
   /** What the renderer holds. */
@@ -273,7 +288,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const linked = this.link?.src;
     const own = this.getAttribute("src");
     // A link names a stream of its own origin, and no redirection leads out of it.
-    if (linked !== undefined) this.open({ kind: "url", url: linked, name: nameOf(linked), sameOrigin: true });
+    if (linked !== undefined) this.open(this.sourceAt(new URL(linked), true));
     else if (own !== null) this.open(this.described(own));
     else this.running?.surface.invite();
   }
@@ -283,19 +298,41 @@ export class StructgstreamPlayer extends HTMLElement {
       const text = document.getElementById(source.slice(1))?.textContent;
       return { kind: "base64", text: text ?? "", name: `The page's ${source}` };
     }
-    const { href } = new URL(source, document.baseURI);
-    return { kind: "url", url: href, name: nameOf(href) };
+    return this.sourceAt(new URL(source, document.baseURI), false);
+  }
+
+  /** A manifest, or a list of several, is JSON; everything else is a stream's file. */
+  private sourceAt(url: URL, sameOrigin: boolean): SourceDescription {
+    const own = url.origin === location.origin;
+    const token = this.token();
+    // What opens this page opens its streams; no other host is told of it.
+    if (own && token !== null && !url.searchParams.has("token")) url.searchParams.set("token", token);
+    const found = { url: url.href, name: nameOf(url.href), sameOrigin };
+    return url.pathname.endsWith(".json") ? { kind: "segments", own, ...found } : { kind: "url", ...found };
+  }
+
+  /** What the page's address says that opens streams. */
+  private token(): string | null {
+    return this.hasAttribute("isolated") ? null : new URLSearchParams(location.search).get("token");
+  }
+
+  /** The address of a stream where a link can lead to it: the page's own token is in the link anyway. */
+  private linkable(source: SourceDescription): string | undefined {
+    if (!("url" in source)) return undefined;
+    const url = new URL(source.url);
+    if (url.origin !== location.origin) return undefined;
+    if (url.searchParams.get("token") === this.token()) url.searchParams.delete("token");
+    return url.href;
   }
 
   private open(source: SourceDescription, seconds?: number): void {
     const { running, link } = this;
     if (!running) return;
     const { player, surface } = running;
-    const at = seconds ?? link?.seconds ?? 0;
+    const at = seconds ?? link?.seconds;
     const view = link?.view;
     this.link = undefined; // a link is of the first stream only
-    this.linked = source.kind === "url" && new URL(source.url).origin === location.origin ? source.url : undefined;
-    if (source.kind === "base64") this.linked = undefined;
+    this.linked = this.linkable(source);
     const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
     surface.begin(source.name);
     if (this.hasAttribute("autoplay")) engine.play();

@@ -2,7 +2,7 @@
 /** The two workers of a stream. */
 
 import type { FromDecoder } from "./decode/messages.js";
-import type { Pipeline } from "./engine/engine.js";
+import type { Pipeline } from "./engine/pipeline.js";
 import { startedWorker } from "./scripts.js";
 
 /** Starts both workers; `close` ends them, whatever they do. */

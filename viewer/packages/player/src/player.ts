@@ -4,17 +4,20 @@
 import type { StreamHeader } from "@structgstream/core";
 import { type Camera, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
-import { Engine, type Pipeline } from "./engine/engine.js";
+import { Engine } from "./engine/engine.js";
 import type { EngineEvents } from "./engine/events.js";
+import type { Pipeline } from "./engine/pipeline.js";
 import type { SourceDescription } from "./source/description.js";
 import { Flight } from "./view/flight.js";
-import { type View, viewOf } from "./view/navigator.js";
+import { carried, type View, viewOf } from "./view/navigator.js";
 import type { QualityControl } from "./view/quality.js";
 import { type Rig, type RigCamera, rigOf } from "./view/rig.js";
 
 export interface PlayerEvents extends EngineEvents {
   /** The camera or the picture's size is another. */
   view: { readonly view: View };
+  /** The cameras may be others from now on. */
+  rig: { readonly rig: Rig };
   /** A picture was drawn. */
   drawn: { readonly stats: RenderStats };
 }
@@ -67,7 +70,7 @@ export class Player extends Emitter<PlayerEvents> {
   }
 
   /** Opens a stream; the one before is forgotten. `view` is taken once the rig is known. */
-  load(source: SourceDescription, startSeconds = 0, view?: (rig: Rig) => View): Engine {
+  load(source: SourceDescription, startSeconds?: number, view?: (rig: Rig) => View): Engine {
     this.engine?.destroy();
     const engine = new Engine(this.options.startPipeline(), this.options.now);
     this.engine = engine;
@@ -163,6 +166,7 @@ export class Player extends Emitter<PlayerEvents> {
     try {
       const update = this.engine?.tick();
       if (update) {
+        if (update.header) this.goOn(update.header);
         renderer.update(update);
         this.hasScene = true;
         this.given ??= { index: update.index, at: time };
@@ -212,6 +216,24 @@ export class Player extends Emitter<PlayerEvents> {
     this.setView(view ? view(rig) : viewOf(rig.first.camera, rig.focus));
     this.atCamera = view ? undefined : rig.first;
     this.emit("header", header);
+    this.emit("rig", { rig });
+  }
+
+  /** The frames from now on belong to another header: the picture stays, and so does what is looked at. */
+  private goOn(header: StreamHeader): void {
+    const before = this.engine?.header;
+    if (this.engine) this.engine.header = header;
+    this.options.renderer.load(header, true);
+    const [rig, old] = [rigOf(header), this.rig];
+    const named = (camera: RigCamera | undefined) => rig.cameras.find(({ name }) => name === camera?.name);
+    const [at, landing] = [named(this.atCamera), named(this.landing)];
+    this.rig = rig;
+    if (this.view && before && old) this.view = carried(this.view, before.similarity, header.similarity);
+    this.flight = undefined;
+    this.landing = undefined;
+    if (landing ?? at) this.flyTo((landing ?? at)!, 0);
+    else this.atCamera = undefined;
+    this.emit("rig", { rig });
   }
 
   private land(): void {

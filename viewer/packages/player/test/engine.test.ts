@@ -414,7 +414,7 @@ test("what a packet took is known by field", async () => {
   await play.settled();
   play.engine.seekFrame(4);
   await play.settled();
-  const facts = play.engine.packetFacts(4)!;
+  const facts = play.engine.packets.of(4)!;
   expect(facts.bytes).toBe(PACKETS[4]!.bytes);
   expect([...facts.byField.values()].reduce((sum, bytes) => sum + bytes, 24)).toBe(facts.bytes);
 });

@@ -1,16 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The decode worker's side of the line to the fetch worker. */
 
-import type { ReadReply, ReadRequest, SourceDescription } from "../source/description.js";
+import type { ReadReply, ReadRequest, SourceDescription, StoredPlace } from "../source/description.js";
+import type { Manifest, PageContent, PageEntry, Quality } from "../source/manifest.js";
 import type { Port } from "../source/port.js";
 
 /** What becomes of one reading; after `end` or `failed` nothing more comes. */
 export interface ReadingEvents {
   begin?(reply: ReadReply & { type: "begin" }): void;
-  bytes(bytes: Uint8Array): void;
+  bytes?(bytes: Uint8Array): void;
+  manifest?(manifest: Manifest): void;
+  qualities?(qualities: readonly Quality[]): void;
+  page?(content: PageContent): void;
   end(): void;
-  failed(message: string): void;
+  /** A `temporary` failure may go away by itself. */
+  failed(message: string, temporary: boolean): void;
   waiting?(seconds: number, problem: string | undefined): void;
+  recovered?(): void;
 }
 
 export class ByteClient {
@@ -28,10 +34,22 @@ export class ByteClient {
     this.port.postMessage({ type: "open", source }, []);
   }
 
-  /** Begins to read; the number is for {@link cancel}. */
-  read(start: number, end: number, wholeIfNeeded: boolean, events: ReadingEvents): number {
+  /** Begins to read; the number is for {@link cancel}. `of` is a file beside a manifest instead of the source. */
+  read(start: number, end: number, wholeIfNeeded: boolean, events: ReadingEvents, of?: StoredPlace): number {
     const id = this.remember(events);
-    this.port.postMessage({ type: "read", id, start, end, wholeIfNeeded }, []);
+    this.port.postMessage({ type: "read", id, start, end, wholeIfNeeded, of }, []);
+    return id;
+  }
+
+  manifests(url: string, name: string, events: ReadingEvents): number {
+    const id = this.remember(events);
+    this.port.postMessage({ type: "manifests", id, url, name }, []);
+    return id;
+  }
+
+  page(url: string, entry: PageEntry, events: ReadingEvents): number {
+    const id = this.remember(events);
+    this.port.postMessage({ type: "page", id, url, entry }, []);
     return id;
   }
 
@@ -55,12 +73,16 @@ export class ByteClient {
     const events = this.readings.get(reply.id);
     if (!events) return;
     if (reply.type === "begin") events.begin?.(reply);
-    else if (reply.type === "bytes") events.bytes(reply.bytes);
+    else if (reply.type === "bytes") events.bytes?.(reply.bytes);
+    else if (reply.type === "manifest") events.manifest?.(reply.manifest);
+    else if (reply.type === "qualities") events.qualities?.(reply.qualities);
+    else if (reply.type === "page") events.page?.(reply.content);
+    else if (reply.type === "recovered") events.recovered?.();
     else if (reply.type === "waiting") events.waiting?.(reply.seconds, reply.problem);
     else {
       this.readings.delete(reply.id);
       if (reply.type === "end") events.end();
-      else events.failed(reply.message);
+      else events.failed(reply.message, reply.temporary);
     }
   }
 }

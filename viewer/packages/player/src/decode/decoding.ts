@@ -5,16 +5,14 @@
  * One packet is decoded at a time, and messages are heard in between, so that a seek never waits for more than one.
  */
 
-import { type Frame, fieldBytes, type Packet, SceneDecoder, StreamError, type StreamReader } from "@structgstream/core";
+import { type Frame, fieldBytes, type Packet, StreamError } from "@structgstream/core";
 import type { ReadReply, ReadRequest } from "../source/description.js";
 import type { Port } from "../source/port.js";
 import { ByteClient } from "./byteClient.js";
-import { Catalog } from "./catalog.js";
-import { ChangedFields } from "./changedFields.js";
+import { FileStream } from "./fileStream.js";
 import type { Demand, FromDecoder, PacketFacts, ToDecoder } from "./messages.js";
-import { Opening, type OpeningEvents } from "./opening.js";
-import { PacketLoader } from "./packetLoader.js";
-import { PacketStore } from "./packetStore.js";
+import { SegmentedStreams } from "./segmentedStreams.js";
+import type { Chapter, Stream } from "./stream.js";
 import { Throttle } from "./throttle.js";
 
 /** On a machine that decodes too slowly, a picture comes at least so often. */
@@ -22,24 +20,19 @@ const LATE_PICTURE_MILLISECONDS = 250;
 /** What changes with every packet is told no more often. */
 const TELL_MILLISECONDS = 100;
 
-/** What is known of a stream once its header is there. */
-interface Stream {
-  readonly decoder: SceneDecoder;
-  readonly catalog: Catalog;
-  readonly store: PacketStore;
-  readonly loader: PacketLoader;
-  readonly changed: ChangedFields;
-}
-
 export class Decoding {
   private readonly client: ByteClient;
   private stream: Stream | undefined;
+  /** Where streams come from that lie in segments folders. */
+  private segmented: SegmentedStreams | undefined;
   private demand: Demand | undefined;
   private serial = -1;
   /** The next frame to give. */
   private next = 0;
   private seeking = false;
   private decoded: number | undefined;
+  /** What the frame given last belongs to. */
+  private told: Chapter | undefined;
   private packets: PacketFacts[] = [];
   private milliseconds = 0;
   private givenAt = 0;
@@ -58,59 +51,48 @@ export class Decoding {
   }
 
   private obey(message: ToDecoder): void {
-    if (message.type === "open") {
-      this.client.open(message.source);
-      new Opening(this.client, this.openingEvents(message.budgetBytes), message.source.name, message.fromStart).begin();
-    } else if (message.type === "demand") this.demand = message.demand;
-    else this.stream?.changed.forget();
+    if (message.type === "open") this.open(message);
+    else if (message.type === "demand") this.demand = message.demand;
+    else if (message.type === "quality") this.segmented?.choose(message.quality);
+    else this.told?.changed.forget();
     this.wake?.();
   }
 
-  private openingEvents(budgetBytes: number): OpeningEvents {
-    let indexed = false;
-    let taken = 0;
-    return {
-      opening: (loadedBytes, totalBytes, ended) => this.tell({ type: "opening", loadedBytes, totalBytes, ended }),
-      header: (header, ranged, index) => {
-        const catalog = new Catalog(header.fps, header.codec === "raw");
-        const store = new PacketStore(budgetBytes);
-        if (index) catalog.fill(index.entries, index.end);
-        indexed = index !== undefined;
-        const loader = new PacketLoader(this.client, catalog, store, {
-          changed: () => this.storeChanged(),
-          damaged: (frame, offset) => this.lose(frame, `its record at byte ${offset} is damaged`),
-          waiting: (seconds, problem) => this.tell({ type: "waiting", seconds, problem }),
-          failed: (problem) => this.tell({ type: "failed", message: problem, fatal: false }),
-        });
-        const decoder = new SceneDecoder(header);
-        this.stream = { decoder, catalog, store, loader, changed: new ChangedFields(header.dynamic) };
-        this.tell({ type: "header", header, ranged });
-        if (indexed) this.catalogTold.call();
-      },
-      read: (reader, ended) => {
-        taken = this.takeFrom(reader, taken, indexed);
-        if (ended && !indexed && this.stream) this.stream.catalog.complete = true;
-        if (!indexed) this.catalogTold.call();
-        this.wake?.();
-      },
-      waiting: (seconds, problem) => this.tell({ type: "waiting", seconds, problem }),
-      failed: (problem) => this.tell({ type: "failed", message: problem, fatal: true }),
+  private open({ source, fromStart, budgetBytes }: ToDecoder & { type: "open" }): void {
+    this.client.open(source);
+    const common = {
+      stored: () => this.storeChanged(),
+      waiting: (seconds: number, problem: string | undefined) => this.tell({ type: "waiting", seconds, problem }),
+      failed: (message: string, fatal: boolean) => this.tell({ type: "failed", message, fatal }),
     };
+    if (source.kind === "segments") {
+      this.segmented = new SegmentedStreams(this.client, source.url, source.name, budgetBytes, {
+        ...common,
+        begun: (stream) => this.begin(stream),
+        changed: () => this.catalogChanged(),
+        lost: (first, end, reason) => this.lose(first, end, reason),
+        notice: (message) => this.tell({ type: "notice", message }),
+        qualities: (names, at) => this.tell({ type: "qualities", names, at }),
+      });
+      return;
+    }
+    FileStream.open(this.client, source.name, fromStart, budgetBytes, {
+      ...common,
+      opening: (loadedBytes, totalBytes, ended) => this.tell({ type: "opening", loadedBytes, totalBytes, ended }),
+      begun: (stream, header, ranged) => {
+        this.begin(stream);
+        this.told = stream.chapter();
+        this.tell({ type: "header", header, ranged });
+      },
+      changed: () => this.catalogChanged(),
+      lost: (first, end, reason) => this.lose(first, end, reason),
+      wanted: () => (this.demand && this.stream ? this.stream.catalog.groupStart(this.demand.at) : 0),
+    });
   }
 
-  /** Takes the packets that the reader found after the first `taken`. */
-  private takeFrom(reader: StreamReader, taken: number, indexed: boolean): number {
-    const { catalog, store } = this.stream!;
-    const keepFrom = this.demand ? catalog.groupStart(this.demand.at) : 0;
-    for (const info of reader.packets.slice(taken)) {
-      const before = catalog.count;
-      if (indexed) catalog.learn(info.index, info.ptsSeconds);
-      else catalog.append(info);
-      if (!indexed && info.index > before) this.tellDamage(before, info.index, "the record there is damaged");
-      store.put(reader.take(info.index), keepFrom);
-    }
-    if (reader.packets.length > taken) this.storeChanged();
-    return reader.packets.length;
+  private begin(stream: Stream): void {
+    this.stream = stream;
+    this.decoded = undefined;
   }
 
   private async work(): Promise<void> {
@@ -128,33 +110,39 @@ export class Decoding {
 
   /** Decodes one packet, if one is wanted and there. */
   private step(): boolean {
-    const { stream, demand } = this;
-    if (!stream || !demand || !stream.catalog.count) return false;
+    const { demand } = this;
+    if (!this.stream?.catalog.count || !demand) return false;
     if (demand.serial !== this.serial) {
       this.serial = demand.serial;
       this.next = demand.at;
       this.seeking = true;
     }
     if (!this.seeking && demand.at > this.next) this.next = demand.at;
+    const changed = this.segmented?.changed(this.next, demand, this.seeking);
+    if (changed) this.begin(changed);
+    const { stream } = this;
     const target = this.seeking ? stream.catalog.shownFor(this.next) : this.next;
-    if (target === undefined) return this.passLost(demand);
+    if (target === undefined) return this.passLost(stream, demand);
     if (!this.seeking && target >= Math.min(demand.until, stream.catalog.count)) {
-      stream.loader.want(target, target, demand.ahead);
+      if (stream.chapter(Math.min(target, stream.catalog.count - 1), demand.ahead)) {
+        stream.loader.want(target, target, demand.ahead);
+      }
       return false;
     }
-    if (!this.seeking && stream.catalog.isLost(target)) return this.passLost(demand);
+    const chapter = stream.chapter(target, demand.ahead);
+    if (!chapter) return false;
+    if (!this.seeking && stream.catalog.isLost(target)) return this.passLost(stream, demand);
     const key = stream.catalog.groupStart(target);
     const goesOn = this.decoded !== undefined && this.decoded >= key && this.decoded < target;
     const first = goesOn ? this.decoded! + 1 : key;
     stream.loader.want(first, target + 1, Math.max(demand.ahead, target + 1));
     const packet = stream.store.get(first);
     if (!packet) return false;
-    this.decode(packet, target, key);
+    this.decode(chapter, packet, target, key);
     return true;
   }
 
-  private decode(packet: Packet, target: number, key: number): void {
-    const { decoder, catalog } = this.stream!;
+  private decode(chapter: Chapter, packet: Packet, target: number, key: number): void {
     const { index } = packet;
     const overdue = performance.now() - this.givenAt > LATE_PICTURE_MILLISECONDS;
     // Key frames are shown on the way: to what is sought, or to where the clock is by now.
@@ -163,18 +151,17 @@ export class Decoding {
     let frame: Frame | undefined;
     this.decoded = undefined;
     try {
-      if (given) frame = decoder.decode(packet);
-      else decoder.advance(packet);
+      if (given) frame = chapter.decoder.decode(packet);
+      else chapter.decoder.advance(packet);
       this.decoded = index;
     } catch (error) {
       if (!(error instanceof StreamError)) throw error;
-      catalog.markDamaged(index);
-      this.lose(index, error.message.replace(/\.$/, ""));
+      this.lose(index, undefined, error.message.replace(/\.$/, ""));
       return;
     }
     this.milliseconds += performance.now() - start;
     this.packets.push({ index, isKey: packet.isKey, bytes: packet.payload.length + 12, byField: fieldBytes(packet) });
-    if (frame) this.give(frame, index === target);
+    if (frame) this.give(chapter, frame, index === target);
     if (index === target) {
       // A frame that stands for a lost one answers for all up to it.
       this.next = Math.max(index, this.seeking ? this.next : index) + 1;
@@ -182,13 +169,18 @@ export class Decoding {
     }
   }
 
-  private give(frame: Frame, exact: boolean): void {
-    const fields = this.stream!.changed.of(frame.fields);
+  private give(chapter: Chapter, frame: Frame, exact: boolean): void {
+    const { told } = this;
+    if (chapter !== told) chapter.changed.forget();
+    if (!told) this.tell({ type: "header", header: chapter.header, ranged: true });
+    this.told = chapter;
+    const fields = chapter.changed.of(frame.fields);
     const update = { index: frame.index, ptsSeconds: frame.ptsSeconds, fields };
     const { serial, packets, milliseconds } = this;
     const transfer = [...fields.values()].map(({ data }) => data.buffer as ArrayBuffer);
+    const header = told && chapter !== told ? { header: chapter.header } : {};
     this.port.postMessage(
-      { type: "frame", serial, update, exact, packets, decodeMilliseconds: milliseconds },
+      { type: "frame", serial, update, exact, packets, decodeMilliseconds: milliseconds, ...header },
       transfer,
     );
     this.packets = [];
@@ -197,8 +189,7 @@ export class Decoding {
   }
 
   /** Goes on after frames that cannot be shown. */
-  private passLost(demand: Demand): boolean {
-    const { catalog } = this.stream!;
+  private passLost({ catalog }: Stream, demand: Demand): boolean {
     let end = this.next;
     while (end < catalog.count && catalog.isLost(end)) end++;
     if (end === this.next) return false;
@@ -208,15 +199,20 @@ export class Decoding {
     return true;
   }
 
-  private lose(index: number, reason: string): void {
-    this.tellDamage(index, this.stream!.catalog.groupEnd(index), reason);
+  /** Frames from `first` on cannot be shown: up to before `end`, or all that need the first. */
+  private lose(first: number, end: number | undefined, reason: string): void {
+    const { catalog } = this.stream!;
+    for (let i = first; i < (end ?? first + 1); i++) catalog.markDamaged(i);
+    const last = (end ?? catalog.groupEnd(first)) - 1;
+    const frames = last === first ? `Frame ${first} is` : `Frames ${first} to ${last} are`;
+    this.tell({ type: "damage", message: `${frames} lost: ${reason}.`, lost: [first, last + 1] });
     this.catalogTold.call();
     this.wake?.();
   }
 
-  private tellDamage(first: number, end: number, reason: string): void {
-    const frames = end === first + 1 ? `Frame ${first} is` : `Frames ${first} to ${end - 1} are`;
-    this.tell({ type: "damage", message: `${frames} lost: ${reason}.`, lost: [first, end] });
+  private catalogChanged(): void {
+    this.catalogTold.call();
+    this.wake?.();
   }
 
   private storeChanged(): void {
@@ -225,12 +221,12 @@ export class Decoding {
   }
 
   private tellStored(): void {
-    const ranges = this.stream!.store.ranges();
-    this.tell({ type: "stored", ranges, fetchedBytes: this.client.fetchedBytes });
+    if (!this.stream) return;
+    this.tell({ type: "stored", ranges: this.stream.store.ranges(), fetchedBytes: this.client.fetchedBytes });
   }
 
   private tellCatalog(): void {
-    this.tell({ type: "catalog", facts: this.stream!.catalog.facts() });
+    if (this.stream) this.tell({ type: "catalog", facts: this.stream.catalog.facts() });
   }
 
   private tell(message: FromDecoder): void {

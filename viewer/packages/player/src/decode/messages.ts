@@ -30,6 +30,8 @@ export type ToDecoder =
       readonly budgetBytes: number;
     }
   | { readonly type: "demand"; readonly demand: Demand }
+  /** One of the qualities; undefined leaves it to the connection. */
+  | { readonly type: "quality"; readonly quality: number | undefined }
   /** The next frame is to come with all its dynamic fields. */
   | { readonly type: "refresh" };
 
@@ -41,14 +43,35 @@ export interface PacketFacts {
   readonly byField: ReadonlyMap<FieldName, number>;
 }
 
+/** How a stream in a segments folder grows. */
+export interface LiveFacts {
+  /** Whether frames still come. */
+  readonly live: boolean;
+  /** How far behind the newest frame playing should stay. */
+  readonly targetSeconds: number;
+  /** Time of a clock from frame to frame of late. */
+  readonly frameSeconds: number | undefined;
+  /** Time of the media from frame to frame of late. */
+  readonly mediaSeconds: number;
+  readonly fps: number;
+}
+
 /** All packets that are known of. */
 export interface CatalogFacts {
-  /** By frame, in seconds; rising. Times of packets not read yet are counted on from those that were. */
+  /** The first frame that there still is. */
+  readonly first: number;
+  /** The number after the last frame's. */
+  readonly count: number;
+  /** Frames whose times are known, rising; times between them go evenly. Without it: all from 0 on. */
+  readonly frames?: Float64Array;
+  /** Of these frames, in seconds; rising. Times of packets not read yet are counted on from those that were. */
   readonly ptsSeconds: Float64Array;
+  /** Those that are known. */
   readonly keys: Uint32Array;
   readonly lost: readonly FrameRange[];
   /** Whether no more packets will come. */
   readonly complete: boolean;
+  readonly live?: LiveFacts;
 }
 
 export type FromDecoder =
@@ -66,6 +89,8 @@ export type FromDecoder =
       readonly type: "frame";
       readonly serial: number;
       readonly update: SceneUpdate;
+      /** Of what the frame belongs to, where that is something else than the frame before: another period or quality. */
+      readonly header?: StreamHeader;
       /** False for a picture on the way: the key frame before the one that was sought, or one that is late. */
       readonly exact: boolean;
       /** Of all packets decoded since the last frame given. */
@@ -75,6 +100,10 @@ export type FromDecoder =
   /** Frames up to before `end` cannot be shown. */
   | { readonly type: "gap"; readonly serial: number; readonly end: number }
   | { readonly type: "damage"; readonly message: string; readonly lost: FrameRange }
+  /** The qualities of the stream, and which of them frames are of. */
+  | { readonly type: "qualities"; readonly names: readonly string[]; readonly at: number }
+  /** Something the user may want to know. */
+  | { readonly type: "notice"; readonly message: string }
   | { readonly type: "waiting"; readonly seconds: number; readonly problem: string | undefined }
   /** Unless it is fatal, the next demand is another attempt. */
   | { readonly type: "failed"; readonly message: string; readonly fatal: boolean };

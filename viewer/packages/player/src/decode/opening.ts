@@ -15,6 +15,7 @@ import {
   type StreamHeader,
   StreamReader,
 } from "@structgstream/core";
+import { joined } from "../source/joined.js";
 import type { ByteClient } from "./byteClient.js";
 
 const HEAD_BYTES = 4096;
@@ -172,14 +173,4 @@ export class Opening {
   private stop(): void {
     if (this.reading !== undefined) this.client.cancel(this.reading);
   }
-}
-
-function joined(parts: readonly Uint8Array[]): Uint8Array {
-  const whole = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0));
-  let at = 0;
-  for (const part of parts) {
-    whole.set(part, at);
-    at += part.length;
-  }
-  return whole;
 }

@@ -3,38 +3,52 @@
 
 import { ByteQueue, HEAD_BYTES, type Packet, packetOf, RecordType, recordBytes, recordIn } from "@structgstream/core";
 import type { ByteClient } from "./byteClient.js";
-import type { Catalog } from "./catalog.js";
+import type { Catalog, Place } from "./catalog.js";
 import type { PacketStore } from "./packetStore.js";
+import { Throughput } from "./throughput.js";
 
 /** One request asks for no more than this, so that a seek never has to wait for long. */
 const MOST_RUN_BYTES = 2 ** 22;
+/** So many files are asked for at once: at the edge of a live stream every packet is one. */
+const MOST_RUNS = 4;
 /** Of the store, so much is for packets ahead; the rest keeps what was shown. */
 const AHEAD_SHARE = 0.6;
 
 export interface LoaderEvents {
   /** Packets have come, or one has been found damaged. */
   changed(): void;
-  damaged(index: number, offset: number): void;
+  damaged(index: number, place: Place): void;
   waiting(seconds: number, problem: string | undefined): void;
-  failed(message: string): void;
+  /** Frames from `first` to before `end`, of this file where there are several, did not come. */
+  failed(problem: string, temporary: boolean, first: number, end: number, file: string): void;
+}
+
+/** Where a packet is, and of which kind it was when it was asked for. */
+interface Expected extends Place {
+  readonly isKey: boolean;
 }
 
 /** A reading that goes on: packets from `next` to before `end` are still to come. */
 interface Run {
-  readonly id: number;
+  id: number;
   next: number;
   readonly end: number;
 }
 
 export class PacketLoader {
-  private run: Run | undefined;
+  private runs: Run[] = [];
   private first = 0;
+  /** Nothing is asked for. */
+  blocked = false;
+  readonly throughput = new Throughput();
 
+  /** @param url of the manifest beside which the files of places are */
   constructor(
     private readonly client: ByteClient,
     private readonly catalog: Catalog,
     private readonly store: PacketStore,
     private readonly events: LoaderEvents,
+    private readonly url = "",
   ) {}
 
   /**
@@ -42,24 +56,46 @@ export class PacketLoader {
    *
    * @param first the packet that is needed first; those before it may be let go of
    * @param needed the frame after the last that is waited for
-   * @param ahead the frame after the last that is wanted, as far as there is room; they are asked for when less than
-   *   half of them is left
+   * @param ahead the frame after the last that is wanted, as far as there is room; of a stream that is one file they are
+   *   asked for when less than half of them is left
    */
   want(first: number, needed: number, ahead: number): void {
     this.first = first;
-    const missing = this.firstMissing(first, Math.min(ahead, this.catalog.count));
-    if (missing === undefined) return;
-    if (this.run && missing >= this.run.next && missing < this.run.end) return;
-    if (missing >= needed && (this.run || missing - first > (ahead - first) / 2)) return;
-    if (this.run) this.client.cancel(this.run.id);
-    this.run = undefined;
-    const end = this.runEnd(missing, first, Math.max(ahead, needed));
-    if (end > missing) this.begin(missing, end);
+    if (this.blocked) return;
+    for (;;) {
+      const missing = this.firstMissing(first, Math.min(ahead, this.catalog.count));
+      if (missing === undefined) return;
+      const files = this.catalog.place(missing)!.entry !== undefined;
+      const urgent = missing < needed;
+      if (urgent && this.runs.some((run) => run.next < missing && run.end > first)) {
+        // What has to come before it is under way.
+        if (!files || this.runs.length >= MOST_RUNS) return;
+      } else if (urgent) this.cancel();
+      else if (files ? this.runs.length >= MOST_RUNS : this.runs.length || missing - first > (ahead - first) / 2)
+        return;
+      const end = this.runEnd(missing, first, files && !urgent ? Number.POSITIVE_INFINITY : Math.max(ahead, needed));
+      if (end <= missing) return;
+      this.begin(missing, end);
+      if (!files) return;
+    }
+  }
+
+  /** Asks for nothing more. */
+  cancel(): void {
+    for (const { id } of this.runs) {
+      this.client.cancel(id);
+      this.throughput.end();
+    }
+    this.runs = [];
   }
 
   private firstMissing(first: number, end: number): number | undefined {
-    for (let i = first; i < end; i++) if (this.wanted(i)) return i;
+    for (let i = first; i < end; i++) if (this.wanted(i) && !this.comes(i)) return i;
     return undefined;
+  }
+
+  private comes(index: number): boolean {
+    return this.runs.some(({ next, end }) => index >= next && index < end);
   }
 
   private wanted(index: number): boolean {
@@ -71,8 +107,10 @@ export class PacketLoader {
     let room = AHEAD_SHARE * this.store.budgetBytes;
     for (let i = first; i < from; i++) room -= this.bytesOf(i);
     room = Math.min(room, MOST_RUN_BYTES);
+    const file = this.catalog.place(from)?.entry?.file;
     let next = from;
     while (next < Math.min(end, this.catalog.count) && this.wanted(next) && (next === first || room > 0)) {
+      if (this.catalog.place(next)?.entry?.file !== file || this.comes(next)) break;
       room -= this.bytesOf(next++);
     }
     return next;
@@ -85,32 +123,49 @@ export class PacketLoader {
 
   private begin(from: number, end: number): void {
     const queue = new ByteQueue();
-    let offset = this.catalog.place(from)!.start;
-    const id = this.client.read(offset, this.catalog.place(end - 1)!.end, false, {
-      bytes: (bytes) => {
+    const places: Expected[] = [];
+    for (let i = from; i < end; i++) places.push({ ...this.catalog.place(i)!, isKey: this.catalog.isKey(i) });
+    const { start, entry } = places[0]!;
+    let offset = start;
+    const run: Run = { id: 0, next: from, end };
+    const over = () => {
+      this.runs = this.runs.filter((other) => other !== run);
+      this.throughput.end();
+    };
+    this.throughput.begin();
+    this.runs.push(run);
+    const events = {
+      bytes: (bytes: Uint8Array) => {
+        this.throughput.take(bytes.length);
         queue.append(bytes);
-        offset = this.packetsIn(queue, offset, run, false);
+        offset = this.packetsIn(queue, offset, run, places, false);
       },
       end: () => {
-        this.packetsIn(queue, offset, run, true);
-        if (this.run === run) this.run = undefined;
+        over();
+        this.packetsIn(queue, offset, run, places, true);
         this.events.changed();
       },
-      failed: (message) => {
-        if (this.run === run) this.run = undefined;
-        this.events.failed(message);
+      failed: (message: string, temporary: boolean) => {
+        over();
+        this.events.failed(message, temporary, run.next, end, entry?.file ?? "");
       },
-      waiting: (seconds, problem) => this.events.waiting(seconds, problem),
-    });
-    const run: Run = { id, next: from, end };
-    this.run = run;
+      waiting: (seconds: number, problem: string | undefined) => this.events.waiting(seconds, problem),
+    };
+    const of = entry && {
+      url: this.url,
+      entry,
+      small: end === from + 1 && start === 0 && places[0]!.end === entry.bytes,
+    };
+    run.id = this.client.read(start, places.at(-1)!.end, false, events, of);
   }
 
   /** Takes whole packets from the queue, which begins at byte `offset`; gives back where it begins then. */
-  private packetsIn(queue: ByteQueue, offset: number, run: Run, ended: boolean): number {
+  private packetsIn(queue: ByteQueue, offset: number, run: Run, places: readonly Expected[], ended: boolean): number {
     let at = offset;
+    const from = run.end - places.length;
     for (; run.next < run.end; run.next++) {
-      const { start, end } = this.catalog.place(run.next)!;
+      const place = places[run.next - from]!;
+      const { start, end } = place;
       const gap = Math.min(start - at, queue.length);
       if (gap) queue.skip(gap);
       at += gap;
@@ -120,7 +175,7 @@ export class PacketLoader {
       const cannotCome = head.length === HEAD_BYTES && bytes > end - start;
       if (!isThere && !cannotCome && !ended) return at;
       const packet = isThere && !cannotCome ? packetIn(queue.peek(bytes), start) : undefined;
-      if (packet?.index === run.next && packet.isKey === this.catalog.isKey(run.next)) {
+      if (packet?.index === run.next && packet.isKey === place.isKey) {
         this.catalog.learn(packet.index, packet.ptsSeconds);
         this.store.put(packet, this.first);
         queue.skip(bytes);
@@ -128,7 +183,7 @@ export class PacketLoader {
         this.events.changed();
       } else {
         this.catalog.markDamaged(run.next);
-        this.events.damaged(run.next, start);
+        this.events.damaged(run.next, place);
       }
     }
     return at;

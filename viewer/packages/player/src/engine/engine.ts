@@ -2,22 +2,19 @@
 /** Playback without a page: a clock, frames that come from a decoder, and what to do when they do not. */
 
 import type { StreamHeader } from "@structgstream/core";
-import type { SceneUpdate } from "@structgstream/gl";
-import type { Demand, FrameRange, FromDecoder, PacketFacts, ToDecoder } from "../decode/messages.js";
+import type { Demand, FromDecoder } from "../decode/messages.js";
 import type { SourceDescription } from "../source/description.js";
+import { demandOf } from "./ahead.js";
 import { MediaClock } from "./clock.js";
-import { GrowingEdge } from "./edge.js";
+import { Edge } from "./edge.js";
 import { Emitter } from "./emitter.js";
 import type { EngineEvents, TimeRange } from "./events.js";
-import { FrameQueue } from "./frameQueue.js";
+import { type DueUpdate, FrameQueue } from "./frameQueue.js";
+import { PacketLog } from "./packetLog.js";
+import type { Pipeline } from "./pipeline.js";
+import { Rebuffering } from "./rebuffering.js";
+import { StoredFrames } from "./storedFrames.js";
 import { Timeline } from "./timeline.js";
-
-/** The decoder's end of the line. */
-export interface Pipeline {
-  send(message: ToDecoder): void;
-  onmessage: ((message: FromDecoder) => void) | undefined;
-  close(): void;
-}
 
 export interface EngineOptions {
   /** Packets are kept in no more bytes than these. */
@@ -27,27 +24,25 @@ export interface EngineOptions {
 }
 
 const BUDGET_BYTES = 64 * 2 ** 20;
-const AHEAD_SECONDS = 10;
-/** Decoded frames wait in a queue, which takes memory: few are enough to even out decoding. */
-const LEAD_SECONDS = 0.15;
-const LEAST_LEAD = 3;
-const MOST_LEAD = 8;
-/** After a stall so much is waited for, or the next one would follow at once. */
-const REBUFFER_SECONDS = 0.5;
-const MOST_REBUFFER_SECONDS = 3;
 const RATES: readonly [number, number] = [0.05, 16];
-const REMEMBERED_PACKETS = 4096;
 
 export class Engine extends Emitter<EngineEvents> {
   loop = false;
   header: StreamHeader | undefined;
   private readonly clock = new MediaClock();
   private readonly queue = new FrameQueue();
-  private readonly edge = new GrowingEdge();
-  private readonly facts = new Map<number, PacketFacts>();
-  private timeline = new Timeline(1);
-  private stored: readonly FrameRange[] = [];
-  private fetched = 0;
+  readonly frames = new Timeline();
+  /** The end of the stream while it grows. */
+  readonly edge = new Edge(this.frames);
+  readonly packets = new PacketLog();
+  /** Names of the qualities, and which of them frames are of; none where there is only one. */
+  qualities: { readonly names: readonly string[]; readonly at: number } = { names: [], at: 0 };
+  /** The one that is wanted; undefined leaves it to the connection. */
+  quality: number | undefined;
+  private opened = false;
+  private rate = 1;
+  readonly stored = new StoredFrames(this.frames);
+  private readonly waiting = new Rebuffering(this.frames, this.stored, this.edge);
   private startSeconds: number | undefined;
   private name = "The stream";
   private serial = 0;
@@ -59,10 +54,7 @@ export class Engine extends Emitter<EngineEvents> {
   private isSeeking = false;
   private isStalled = false;
   private hasEnded = false;
-  /** Since when a stalled clock could go on. */
-  private readySince: number | undefined;
   private failed = false;
-  private lastDecodeMilliseconds = 0;
 
   /** @param now seconds of a clock that only goes forward */
   constructor(
@@ -74,25 +66,30 @@ export class Engine extends Emitter<EngineEvents> {
     pipeline.onmessage = (message) => this.hear(message);
   }
 
-  /** Opens a stream and shows its frame at `startSeconds`. An engine opens one in its life. */
-  load(source: SourceDescription, startSeconds = 0): void {
+  /**
+   * Opens a stream and shows its frame at `startSeconds`; without it the first, or of a live stream the last key frame that
+   * is far enough behind the newest. An engine opens one in its life.
+   */
+  load(source: SourceDescription, startSeconds?: number): void {
     this.startSeconds = startSeconds;
     this.name = source.name;
     const budgetBytes = this.options.budgetBytes ?? BUDGET_BYTES;
-    this.pipeline.send({ type: "open", source, fromStart: startSeconds <= 0, budgetBytes });
+    this.pipeline.send({ type: "open", source, fromStart: (startSeconds ?? 0) <= 0, budgetBytes });
   }
 
   play(): void {
     if (this.failed || this.wantsToPlay) return;
     this.wantsToPlay = true;
     if (this.hasEnded) this.seekFrame(0);
-    else if (!this.isSeeking && this.timeline.count) this.clock.start(this.now());
+    else if (this.opened && this.edge.following) this.goLive();
+    else if (!this.isSeeking && this.frames.count) this.clock.start(this.now());
     this.emit("state", {});
   }
 
   pause(): void {
     if (!this.wantsToPlay) return;
     this.wantsToPlay = false;
+    this.edge.follow = false;
     this.clock.stop(this.now());
     this.setStalled(false);
     this.emit("state", {});
@@ -100,17 +97,41 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** Goes to a time; the frame there is drawn when it has come, the key frame before it as soon as that has. */
   seek(seconds: number): void {
-    if (!this.timeline.count) {
+    const { frames: timeline } = this;
+    if (!this.opened || !timeline.count) {
       this.startSeconds = seconds;
       return;
     }
-    const time = Math.min(Math.max(seconds, 0), this.timeline.duration);
-    this.begin(this.timeline.frameAt(time), time);
+    const time = Math.min(Math.max(seconds, timeline.start), timeline.duration);
+    // Who goes to where following would be, or later, follows.
+    this.edge.follow = time >= this.edge.seconds - this.edge.distance;
+    this.begin(timeline.frameAt(time), time);
   }
 
   seekFrame(index: number): void {
-    const frame = Math.min(Math.max(Math.round(index), 0), Math.max(this.timeline.count - 1, 0));
-    this.begin(frame, this.timeline.ptsOf(frame));
+    const { frames: timeline } = this;
+    const frame = Math.min(Math.max(Math.round(index), timeline.first), Math.max(timeline.count - 1, 0));
+    this.edge.follow = frame === timeline.count - 1;
+    this.begin(frame, timeline.ptsOf(frame));
+  }
+
+  /** Goes to the edge of a live stream, and plays it from now on. */
+  goLive(playing = true): void {
+    if (!this.edge.live) return;
+    this.wantsToPlay = playing && !this.failed;
+    this.edge.follow = true;
+    this.begin(this.edge.start, this.frames.ptsOf(this.edge.start));
+  }
+
+  /** Seconds from the clock to the newest frame. */
+  get behindSeconds(): number {
+    return Math.max(this.edge.seconds - this.clock.at(this.now()), 0);
+  }
+
+  /** Chooses one of the qualities; undefined leaves it to the connection. */
+  chooseQuality(quality: number | undefined): void {
+    this.quality = quality;
+    this.pipeline.send({ type: "quality", quality });
   }
 
   /** Pauses, and goes so many frames on or back. */
@@ -120,32 +141,29 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   get playbackRate(): number {
-    return this.clock.rate;
+    return this.rate;
   }
 
   set playbackRate(rate: number) {
     if (!Number.isFinite(rate) || rate <= 0) {
       throw new RangeError(`The playback rate is ${rate}; expected a positive number, such as 0.5.`);
     }
-    this.clock.setRate(Math.min(Math.max(rate, RATES[0]), RATES[1]), this.now());
+    this.rate = Math.min(Math.max(rate, RATES[0]), RATES[1]);
+    this.clock.setRate(this.rate, this.now());
     this.emit("state", {});
   }
 
   get currentTime(): number {
-    return Math.min(this.clock.at(this.now()), Math.max(this.timeline.duration, 0));
+    return Math.min(this.clock.at(this.now()), Math.max(this.frames.duration, 0));
   }
 
   /** The frame that the clock is at, or that is sought. */
   get frameIndex(): number {
-    return this.isSeeking ? this.target : this.timeline.frameAt(this.clock.at(this.now()));
+    return this.isSeeking ? this.target : this.frames.frameAt(this.clock.at(this.now()));
   }
 
   get durationSeconds(): number {
-    return this.timeline.duration;
-  }
-
-  get frames(): Timeline {
-    return this.timeline;
+    return this.frames.duration;
   }
 
   get paused(): boolean {
@@ -166,45 +184,31 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** Whether frames may still be appended to the stream, and all that there are have been read. */
   get growing(): boolean {
-    return !this.timeline.complete && this.edge.reached;
+    return this.edge.grows;
   }
 
   /** Of a growing stream: seconds until its next frame, where its pace is known. */
   get nextFrameSeconds(): number | undefined {
-    return this.growing ? this.edge.nextIn(this.now()) : undefined;
+    return this.edge.nextIn(this.now());
   }
 
   get buffered(): readonly TimeRange[] {
-    return this.stored.map(([first, end]) => [this.timeline.ptsOf(first), this.timeline.endOf(end - 1)]);
-  }
-
-  get fetchedBytes(): number {
-    return this.fetched;
-  }
-
-  /** What decoding a packet took in the worker, on the way to the last frame given. */
-  get decodeMilliseconds(): number {
-    return this.lastDecodeMilliseconds;
-  }
-
-  /** What a packet took, as far as it was decoded lately. */
-  packetFacts(index: number): PacketFacts | undefined {
-    return this.facts.get(index);
+    return this.stored.times;
   }
 
   /** The next picture comes with everything that can change: for a renderer that has lost what it had. */
   refresh(): void {
     this.pipeline.send({ type: "refresh" });
-    if (this.timeline.count) this.begin(this.frameIndex, this.clock.at(this.now()));
+    if (this.frames.count) this.begin(this.frameIndex, this.clock.at(this.now()));
   }
 
   /** To be called before each picture: moves the clock, and gives what has to be drawn, if anything new has. */
-  tick(): SceneUpdate | undefined {
-    if (!this.timeline.count || this.failed) return undefined;
+  tick(): DueUpdate | undefined {
+    if (!this.opened || this.failed) return undefined;
     const now = this.now();
     if (this.wantsToPlay && !this.isSeeking) this.advance(now);
     this.ask();
-    const update = this.queue.take(this.timeline.frameAt(this.clock.at(now)));
+    const update = this.queue.take(this.frames.frameAt(this.clock.at(now)));
     if (update) this.emit("frame", { index: update.index, ptsSeconds: update.ptsSeconds });
     return update;
   }
@@ -231,15 +235,23 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private advance(now: number): void {
-    const { clock, timeline } = this;
-    if (this.isStalled && this.mayGoOn(clock.at(now), now)) {
+    const { clock, frames: timeline } = this;
+    const pace = this.edge.pace(clock.at(now), this.rate);
+    if (pace.to !== undefined) {
+      this.emit("notice", { message: pace.why });
+      this.begin(pace.to, timeline.ptsOf(pace.to));
+      return;
+    }
+    if (pace.rate !== clock.rate) clock.setRate(pace.rate, now);
+    const time = clock.at(now);
+    const ahead = this.demanded?.ahead ?? 1;
+    if (this.isStalled && this.waiting.isOver(time, clock.rate, this.reached, ahead, now)) {
       this.setStalled(false);
       clock.start(now);
     }
     if (!clock.running) return;
-    const time = clock.at(now);
     if (time >= timeline.duration) this.stopAtEnd(now);
-    else if (timeline.frameAt(time) > this.reached && !this.isStored(this.reached + 1)) {
+    else if (timeline.frameAt(time) > this.reached && !this.stored.has(this.reached + 1)) {
       clock.stop(now);
       clock.set(Math.min(time, Math.max(timeline.endOf(Math.max(this.reached, 0)) - 1e-3, 0)), now);
       this.setStalled(true);
@@ -247,14 +259,15 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private stopAtEnd(now: number): void {
-    const { clock, timeline } = this;
+    const { clock, frames: timeline } = this;
     if (timeline.complete && this.loop) {
       this.seekFrame(0);
       return;
     }
     clock.stop(now);
     if (!timeline.complete) {
-      // The last frame is held until the next one has been written.
+      // The last frame is held until the next one has been written: who has come to the edge follows it.
+      this.edge.follow = true;
       clock.set(Math.max(timeline.duration - 1e-3, 0), now);
       this.setStalled(true);
       return;
@@ -266,29 +279,12 @@ export class Engine extends Emitter<EngineEvents> {
     this.emit("state", {});
   }
 
-  private mayGoOn(time: number, now: number): boolean {
-    const { timeline, reached, clock } = this;
-    const frame = timeline.frameAt(time);
-    if (reached <= frame) return frame >= timeline.count - 1 && timeline.complete;
-    this.readySince ??= now;
-    const wanted = timeline.frameAt(time + REBUFFER_SECONDS * clock.rate);
-    const enough = Math.min(wanted, (this.demanded?.ahead ?? 1) - 1);
-    // A store may be too small for that much.
-    return this.growing || reached >= enough || this.isStored(enough) || now - this.readySince > MOST_REBUFFER_SECONDS;
-  }
-
-  private isStored(index: number): boolean {
-    return this.stored.some(([first, end]) => index >= first && index < end);
-  }
-
   /** Tells the decoder what is wanted, if that has changed. */
   private ask(): void {
-    const { timeline, clock, serial } = this;
+    const { frames: timeline, clock, serial } = this;
     const at = this.isSeeking ? this.target : timeline.frameAt(clock.at(this.now()));
-    const lead = Math.ceil((LEAD_SECONDS * clock.rate * timeline.count) / Math.max(timeline.duration, 1e-3));
-    const until = at + 1 + (this.wantsToPlay ? Math.min(Math.max(lead, LEAST_LEAD), MOST_LEAD) : 0);
-    const seconds = timeline.ptsOf(at) + (this.options.aheadSeconds ?? AHEAD_SECONDS) * clock.rate;
-    const ahead = this.wantsToPlay ? Math.max(timeline.frameAt(seconds) + 1, until) : until;
+    const rate = this.wantsToPlay ? clock.rate : undefined;
+    const { until, ahead } = demandOf(timeline, serial, at, rate, this.options.aheadSeconds);
     const last = this.demanded;
     if (last?.serial === serial && last.at === at && last.until === until && last.ahead === ahead) return;
     this.demanded = { serial, at, until, ahead };
@@ -302,17 +298,21 @@ export class Engine extends Emitter<EngineEvents> {
     else if (message.type === "header") this.hearHeader(message.header, message.ranged);
     else if (message.type === "catalog") this.hearCatalog(message);
     else if (message.type === "stored") {
-      this.stored = message.ranges;
-      this.fetched = message.fetchedBytes;
+      this.stored.ranges = message.ranges;
+      this.stored.fetchedBytes = message.fetchedBytes;
       this.tellProgress();
     } else if (message.type === "damage") this.emit("error", { message: message.message, fatal: false });
     else if (message.type === "waiting") this.hearWaiting(message.seconds, message.problem);
-    else this.fail(message.message, message.fatal);
+    else if (message.type === "notice") this.emit("notice", message);
+    else if (message.type === "qualities") {
+      this.qualities = message;
+      this.emit("state", {});
+    } else this.fail(message.message, message.fatal);
   }
 
   private hearHeader(header: StreamHeader, ranged: boolean): void {
     this.header = header;
-    this.timeline = new Timeline(header.fps);
+    this.frames.fps = header.fps;
     this.emit("header", header);
     if (ranged) return;
     this.emit("notice", {
@@ -321,12 +321,14 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private hearCatalog({ facts }: FromDecoder & { type: "catalog" }): void {
-    this.timeline.take(facts);
-    this.edge.frames(facts.ptsSeconds.length, this.now());
+    const { frames: timeline, edge } = this;
+    const wasLive = edge.live;
+    timeline.take(facts);
+    edge.changed(this.now());
+    if (wasLive && !edge.live) this.emit("notice", { message: "The stream has ended; it is a recording now." });
     this.startIfThere();
     this.tellProgress();
-    if (facts.complete && !this.timeline.count)
-      this.fail(`${this.name} has a header and no whole frame to show.`, true);
+    if (facts.complete && !timeline.count) this.fail(`${this.name} has a header and no whole frame to show.`, true);
   }
 
   private hearWaiting(seconds: number, problem: string | undefined): void {
@@ -340,18 +342,18 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private startIfThere(): void {
-    const { startSeconds, timeline } = this;
-    if (startSeconds === undefined || !timeline.count) return;
-    if (startSeconds > timeline.duration && !timeline.complete && !this.edge.reached) return;
-    this.startSeconds = undefined;
-    this.seek(startSeconds);
+    const { startSeconds, frames: timeline } = this;
+    if (this.opened || !timeline.count) return;
+    if ((startSeconds ?? 0) > timeline.duration && !timeline.complete && !this.edge.reached) return;
+    this.opened = true;
+    if (startSeconds === undefined && this.edge.live) this.goLive(this.wantsToPlay);
+    else this.seek(startSeconds ?? timeline.start);
   }
 
   private hearFrame(message: FromDecoder & { type: "frame" }): void {
-    const { serial, update, exact, packets } = message;
-    for (const packet of packets) this.facts.set(packet.index, packet);
-    while (this.facts.size > REMEMBERED_PACKETS) this.facts.delete(this.facts.keys().next().value as number);
-    this.lastDecodeMilliseconds = message.decodeMilliseconds / Math.max(packets.length, 1);
+    const { serial, exact, packets, header } = message;
+    const update = { ...message.update, header };
+    this.packets.take(packets, message.decodeMilliseconds);
     if (serial !== this.serial) {
       this.queue.carry(update);
       return;
@@ -377,16 +379,17 @@ export class Engine extends Emitter<EngineEvents> {
   private setStalled(stalled: boolean): void {
     if (this.isStalled === stalled) return;
     this.isStalled = stalled;
-    this.readySince = undefined;
+    if (stalled) this.edge.stalled();
+    this.waiting.begin();
     this.emit("stall", { stalled });
   }
 
   private tellProgress(): void {
     this.emit("progress", {
       buffered: this.buffered,
-      fetchedBytes: this.fetched,
+      fetchedBytes: this.stored.fetchedBytes,
       durationSeconds: this.durationSeconds,
-      complete: this.timeline.complete,
+      complete: this.frames.complete,
     });
   }
 

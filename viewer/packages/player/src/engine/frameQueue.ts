@@ -5,11 +5,16 @@
  * An update holds what changed since the last one given, so none may be lost: what is not drawn goes on with the next.
  */
 
-import type { FieldName, Tensor } from "@structgstream/core";
+import type { FieldName, StreamHeader, Tensor } from "@structgstream/core";
 import type { SceneUpdate } from "@structgstream/gl";
 
+/** An update, with the header that it and those after it belong to where that is another than before. */
+export interface DueUpdate extends SceneUpdate {
+  readonly header?: StreamHeader | undefined;
+}
+
 interface Pending {
-  readonly update: SceneUpdate;
+  readonly update: DueUpdate;
   /** To be drawn whatever the clock says. */
   readonly atOnce: boolean;
 }
@@ -17,14 +22,20 @@ interface Pending {
 export class FrameQueue {
   private pending: Pending[] = [];
   private carried = new Map<FieldName, Tensor>();
+  private header: StreamHeader | undefined;
 
-  add(update: SceneUpdate, atOnce: boolean): void {
+  add(update: DueUpdate, atOnce: boolean): void {
     this.pending.push({ update, atOnce });
   }
 
   /** Keeps what an update changes, without ever drawing it by itself. */
-  carry(update: SceneUpdate): void {
-    for (const [name, tensor] of update.fields) this.carried.set(name, tensor);
+  carry({ header, fields }: DueUpdate): void {
+    if (header) {
+      // What was before belongs to another scene.
+      this.header = header;
+      this.carried = new Map();
+    }
+    for (const [name, tensor] of fields) this.carried.set(name, tensor);
   }
 
   /** All that is there belongs to another place of the stream now. */
@@ -34,8 +45,8 @@ export class FrameQueue {
   }
 
   /** The last update that is due at frame `index`, with all that changed before it. */
-  take(index: number): SceneUpdate | undefined {
-    let last: SceneUpdate | undefined;
+  take(index: number): DueUpdate | undefined {
+    let last: DueUpdate | undefined;
     while (this.pending.length) {
       const { update, atOnce } = this.pending[0]!;
       if (!atOnce && update.index > index) break;
@@ -44,8 +55,9 @@ export class FrameQueue {
       last = update;
     }
     if (!last) return undefined;
-    const fields = this.carried;
+    const { carried: fields, header } = this;
     this.carried = new Map();
-    return { ...last, fields };
+    this.header = undefined;
+    return { ...last, fields, header };
   }
 }

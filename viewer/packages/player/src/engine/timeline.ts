@@ -1,19 +1,38 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Frames and their times. */
 
-import type { CatalogFacts, FrameRange } from "../decode/messages.js";
+import type { CatalogFacts, FrameRange, LiveFacts } from "../decode/messages.js";
 
 export class Timeline {
-  private facts: CatalogFacts = { ptsSeconds: new Float64Array(), keys: new Uint32Array(), lost: [], complete: false };
+  private facts: CatalogFacts = {
+    first: 0,
+    count: 0,
+    ptsSeconds: new Float64Array(),
+    keys: new Uint32Array(),
+    lost: [],
+    complete: false,
+  };
 
-  constructor(private readonly fps: number) {}
+  /** Frames a second, for how long the last one is shown. */
+  fps = 1;
 
   take(facts: CatalogFacts): void {
     this.facts = facts;
   }
 
+  /** The first frame that there still is. */
+  get first(): number {
+    return this.facts.first;
+  }
+
+  /** The number after the last frame's. */
   get count(): number {
-    return this.facts.ptsSeconds.length;
+    return this.facts.count;
+  }
+
+  /** When the first frame begins, in seconds. */
+  get start(): number {
+    return this.ptsOf(this.first);
   }
 
   /** Whether no more frames will come. */
@@ -23,6 +42,11 @@ export class Timeline {
 
   get keys(): Uint32Array {
     return this.facts.keys;
+  }
+
+  /** How the stream grows, where a manifest says so. */
+  get live(): LiveFacts | undefined {
+    return this.facts.live;
   }
 
   get lost(): readonly FrameRange[] {
@@ -35,7 +59,13 @@ export class Timeline {
   }
 
   ptsOf(index: number): number {
-    return this.facts.ptsSeconds[index] ?? 0;
+    const { frames, ptsSeconds } = this.facts;
+    if (!frames) return ptsSeconds[index] ?? 0;
+    const at = lastBefore(frames, index);
+    const [frame, next] = [frames[at] ?? 0, frames[at + 1]];
+    const seconds = ptsSeconds[at] ?? 0;
+    if (next === undefined || index <= frame) return seconds;
+    return seconds + ((index - frame) / (next - frame)) * (ptsSeconds[at + 1]! - seconds);
   }
 
   /** When a frame is over. */
@@ -47,16 +77,27 @@ export class Timeline {
   frameAt(seconds: number): number {
     // Times that come from frames must lead back to them, whatever was added and taken away meanwhile.
     const time = seconds + 1e-6;
-    let [low, high] = [0, this.count - 1];
-    while (low < high) {
-      const middle = (low + high + 1) >> 1;
-      if (this.ptsOf(middle) <= time) low = middle;
-      else high = middle - 1;
-    }
-    return Math.max(low, 0);
+    const { frames, ptsSeconds, first } = this.facts;
+    const at = lastBefore(ptsSeconds, time);
+    if (!frames) return at;
+    const [frame, next] = [frames[at] ?? 0, frames[at + 1]];
+    const share = next === undefined ? 0 : (time - ptsSeconds[at]!) / (ptsSeconds[at + 1]! - ptsSeconds[at]!);
+    const within = Math.min(Math.floor(share * ((next ?? 0) - frame)), (next ?? 0) - frame - 1);
+    return Math.max(frame + Math.max(within, 0), first);
   }
 
   private lastFor(): number {
-    return 1 / this.fps;
+    return 1 / (this.live?.fps ?? this.fps);
   }
+}
+
+/** Place of the last value that is not above `limit`; 0 where there is none. */
+function lastBefore(values: Float64Array, limit: number): number {
+  let [low, high] = [0, values.length - 1];
+  while (low < high) {
+    const middle = (low + high + 1) >> 1;
+    if (values[middle]! <= limit) low = middle;
+    else high = middle - 1;
+  }
+  return low;
 }

@@ -40,6 +40,8 @@ export class SourceError extends Error {
   constructor(
     message: string,
     readonly temporary = false,
+    /** Whether asking again cannot help, whatever was there before. */
+    readonly final = false,
   ) {
     super(message);
   }

@@ -3,9 +3,17 @@
 
 import { BlobSource, blobOfBase64 } from "./blobSource.js";
 import { type ByteSource, SourceError } from "./byteSource.js";
-import type { ReadReply, ReadRequest, SourceDescription } from "./description.js";
+import type { ReadReply, ReadRequest, SourceDescription, StoredPlace } from "./description.js";
 import { HttpSource } from "./httpSource.js";
+import { joined } from "./joined.js";
+import { type Manifest, MOST_MANIFEST_BYTES, pageIn, type Quality } from "./manifest.js";
+import { ManifestFeed } from "./manifestFeed.js";
+import { pause } from "./pause.js";
 import type { Port } from "./port.js";
+import { besides, verify } from "./storedFile.js";
+
+/** An init record or a packet that is larger is not taken. */
+const MOST_HELD_BYTES = 2 ** 28;
 
 /** How long is waited before looking again, in seconds. */
 export interface Patience {
@@ -51,37 +59,113 @@ export class Fetcher {
     } else void this.perform(message);
   }
 
-  private async perform(message: ReadRequest & { type: "read" | "follow" }): Promise<void> {
+  private async perform(message: Exclude<ReadRequest, { type: "open" | "cancel" }>): Promise<void> {
     const { id } = message;
     const abort = new AbortController();
     this.readings.set(id, abort);
     try {
-      this.source ??= this.opened();
-      if (message.type === "read") {
-        await this.read(id, message.start, abort.signal, message.end, message.wholeIfNeeded);
-      } else await this.follow(id, message.start, abort.signal);
+      await this.answer(message, abort.signal);
       if (!abort.signal.aborted) this.port.postMessage({ type: "end", id }, []);
     } catch (error) {
       if (abort.signal.aborted) return;
       const text = error instanceof Error ? error.message : String(error);
-      this.port.postMessage({ type: "failed", id, message: text }, []);
+      const temporary = error instanceof SourceError && error.temporary;
+      this.port.postMessage({ type: "failed", id, message: text, temporary }, []);
     } finally {
       this.readings.delete(id);
     }
   }
 
+  private async answer(message: Exclude<ReadRequest, { type: "open" | "cancel" }>, signal: AbortSignal): Promise<void> {
+    const { id } = message;
+    if (message.type === "manifests") await this.feed(message, signal);
+    else if (message.type === "page") {
+      const { url, entry } = message;
+      const bytes = await this.wholeOf(id, { url, entry, small: true }, MOST_MANIFEST_BYTES, signal);
+      if (!signal.aborted) this.port.postMessage({ type: "page", id, content: pageIn(bytes, entry) }, []);
+    } else if (message.type === "follow") await this.follow(id, message.start, signal);
+    else if (message.of) await this.readStored(id, message.of, message.start, message.end, signal);
+    else {
+      const give = (bytes: Uint8Array) => this.give(id, bytes, signal);
+      await this.read(this.opened(), id, message.start, signal, give, message.end, message.wholeIfNeeded);
+    }
+  }
+
+  private give(id: number, bytes: Uint8Array, signal: AbortSignal): void {
+    if (!signal.aborted) this.port.postMessage({ type: "bytes", id, bytes }, [bytes.buffer as ArrayBuffer]);
+  }
+
+  private async feed({ id, url, name }: ReadRequest & { type: "manifests" }, signal: AbortSignal): Promise<void> {
+    const { sameOrigin, own } = this.description as SourceDescription & { kind: "segments" };
+    const feed = new ManifestFeed(url, name, this.request, sameOrigin === true, own, this.patience);
+    const events = {
+      manifest: (manifest: Manifest) => {
+        this.answered = true;
+        this.port.postMessage({ type: "manifest", id, manifest }, []);
+      },
+      qualities: (qualities: readonly Quality[]) => this.port.postMessage({ type: "qualities", id, qualities }, []),
+      waiting: (seconds: number, problem: string) =>
+        this.port.postMessage({ type: "waiting", id, seconds, problem }, []),
+      recovered: () => this.port.postMessage({ type: "recovered", id }, []),
+    };
+    await feed.follow(events, signal);
+  }
+
+  /** Bytes of a file that never changes; all of it is compared with what is stated of it. */
+  private async readStored(
+    id: number,
+    of: StoredPlace,
+    start: number,
+    end: number,
+    signal: AbortSignal,
+  ): Promise<void> {
+    if (of.small) return this.give(id, await this.wholeOf(id, of, MOST_HELD_BYTES, signal), signal);
+    const parts: Uint8Array[] = [];
+    const whole = start === 0 && end === of.entry.bytes;
+    const give = (bytes: Uint8Array) => {
+      if (whole) parts.push(bytes.slice());
+      this.give(id, bytes, signal);
+    };
+    await this.read(this.stored(of), id, start, signal, give, end);
+    if (whole && !signal.aborted) await verify(joined(parts), of.entry);
+  }
+
+  private async wholeOf(id: number, of: StoredPlace, most: number, signal: AbortSignal): Promise<Uint8Array> {
+    const parts: Uint8Array[] = [];
+    const { bytes: end, file } = of.entry;
+    if (end > most) throw new SourceError(`${file} has ${end} bytes, more than this player takes at once (${most}).`);
+    await this.read(this.stored(of), id, 0, signal, (bytes) => parts.push(bytes), end);
+    const bytes = joined(parts);
+    if (!signal.aborted) await verify(bytes, of.entry);
+    return bytes;
+  }
+
+  private stored({ url, entry }: StoredPlace): ByteSource {
+    const { sameOrigin } = this.description as SourceDescription & { kind: "segments" };
+    return new HttpSource(besides(url, entry.file), entry.file, this.request, sameOrigin, true);
+  }
+
   private opened(): ByteSource {
+    this.source ??= this.newSource();
+    return this.source;
+  }
+
+  private newSource(): ByteSource {
     const source = this.description!;
-    if (source.kind === "url") return new HttpSource(source.url, source.name, this.request, source.sameOrigin);
+    if (source.kind === "url" || source.kind === "segments") {
+      return new HttpSource(source.url, source.name, this.request, source.sameOrigin);
+    }
     const blob = source.kind === "blob" ? source.blob : blobOfBase64(source.text, source.name);
     return new BlobSource(blob, source.name);
   }
 
   /** Reads a range, again from where it broke off while there is hope; gives back where the bytes ended. */
   private async read(
+    source: ByteSource,
     id: number,
     start: number,
     signal: AbortSignal,
+    give: (bytes: Uint8Array) => void,
     end?: number,
     wholeIfNeeded?: boolean,
   ): Promise<number> {
@@ -90,7 +174,7 @@ export class Fetcher {
     for (let attempt = 0; ; ) {
       try {
         const options = { ...(end === undefined ? {} : { end }), wholeIfNeeded: wholeIfNeeded === true && !begun };
-        await this.source!.read(
+        await source.read(
           at,
           options,
           {
@@ -103,7 +187,7 @@ export class Fetcher {
             take: (bytes) => {
               at += bytes.length;
               attempt = 0;
-              if (!signal.aborted) this.port.postMessage({ type: "bytes", id, bytes }, [bytes.buffer as ArrayBuffer]);
+              give(bytes);
             },
           },
           signal,
@@ -122,28 +206,17 @@ export class Fetcher {
 
   private async follow(id: number, start: number, signal: AbortSignal): Promise<void> {
     const { firstPoll, longestPoll, backOff, stillAfter } = this.patience;
+    const source = this.opened();
     let at = start;
     let wait = firstPoll;
     for (let still = 0; !signal.aborted && still < stillAfter; ) {
       const before = at;
-      at = await this.read(id, at, signal);
-      if (!this.source!.mayGrow || signal.aborted) return;
+      at = await this.read(source, id, at, signal, (bytes) => this.give(id, bytes, signal));
+      if (!source.mayGrow || signal.aborted) return;
       wait = at > before ? firstPoll : Math.min(wait * backOff, longestPoll);
       still = at > before ? 0 : still + wait;
       this.port.postMessage({ type: "waiting", id, seconds: wait, problem: undefined }, []);
       await pause(wait, signal);
     }
   }
-}
-
-function pause(seconds: number, signal: AbortSignal): Promise<void> {
-  return new Promise((resolve) => {
-    const timer = setTimeout(done, seconds * 1000);
-    function done(): void {
-      clearTimeout(timer);
-      signal.removeEventListener("abort", done);
-      resolve();
-    }
-    signal.addEventListener("abort", done);
-  });
 }

@@ -26,6 +26,8 @@ export class HttpSource implements ByteSource {
     private readonly name: string,
     private readonly request: typeof fetch,
     private readonly sameOrigin = false,
+    /** Whether the file never changes, so that the browser's own copy will do. */
+    private readonly kept = false,
   ) {}
 
   get mayGrow(): boolean {
@@ -41,7 +43,7 @@ export class HttpSource implements ByteSource {
       this.takeNothing(start, response, sink);
       return;
     }
-    if (response.status !== 206 && response.status !== 200) throw this.refused(response.status);
+    if (response.status !== 206 && response.status !== 200) throw refusal(this.name, response.status);
     const found = response.status === 206 ? rangeOf(response.headers.get("Content-Range")) : undefined;
     if (found) {
       // A page of another origin may not be allowed to see where the bytes are from; they are what was asked for then.
@@ -61,19 +63,9 @@ export class HttpSource implements ByteSource {
     return this.pour(response, start, (options.end ?? Number.POSITIVE_INFINITY) - start, sink);
   }
 
-  private async answer(start: number, end: number | undefined, signal: AbortSignal): Promise<Response> {
-    const range = `bytes=${start}-${end === undefined ? "" : end - 1}`;
-    try {
-      const mode = this.sameOrigin ? "same-origin" : "cors";
-      return await this.request(this.url, { headers: { Range: range }, signal, mode, cache: "no-store" });
-    } catch (error) {
-      if (signal.aborted) throw error;
-      throw new SourceError(
-        `${this.name} cannot be fetched: the server does not answer, or, being of another origin, does not allow this ` +
-          "page to read it (Access-Control-Allow-Origin).",
-        true,
-      );
-    }
+  private answer(start: number, end: number | undefined, signal: AbortSignal): Promise<Response> {
+    const headers = { Range: `bytes=${start}-${end === undefined ? "" : end - 1}` };
+    return answered(this.request, this.url, this.name, headers, this.sameOrigin, signal, this.kept);
   }
 
   /** Gives `count` bytes of the body after the first `skip`. */
@@ -122,17 +114,40 @@ export class HttpSource implements ByteSource {
   private misplaced(start: number, found: number | undefined): SourceError {
     return new SourceError(`The server gave ${this.name} from byte ${found} on where byte ${start} was asked for.`);
   }
+}
 
-  private refused(status: number): SourceError {
-    if (status === 404 || status === 410) {
-      return new SourceError(`${this.name} was not found on the server (${status}). Check the address.`);
-    }
-    if (status === 401 || status === 403) {
-      return new SourceError(`The server does not give ${this.name} to this page (${status}).`);
-    }
-    const temporary = TEMPORARY.has(status);
-    return new SourceError(`The server answered ${status} where ${this.name} was asked for.`, temporary);
+/** What a server answers; it may be a refusal. */
+export async function answered(
+  request: typeof fetch,
+  url: string,
+  name: string,
+  headers: Record<string, string>,
+  sameOrigin: boolean,
+  signal: AbortSignal,
+  kept = false,
+): Promise<Response> {
+  const [mode, cache] = [sameOrigin ? "same-origin" : "cors", kept ? "default" : "no-store"] as const;
+  try {
+    return await request(url, { headers, signal, mode, cache });
+  } catch (error) {
+    if (signal.aborted) throw error;
+    throw new SourceError(
+      `${name} cannot be fetched: the server does not answer, or, being of another origin, does not allow this ` +
+        "page to read it (Access-Control-Allow-Origin).",
+      true,
+    );
   }
+}
+
+/** What an answer means that is none of those that were hoped for. */
+export function refusal(name: string, status: number): SourceError {
+  if (status === 404 || status === 410) {
+    return new SourceError(`${name} was not found on the server (${status}). Check the address.`);
+  }
+  if (status === 401 || status === 403) {
+    return new SourceError(`The server does not give ${name} to this page (${status}).`);
+  }
+  return new SourceError(`The server answered ${status} where ${name} was asked for.`, TEMPORARY.has(status));
 }
 
 /** `bytes 0-9/100` or `bytes * /100`; nothing where it cannot be seen or understood. */

@@ -44,8 +44,11 @@ export class Bar {
     this.rate.addEventListener("change", () => {
       player.playbackRate = Number(this.rate.value);
     });
-    this.edge = made("button", { type: "button", hidden: true, title: "Go to the newest frame" }, "Newest");
-    this.edge.addEventListener("click", () => engine()?.seekFrame(Number.MAX_SAFE_INTEGER));
+    this.edge = made("button", { type: "button", class: "edge", hidden: true });
+    this.edge.addEventListener("click", () => {
+      if (engine()?.edge.live) engine()?.goLive();
+      else engine()?.seekFrame(Number.MAX_SAFE_INTEGER);
+    });
     const panel = (name: Parameters<BarActions["toggle"]>[0], face: IconName, label: string, extra: string) => {
       const made_ = button(face, label, () => actions.toggle(name, made_), extra);
       made_.setAttribute("aria-expanded", "false");
@@ -100,8 +103,23 @@ export class Bar {
       this.play.setAttribute("aria-label", label);
       this.play.title = label;
     }
-    this.edge.hidden = !engine?.growing || engine.frameIndex >= engine.frames.count - 1;
+    this.updateEdge();
     this.updateTime();
+  }
+
+  private updateEdge(): void {
+    const { engine } = this.player;
+    const live = engine?.edge.live === true;
+    this.edge.hidden = !engine?.growing || (!live && engine.frameIndex >= engine.frames.count - 1);
+    if (this.edge.hidden || !engine) return;
+    const behind = Math.round(engine.behindSeconds);
+    const distance = behind >= 60 ? timeText(behind, false) : `${behind} s`;
+    setText(this.edge, live ? (behind ? `LIVE −${distance}` : "LIVE") : "Newest");
+    this.edge.classList.toggle("at", engine.edge.following && !engine.paused);
+    const title = behind ? `Go to the newest frames: ${distance} behind them` : "At the newest frame";
+    if (this.edge.title === title) return;
+    this.edge.title = title;
+    this.edge.setAttribute("aria-label", live ? `Live. ${title}` : title);
   }
 
   private updateTime(): void {
@@ -113,7 +131,8 @@ export class Bar {
     const fine = engine.durationSeconds < 60;
     const now = timeText(engine.currentTime, fine);
     const total = timeText(engine.durationSeconds, fine);
-    const text = `${now} / ${total}`;
+    // Of a live stream the button beside it says how far its end is.
+    const text = engine.edge.live ? now : `${now} / ${total}`;
     const frame = ` · frame ${engine.frameIndex}`;
     if (this.time.textContent === text + frame) return;
     this.time.replaceChildren(text, made("span", { class: "soft" }, frame));

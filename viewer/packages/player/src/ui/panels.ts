@@ -104,7 +104,13 @@ export function pictureContent(quality: QualityControl, player: Player, actions:
     element.addEventListener("click", act);
     return element;
   };
+  const { engine } = player;
+  const names = engine?.qualities.names ?? [];
+  const qualities = [["auto", "automatic"] as const, ...names.map((name, i) => [String(i), name] as const)];
+  const taken = (text: string) => engine?.chooseQuality(text === "auto" ? undefined : Number(text));
+  const chosen = engine?.quality === undefined ? "auto" : String(engine.quality);
   return [
+    ...(names.length > 1 ? [choice("Stream", qualities, chosen, taken)] : []),
     choice("Splats, at most", splats, String(maxSplats) as "auto", (text) => set({ maxSplats: value(text) })),
     choice("Resolution", scales, String(pixelScale) as "auto", (text) => set({ pixelScale: value(text) })),
     choice(

@@ -34,9 +34,9 @@ export class Statistics {
     this.set("Frame", `${index} of ${engine.frames.count}`);
     this.set("Pictures a second", pictureSeconds ? (1 / pictureSeconds).toFixed(0) : "–");
     this.set("Bit rate, last second", this.rateText(index));
-    this.set("Fetched", bytesText(engine.fetchedBytes));
+    this.set("Fetched", bytesText(engine.stored.fetchedBytes));
     this.set("Splats drawn", stats ? countText(stats.splats) : "–");
-    this.set("Decoding, worker", `${engine.decodeMilliseconds.toFixed(1)} ms`);
+    this.set("Decoding, worker", `${engine.packets.decodeMilliseconds.toFixed(1)} ms`);
     this.set("Sorting, worker", stats ? `${stats.sortMilliseconds.toFixed(1)} ms` : "–");
     this.set("Main thread a picture", stats ? `${stats.callMilliseconds.toFixed(1)} ms` : "–");
     this.updateFields(index);
@@ -58,7 +58,7 @@ export class Statistics {
     let bytes = 0;
     let from = index;
     for (let i = index; i >= 0 && frames.ptsOf(index) - frames.ptsOf(i) < 1; i--) {
-      const facts = this.player.engine!.packetFacts(i);
+      const facts = this.player.engine!.packets.of(i);
       if (!facts) break;
       bytes += facts.bytes;
       from = i;
@@ -68,7 +68,7 @@ export class Statistics {
   }
 
   private updateFields(index: number): void {
-    const packet = this.player.engine?.packetFacts(index);
+    const packet = this.player.engine?.packets.of(index);
     if (!packet) return;
     setText(this.title, `${packet.isKey ? "Key" : "Delta"} packet, ${bytesText(packet.bytes)}`);
     for (const [name, bytes] of packet.byField) {

@@ -3,11 +3,11 @@
 
 const DARK = `
   --ground: #0d0e10; --panel: rgb(22 23 26 / 88%); --line: rgb(255 255 255 / 14%); --text: #f2f3f5; --soft: #a9adb6;
-  --hover: rgb(255 255 255 / 10%); --accent: #6ea8ff; --key: rgb(255 255 255 / 55%); --lost: #ff7a6b;
+  --hover: rgb(255 255 255 / 10%); --accent: #6ea8ff; --key: rgb(255 255 255 / 55%); --lost: #ff7a6b; --live: #ff4d3d;
   --buffer: rgb(255 255 255 / 34%); --rail: rgb(255 255 255 / 16%);`;
 const LIGHT = `
   --ground: #e9ebee; --panel: rgb(252 252 253 / 92%); --line: rgb(15 18 25 / 14%); --text: #15181e; --soft: #565c68;
-  --hover: rgb(15 18 25 / 8%); --accent: #1f5fd6; --key: rgb(15 18 25 / 50%); --lost: #c2321f;
+  --hover: rgb(15 18 25 / 8%); --accent: #1f5fd6; --key: rgb(15 18 25 / 50%); --lost: #c2321f; --live: #d92c17;
   --buffer: rgb(15 18 25 / 32%); --rail: rgb(15 18 25 / 14%);`;
 
 export const STYLES = `
@@ -40,6 +40,9 @@ button:disabled { opacity: .4; cursor: default; background: none; }
 button[aria-pressed="true"], button[aria-expanded="true"] { color: var(--accent); }
 :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 .icon { width: 20px; height: 20px; fill: none; stroke: currentColor; stroke-width: 1.8; stroke-linecap: round; stroke-linejoin: round; }
+.edge { font-size: 11px; font-weight: 600; font-variant-numeric: tabular-nums; color: var(--soft); white-space: nowrap; }
+.edge::before { content: ""; width: 7px; height: 7px; border-radius: 50%; background: var(--soft); }
+.edge.at { color: var(--text); } .edge.at::before { background: var(--live); }
 .time { font-variant-numeric: tabular-nums; white-space: nowrap; padding: 0 8px; overflow: hidden; text-overflow: ellipsis;
   flex: 0 1 auto; min-width: 0; }
 .time .soft { color: var(--soft); }

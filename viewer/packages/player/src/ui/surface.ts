@@ -184,11 +184,10 @@ export class Surface {
         : totalBytes && ` of ${bytesText(totalBytes)}`;
       this.notes.loading(loadedBytes, totalBytes, bytesText(loadedBytes) + (rest ?? ""));
     });
-    player.on("header", () => {
-      if (!player.rig) return;
-      this.overlay.attach(player.rig);
-      this.cameras.attach(player.rig);
-      this.notes.loading(1, 1, "Decoding");
+    player.on("header", () => this.notes.loading(1, 1, "Decoding"));
+    player.on("rig", ({ rig }) => {
+      this.overlay.attach(rig);
+      this.cameras.attach(rig);
     });
     player.on("drawn", () => this.pictureCame());
     player.on("progress", () => this.bar.timeline.changed());
@@ -209,7 +208,8 @@ export class Surface {
     const { engine } = this.options.player;
     this.playButton = made("button", { type: "button", class: "big glass", "aria-label": "Play" }, icon("play"));
     this.playButton.addEventListener("click", () => engine?.play());
-    if (engine?.paused && !engine.growing && engine.frames.count > 1) this.notes.show(this.playButton);
+    if (engine?.paused && (!engine.growing || engine.edge.live) && engine.frames.count > 1)
+      this.notes.show(this.playButton);
     else this.notes.show();
   }
 
@@ -221,9 +221,9 @@ export class Surface {
 
   private tellEdge(): void {
     const { engine } = this.options.player;
-    if (!engine?.growing || engine.paused || !engine.stalled) return;
+    if (!engine?.growing || engine.edge.flows || engine.paused || !engine.stalled) return;
     const seconds = engine.nextFrameSeconds;
-    const when = seconds === undefined ? "the next is awaited" : `next in about ${Math.ceil(seconds)} s`;
+    const when = !seconds ? "the next is awaited" : `next in about ${Math.ceil(seconds)} s`;
     this.notes.status(`Frame ${engine.frames.count - 1}, ${when}`, performance.now() / 1000);
   }
 

@@ -52,19 +52,21 @@ export class TimelineBar {
     const { clientWidth: width, clientHeight: height } = root;
     const seconds = engine.currentTime;
     const scale = devicePixelRatio;
-    const duration = Math.max(engine.durationSeconds, 1e-6);
-    const at = Math.round((seconds / duration) * width * scale);
+    const { start } = engine.frames;
+    const duration = engine.durationSeconds;
+    const span = Math.max(duration - start, 1e-6);
+    const at = Math.round((Math.max(seconds - start, 0) / span) * width * scale);
     const state = `${this.version},${at},${width},${height},${scale},${duration},${getComputedStyle(root).color}`;
     if (state === this.drawn || !width) return;
     this.drawn = state;
-    root.setAttribute("aria-valuemin", "0");
+    root.setAttribute("aria-valuemin", start.toFixed(2));
     root.setAttribute("aria-valuemax", duration.toFixed(2));
     root.setAttribute("aria-valuenow", seconds.toFixed(2));
     root.setAttribute("aria-valuetext", `${timeText(seconds, true)} of ${timeText(duration, true)}`);
-    this.draw(engine, width, height, scale, duration, at / scale);
+    this.draw(engine, width, height, scale, at / scale);
   }
 
-  private draw(engine: Engine, width: number, height: number, scale: number, duration: number, at: number): void {
+  private draw(engine: Engine, width: number, height: number, scale: number, at: number): void {
     const { canvas } = this;
     if (canvas.width !== Math.round(width * scale)) canvas.width = Math.round(width * scale);
     if (canvas.height !== Math.round(height * scale)) canvas.height = Math.round(height * scale);
@@ -77,12 +79,13 @@ export class TimelineBar {
     };
     context.setTransform(scale, 0, 0, scale, 0, 0);
     context.clearRect(0, 0, width, height);
-    const x = (seconds: number) => Math.min((seconds / duration) * width, width);
+    const { frames, durationSeconds } = engine;
+    const span = Math.max(durationSeconds - frames.start, 1e-6);
+    const x = (seconds: number) => Math.min(Math.max((seconds - frames.start) / span, 0), 1) * width;
     const top = height / 2 - 2;
     fill("--rail", 0, width, top, 4);
     for (const [start, end] of engine.buffered) fill("--buffer", x(start), x(end), top, 4);
     fill("--accent", 0, at, top, 4);
-    const { frames } = engine;
     for (const [first, end] of frames.lost) fill("--lost", x(frames.ptsOf(first)), x(frames.endOf(end - 1)), top, 4);
     // More keys than this would be a bar of their own.
     if (frames.keys.length < width / 4)
@@ -96,7 +99,8 @@ export class TimelineBar {
   private secondsAt(event: PointerEvent): number {
     const { left, width } = this.root.getBoundingClientRect();
     const share = Math.min(Math.max((event.clientX - left) / Math.max(width, 1), 0), 1);
-    return share * (this.engine?.durationSeconds ?? 0);
+    const from = this.engine?.frames.start ?? 0;
+    return from + share * ((this.engine?.durationSeconds ?? 0) - from);
   }
 
   private showTip(event: PointerEvent): void {

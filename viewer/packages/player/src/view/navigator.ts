@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** A camera that hands move: around a point, with it, towards it, or freely. Values in, values out. */
 
+import type { Similarity } from "@structgstream/core";
 import {
   across,
   along,
@@ -34,6 +35,16 @@ export function viewOf(camera: Camera, focus: Vector): View {
   const depth = dot(along(focus, eye, -1), forward);
   const distance = depth > LEAST_DISTANCE ? depth : Math.max(length(along(focus, eye, -1)), LEAST_DISTANCE);
   return { camera, pivot: along(eye, forward, distance) };
+}
+
+/** The same view of the capture in the units of another scene: `scene = (capture - center) * scale`. */
+export function carried(view: View, from: Similarity, to: Similarity): View {
+  const ratio = to.scale / from.scale;
+  const moved = (point: Vector) =>
+    point.map((value, i) => (value / from.scale + from.center[i]! - to.center[i]!) * to.scale) as unknown as Vector;
+  const { camera, pivot } = view;
+  const viewmat = viewmatOf(moved(center(camera)), axes(camera));
+  return { camera: { ...camera, viewmat, near: camera.near * ratio }, pivot: moved(pivot) };
 }
 
 /** Goes round the pivot: to the right for positive `yaw`, up for positive `pitch`, both in radians. */

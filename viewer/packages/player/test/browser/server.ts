@@ -19,6 +19,7 @@ export interface Served {
 
 export interface Request {
   readonly path: string;
+  readonly query: string;
   /** From the first to before the last byte; undefined when all was asked for. */
   readonly range: readonly [start: number, end: number] | undefined;
 }
@@ -46,6 +47,14 @@ export class TestServer {
     return file;
   }
 
+  /** Gives the files of a folder as they are now, and no others below that path. */
+  publish(path: string, files: ReadonlyMap<string, Uint8Array>, more: Omit<Served, "bytes"> = {}): void {
+    for (const known of this.files.keys()) {
+      if (known.startsWith(path) && !files.has(known.slice(path.length))) this.files.delete(known);
+    }
+    for (const [name, bytes] of files) this.put(path + name, bytes, more);
+  }
+
   rangesOf(path: string): (readonly [number, number] | undefined)[] {
     return this.requests.filter((request) => request.path === path).map(({ range }) => range);
   }
@@ -56,13 +65,13 @@ export class TestServer {
   }
 
   private async answer(request: IncomingMessage, response: ServerResponse): Promise<void> {
-    const path = new URL(request.url ?? "/", "http://localhost").pathname;
+    const { pathname: path, search: query } = new URL(request.url ?? "/", "http://localhost");
     const file = this.files.get(path);
     const asked = /^bytes=(\d+)-(\d*)$/.exec(request.headers.range ?? "");
     const size = file?.bytes.length ?? 0;
     const start = asked ? Number(asked[1]) : 0;
     const end = asked?.[2] ? Math.min(Number(asked[2]) + 1, size) : size;
-    this.requests.push({ path, range: asked ? [start, end] : undefined });
+    this.requests.push({ path, query, range: asked ? [start, end] : undefined });
     if (!file || file.status) {
       const headers = file?.location ? { Location: file.location } : {};
       response.writeHead(file?.status ?? 404, headers).end();

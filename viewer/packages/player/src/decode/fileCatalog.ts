@@ -1,0 +1,87 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The packets of one file, by its index or as they are found by reading it. */
+
+import type { IndexEntry, PacketInfo } from "@structgstream/core";
+import { Catalog, type Place } from "./catalog.js";
+import type { CatalogFacts } from "./messages.js";
+
+interface Entry {
+  readonly isKey: boolean;
+  readonly offset: number;
+  /** Where something else begins: records of unknown types may lie before it. */
+  readonly end: number;
+  ptsSeconds: number | undefined;
+}
+
+export class FileCatalog extends Catalog {
+  // By frame; undefined where a packet was lost before anything was known of it.
+  private readonly entries: (Entry | undefined)[] = [];
+
+  /**
+   * @param fps frames a second, for times that are not known yet
+   * @param independent whether every packet stands alone, whatever its kind: codec `raw`
+   */
+  constructor(
+    private readonly fps: number,
+    private readonly independent: boolean,
+  ) {
+    super();
+  }
+
+  get count(): number {
+    return this.entries.length;
+  }
+
+  /** Takes everything from an index; `end` is where the index record begins. */
+  fill(index: readonly IndexEntry[], end: number): void {
+    for (const [i, { isKey, offset }] of index.entries()) {
+      this.entries.push({ isKey, offset, end: index[i + 1]?.offset ?? end, ptsSeconds: undefined });
+    }
+    this.complete = true;
+  }
+
+  /** Takes a packet that was found by reading; frames that it leaves out are lost. */
+  append({ index, isKey, offset, bytes, ptsSeconds }: PacketInfo): void {
+    while (this.entries.length < index) this.markDamaged(this.entries.push(undefined) - 1);
+    this.entries.push({ isKey, offset, end: offset + bytes, ptsSeconds });
+  }
+
+  place(index: number): Place | undefined {
+    const entry = this.entries[index];
+    return entry && { start: entry.offset, end: entry.end };
+  }
+
+  isKey(index: number): boolean {
+    return this.entries[index]?.isKey === true;
+  }
+
+  learn(index: number, ptsSeconds: number): void {
+    const entry = this.entries[index];
+    if (entry) entry.ptsSeconds = ptsSeconds;
+  }
+
+  groupStart(index: number): number {
+    let first = index;
+    while (!this.independent && first > 0 && !this.isKey(first)) first--;
+    return first;
+  }
+
+  groupEnd(index: number): number {
+    let end = index + 1;
+    while (!this.independent && end < this.count && !this.isKey(end)) end++;
+    return end;
+  }
+
+  facts(): CatalogFacts {
+    const { count, complete } = this;
+    const ptsSeconds = new Float64Array(count);
+    const keys: number[] = [];
+    for (const [i, entry] of this.entries.entries()) {
+      const after = i ? ptsSeconds[i - 1]! + 1 / this.fps : 0;
+      // Guesses may be beyond a time that is known: time must rise all the same.
+      ptsSeconds[i] = Math.max(entry?.ptsSeconds ?? after, i ? ptsSeconds[i - 1]! + 1e-9 : Number.NEGATIVE_INFINITY);
+      if (entry?.isKey) keys.push(i);
+    }
+    return { first: 0, count, ptsSeconds, keys: Uint32Array.from(keys), lost: this.lost(), complete };
+  }
+}

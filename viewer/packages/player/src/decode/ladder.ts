@@ -1,0 +1,61 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Which of several qualities a connection can bear. */
+
+import type { Quality } from "../source/manifest.js";
+
+/** A connection must bear so many times a quality's bit rate to go up to it, and no fewer to stay. */
+const UP = 1.6;
+const STAY = 1.15;
+/** Seconds between changes: up only when it has held for a while, after going down for longer. */
+const UP_SECONDS = 4;
+const AGAIN_SECONDS = 20;
+const DOWN_SECONDS = 2;
+
+export class Ladder {
+  /** By rising bit rate. */
+  readonly steps: readonly Quality[];
+  /** What the user wants; undefined leaves it to the connection. */
+  choice: number | undefined;
+  at = 0;
+  private changed: number;
+  private fell = false;
+  private readonly refused = new Set<number>();
+
+  /** @param now seconds of any clock */
+  constructor(
+    qualities: readonly Quality[],
+    private readonly now: () => number,
+  ) {
+    this.steps = [...qualities].sort((a, b) => a.bits_per_second - b.bits_per_second);
+    this.changed = now();
+  }
+
+  /** The step to be on; `bitsPerSecond` is undefined while nothing is known. */
+  wanted(bitsPerSecond: number | undefined): number {
+    const { at, steps, choice } = this;
+    if (choice !== undefined) return this.refused.has(choice) ? at : choice;
+    if (bitsPerSecond === undefined) return at;
+    const since = this.now() - this.changed;
+    const bears = (step: number, factor: number) => bitsPerSecond >= factor * steps[step]!.bits_per_second;
+    if (at > 0 && !bears(at, STAY)) {
+      let lower = at - 1;
+      while (lower > 0 && !bears(lower, STAY)) lower--;
+      return since >= DOWN_SECONDS ? lower : at;
+    }
+    const higher = at + 1;
+    const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
+    return higher < steps.length && enough && !this.refused.has(higher) && bears(higher, UP) ? higher : at;
+  }
+
+  /** Another step is used from now on. */
+  change(step: number): void {
+    this.fell = step < this.at;
+    this.at = step;
+    this.changed = this.now();
+  }
+
+  /** A step cannot be had. */
+  refuse(step: number): void {
+    this.refused.add(step);
+  }
+}

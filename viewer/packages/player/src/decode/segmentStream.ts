@@ -1,0 +1,206 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A stream in a segments folder: follows its manifest, and fetches pages and init records when they are needed. */
+
+import { StreamReader } from "@structgstream/core";
+import type { Manifest, PageEntry, Quality } from "../source/manifest.js";
+import type { ByteClient } from "./byteClient.js";
+import type { Place } from "./catalog.js";
+import { PacketLoader } from "./packetLoader.js";
+import { PacketStore } from "./packetStore.js";
+import { SegmentCatalog } from "./segmentCatalog.js";
+import { Chapter, type Stream } from "./stream.js";
+
+/** After a file could not be fetched. */
+const AGAIN_MILLISECONDS = 1000;
+/** A file that the host does not have, or another in its place, is asked for so often. */
+const ATTEMPTS = 3;
+const MOST_CHAPTERS = 3;
+
+export interface SegmentEvents {
+  /** There is another manifest, or another page of it. */
+  changed(): void;
+  /** Packets have come, or can be asked for again. */
+  stored(): void;
+  qualities(qualities: readonly Quality[]): void;
+  /** Frames up to before `end`, or all that need the first one, cannot be had. */
+  lost(first: number, end: number | undefined, reason: string): void;
+  notice(message: string): void;
+  waiting(seconds: number, problem: string | undefined): void;
+  failed(message: string): void;
+}
+
+export class SegmentStream implements Stream {
+  readonly catalog = new SegmentCatalog();
+  readonly store: PacketStore;
+  readonly loader: PacketLoader;
+  /** By the number of the period; the one used last is the last. */
+  private readonly chapters = new Map<number, Chapter>();
+  /** Files that are being fetched, besides those with packets. */
+  private readonly coming = new Set<string>();
+  private readonly failures = new Map<string, number>();
+  private following: number | undefined;
+  private troubled = false;
+
+  /**
+   * @param url of its manifest
+   * @param name what messages call that
+   */
+  constructor(
+    private readonly client: ByteClient,
+    readonly url: string,
+    private readonly name: string,
+    budgetBytes: number,
+    private readonly events: SegmentEvents,
+  ) {
+    this.store = new PacketStore(budgetBytes);
+    const loading = {
+      changed: () => events.stored(),
+      damaged: (index: number, { entry, start }: Place) =>
+        events.lost(index, undefined, `its record at byte ${start} of ${entry?.file} is damaged`),
+      // While the manifest is followed, that says how the connection is.
+      waiting: (seconds: number, problem: string | undefined) => {
+        if (!this.catalog.live) events.waiting(seconds, problem);
+      },
+      failed: (problem: string, temporary: boolean, first: number, end: number, file: string) =>
+        this.packetsFailed(problem, temporary, first, end, file),
+    };
+    this.loader = new PacketLoader(client, this.catalog, this.store, loading, url);
+  }
+
+  /** Begins to follow the manifest. */
+  follow(): void {
+    this.following ??= this.client.manifests(this.url, this.name, {
+      manifest: (manifest) => this.take(manifest),
+      qualities: (qualities) => this.events.qualities(qualities),
+      end: () => {},
+      failed: (message) => this.events.failed(message),
+      waiting: (seconds, problem) => {
+        // Once is enough to know.
+        if (!this.troubled) this.events.waiting(seconds, problem);
+        this.troubled = true;
+      },
+      recovered: () => {
+        this.troubled = false;
+        this.events.notice("The stream can be reached again.");
+      },
+    });
+  }
+
+  /** Asks for nothing more, until it is followed again. */
+  leave(): void {
+    if (this.following !== undefined) this.client.cancel(this.following);
+    this.following = undefined;
+    this.loader.cancel();
+  }
+
+  chapter(index: number, ahead: number): Chapter | undefined {
+    const last = Math.min(ahead, this.catalog.count) - 1;
+    const isThere = this.known(index);
+    // What comes next is fetched before it is needed.
+    if (this.known(last)) this.opened(last);
+    const { newestPeriod } = this.catalog;
+    if (isThere && newestPeriod !== undefined && ahead >= this.catalog.count) this.openedPeriod(newestPeriod);
+    return isThere ? this.opened(index) : undefined;
+  }
+
+  private take(manifest: Manifest): void {
+    this.catalog.take(manifest);
+    this.loader.blocked = false;
+    this.events.changed();
+  }
+
+  /** Whether it is known where a frame is; what is missing for that is asked for. */
+  private known(index: number): boolean {
+    const page = this.catalog.missingPage(index);
+    if (page) this.fetchPage(page);
+    return page === undefined;
+  }
+
+  private opened(index: number): Chapter | undefined {
+    const entry = this.catalog.period(index);
+    return entry && this.openedPeriod(entry.period);
+  }
+
+  private openedPeriod(period: number): Chapter | undefined {
+    const found = this.chapters.get(period);
+    if (found) {
+      this.chapters.delete(period);
+      this.chapters.set(period, found);
+    } else this.fetchInit(period);
+    return found;
+  }
+
+  private fetchPage(entry: PageEntry): void {
+    this.fetch(entry.file, (events) => {
+      this.client.page(this.url, entry, {
+        ...events,
+        page: (content) => {
+          this.catalog.takePage(entry, content);
+          this.events.changed();
+        },
+      });
+    });
+  }
+
+  private fetchInit(period: number): void {
+    const entry = this.catalog.periodNumbered(period);
+    if (!entry) return;
+    this.fetch(entry.file, (events) => {
+      const reader = new StreamReader(entry.file);
+      const bytes = (part: Uint8Array) => {
+        try {
+          reader.push(part);
+          if (!reader.header) reader.finish();
+          this.chapters.set(period, new Chapter(reader.header!));
+          if (this.chapters.size > MOST_CHAPTERS) this.chapters.delete(this.chapters.keys().next().value as number);
+        } catch (error) {
+          this.events.failed(error instanceof Error ? error.message : String(error));
+        }
+      };
+      this.client.read(0, entry.bytes, false, { ...events, bytes }, { url: this.url, entry, small: true });
+    });
+  }
+
+  /** Asks for a file once, and again some time after it could not be had. */
+  private fetch(
+    file: string,
+    ask: (events: { end(): void; failed(message: string, temporary: boolean): void }) => void,
+  ): void {
+    if (this.coming.has(file)) return;
+    this.coming.add(file);
+    const over = () => {
+      this.coming.delete(file);
+      this.events.stored();
+    };
+    ask({
+      end: over,
+      failed: (message, temporary) => {
+        if (this.attempt(file, temporary) > ATTEMPTS) this.events.failed(message);
+        else setTimeout(over, AGAIN_MILLISECONDS);
+      },
+    });
+  }
+
+  private packetsFailed(problem: string, temporary: boolean, first: number, end: number, file: string): void {
+    // Parts that have become a segment are there no longer: the next manifest says where their frames are.
+    const same = this.catalog.place(first)?.entry?.file === file;
+    if (first < end && same && this.attempt(file, temporary) >= ATTEMPTS) {
+      this.events.lost(first, end, problem.replace(/\.$/, ""));
+      return;
+    }
+    if (first === end) this.events.notice(problem);
+    this.loader.blocked = true;
+    setTimeout(() => {
+      this.loader.blocked = false;
+      this.events.stored();
+    }, AGAIN_MILLISECONDS);
+  }
+
+  /** How often a file could not be had for a reason that stays. */
+  private attempt(file: string, temporary: boolean): number {
+    const count = (this.failures.get(file) ?? 0) + Number(!temporary);
+    this.failures.set(file, count);
+    if (this.failures.size > 64) this.failures.delete(this.failures.keys().next().value as string);
+    return count;
+  }
+}

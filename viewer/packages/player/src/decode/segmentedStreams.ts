@@ -1,0 +1,151 @@
+// SPDX-License-Identifier: Apache-2.0
+/** A stream in a segments folder, or the same one in several qualities, one of which is decoded at a time. */
+
+import type { Quality } from "../source/manifest.js";
+import { besides } from "../source/storedFile.js";
+import type { ByteClient } from "./byteClient.js";
+import { Ladder } from "./ladder.js";
+import type { Demand } from "./messages.js";
+import { type SegmentEvents, SegmentStream } from "./segmentStream.js";
+
+export interface SegmentedEvents {
+  /** The first manifest is there. */
+  begun(stream: SegmentStream): void;
+  changed(): void;
+  stored(): void;
+  lost(first: number, end: number | undefined, reason: string): void;
+  notice(message: string): void;
+  waiting(seconds: number, problem: string | undefined): void;
+  /** Unless it is fatal, the next demand is another attempt. */
+  failed(message: string, fatal: boolean): void;
+  /** Names of the qualities, and which of them frames are of. */
+  qualities(names: readonly string[], at: number): void;
+}
+
+export class SegmentedStreams {
+  private active: SegmentStream;
+  private ladder: Ladder | undefined;
+  /** The quality that is changed to, as soon as it can be. */
+  private pending: { readonly stream: SegmentStream; readonly step: number } | undefined;
+
+  constructor(
+    private readonly client: ByteClient,
+    private readonly url: string,
+    name: string,
+    private readonly budgetBytes: number,
+    private readonly events: SegmentedEvents,
+  ) {
+    this.active = this.followed(url, name);
+  }
+
+  /** Leaves the choice of a quality to the connection, or makes it. */
+  choose(quality: number | undefined): void {
+    if (this.ladder) this.ladder.choice = quality;
+  }
+
+  /**
+   * To be called before a frame is decoded.
+   *
+   * @returns the stream of another quality, if frames from `next` on are of that
+   */
+  changed(next: number, demand: Demand, seeking: boolean): SegmentStream | undefined {
+    const { ladder, active } = this;
+    if (!ladder) return undefined;
+    const step = ladder.wanted(active.loader.throughput.bitsPerSecond);
+    if (this.pending && this.pending.step !== step) this.drop();
+    if (step === ladder.at) return undefined;
+    this.pending ??= {
+      step,
+      stream: this.qualityOf(ladder.steps[step]!),
+    };
+    const { stream } = this.pending;
+    const { catalog, store } = stream;
+    if (next >= catalog.count || !stream.chapter(next, demand.ahead)) return undefined;
+    // Without the frame that is needed now there is nothing to go on with.
+    const starved = step < ladder.at && !active.store.has(next);
+    if (seeking || starved) return this.change();
+    const key = catalog.groupStart(next) === next ? next : catalog.groupEnd(next);
+    if (key >= catalog.count) return undefined;
+    stream.loader.want(key, key + 1, Math.max(demand.ahead, key + 1));
+    return key === next && store.has(key) ? this.change() : undefined;
+  }
+
+  private change(): SegmentStream {
+    const { stream, step } = this.pending!;
+    this.active.leave();
+    this.active = stream;
+    this.pending = undefined;
+    this.ladder!.change(step);
+    this.tellQualities();
+    this.events.changed();
+    this.events.stored();
+    return stream;
+  }
+
+  private drop(): void {
+    this.pending?.stream.leave();
+    this.pending = undefined;
+  }
+
+  private followed(url: string, name: string): SegmentStream {
+    let begun = false;
+    const { events } = this;
+    const isActive = () => stream === this.active;
+    const told: SegmentEvents = {
+      changed: () => {
+        if (!isActive()) events.stored();
+        else {
+          if (!begun) events.begun(stream);
+          begun = true;
+          events.changed();
+        }
+      },
+      stored: () => events.stored(),
+      qualities: (qualities) => {
+        if (isActive() && !this.ladder) this.begin(qualities);
+        else told.failed(`${name} leads to a list of qualities where a manifest belongs.`);
+      },
+      lost: (first, end, reason) => {
+        if (isActive()) events.lost(first, end, reason);
+      },
+      notice: (message) => {
+        if (isActive()) events.notice(message);
+      },
+      waiting: (seconds, problem) => {
+        if (isActive()) events.waiting(seconds, problem);
+      },
+      failed: (message) => {
+        if (isActive()) events.failed(message, !begun);
+        else if (stream === this.pending?.stream) this.refuse(message);
+      },
+    };
+    const stream: SegmentStream = new SegmentStream(this.client, url, name, this.budgetBytes, told);
+    stream.follow();
+    return stream;
+  }
+
+  private begin(qualities: readonly Quality[]): void {
+    this.ladder = new Ladder(qualities, () => performance.now() / 1000);
+    this.active.leave();
+    this.active = this.qualityOf(this.ladder.steps[0]!);
+    this.tellQualities();
+  }
+
+  private refuse(message: string): void {
+    this.ladder!.refuse(this.pending!.step);
+    this.drop();
+    this.events.notice(message);
+  }
+
+  private qualityOf({ manifest }: Quality): SegmentStream {
+    return this.followed(besides(this.url, manifest), manifest);
+  }
+
+  private tellQualities(): void {
+    const { steps, at } = this.ladder!;
+    this.events.qualities(
+      steps.map(({ name }) => name),
+      at,
+    );
+  }
+}

@@ -1,0 +1,10 @@
+// SPDX-License-Identifier: Apache-2.0
+
+import type { FromDecoder, ToDecoder } from "../decode/messages.js";
+
+/** The decoder's end of the line. */
+export interface Pipeline {
+  send(message: ToDecoder): void;
+  onmessage: ((message: FromDecoder) => void) | undefined;
+  close(): void;
+}

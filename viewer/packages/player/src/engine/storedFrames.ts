@@ -1,0 +1,24 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Which frames' packets have been fetched. */
+
+import type { FrameRange } from "../decode/messages.js";
+import type { TimeRange } from "./events.js";
+import type { Timeline } from "./timeline.js";
+
+export class StoredFrames {
+  ranges: readonly FrameRange[] = [];
+  /** Bytes fetched so far, everything counted. */
+  fetchedBytes = 0;
+
+  constructor(private readonly timeline: Timeline) {}
+
+  has(index: number): boolean {
+    return this.ranges.some(([first, end]) => index >= first && index < end);
+  }
+
+  /** Their times. */
+  get times(): readonly TimeRange[] {
+    const { timeline } = this;
+    return this.ranges.map(([first, end]) => [timeline.ptsOf(first), timeline.endOf(end - 1)]);
+  }
+}

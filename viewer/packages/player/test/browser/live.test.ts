@@ -1,0 +1,259 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The built player at the edge of a live stream that a plain web server has. Skipped where there is no browser. */
+
+import { readFileSync } from "node:fs";
+import type { Page } from "playwright-core";
+import { afterAll, afterEach, beforeAll, describe, expect, test, vi } from "vitest";
+import { chromiumPath } from "../../../gl/test/support/chromium.ts";
+import { LiveRun, type RunOptions } from "../liveRun.ts";
+import { CLIP } from "../served.ts";
+import { TestServer } from "./server.ts";
+import { ask, type Opened, Stage, shows } from "./stage.ts";
+
+vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
+
+const executable = chromiumPath();
+const fixture = (name: string) =>
+  new Uint8Array(readFileSync(new URL(`../../../core/test/fixtures/${name}.sgs`, import.meta.url)));
+/** Few anchors: software GL shows many pictures of them in a second. */
+const FEW = fixture("paper");
+
+describe.skipIf(!executable)("a live stream in a browser", () => {
+  let stage: Stage;
+  let opened: Opened | undefined;
+  let writing: ReturnType<typeof setInterval> | undefined;
+
+  beforeAll(async () => {
+    stage = await Stage.opened(executable!);
+  });
+
+  afterAll(() => stage?.close());
+
+  afterEach(async () => {
+    clearInterval(writing);
+    await opened?.page.context().close();
+    opened = undefined;
+    stage.server.publish("/live/", new Map());
+  });
+
+  async function open(...given: Parameters<Stage["open"]>): Promise<Page> {
+    opened = await stage.open(...given);
+    return opened.page;
+  }
+
+  function run(stream: Uint8Array, frames: number, options: RunOptions = {}): LiveRun {
+    const made = new LiveRun(stream, options).write(frames);
+    stage.server.publish("/live/", made.files);
+    return made;
+  }
+
+  function write(live: LiveRun, frames: number): void {
+    live.write(frames);
+    stage.server.publish("/live/", live.files);
+  }
+
+  /** Goes on writing, so many frames a second. */
+  function keepWriting(live: LiveRun, rate: number): void {
+    writing = setInterval(() => write(live, 1), 1000 / rate);
+  }
+
+  function expectQuiet(...expected: RegExp[]): void {
+    const left = opened!.complaints.filter((text) => !expected.some((one) => one.test(text)));
+    expect(left).toEqual([]);
+  }
+
+  const errors = (page: Page) =>
+    ask(page, (_, events) => events.filter(([name]) => name === "error").map(([, m]) => m));
+  const notices = (page: Page) =>
+    ask(page, (_, events) => events.filter(([name]) => name === "notice").map(([, m]) => m));
+
+  test("a late viewer begins at the edge, holds the last frame, and knows when the next one comes", async () => {
+    const live = run(CLIP, 20, { frameSeconds: 4, pageSegments: 2 });
+    const page = await open('src="live/manifest.json" autoplay');
+    await shows(page, 19);
+    expect(await ask(page, (_, __, frames) => frames[0])).toBeGreaterThanOrEqual(18);
+    expect(await ask(page, (player) => [player.live, player.paused, player.behindSeconds])).toEqual([true, false, 0]);
+    write(live, 1);
+    await shows(page, 20);
+    await page.getByText(/Frame 20, next in about [1-4] s/).waitFor();
+    await page.getByRole("button", { name: "Live. At the newest frame" }).waitFor();
+    const asked = stage.server.requests.map(({ path }) => path);
+    expect(asked.filter((path) => path.includes("history"))).toEqual([]);
+    expect(asked.filter((path) => path.includes("segment")).length).toBeLessThanOrEqual(1);
+    expect(await errors(page)).toEqual([]);
+    expectQuiet();
+  });
+
+  test("scrubs over the window and goes back to LIVE", async () => {
+    const live = run(FEW, 120, { pageSegments: 3, fps: 10 });
+    const page = await open('src="live/manifest.json" autoplay');
+    keepWriting(live, 10);
+    await page.waitForFunction(() => heard.frames.length > 5);
+    const slider = page.getByRole("slider", { name: "Time" });
+    const box = (await slider.boundingBox())!;
+    await page.mouse.click(box.x + box.width * 0.25, box.y + box.height / 2);
+    await page.waitForFunction(() => heard.frames.at(-1)! < 40);
+    await page.getByRole("button", { name: /Live\. Go to the newest frames: \d+ s behind/ }).click();
+    await page.waitForFunction(() => heard.frames.at(-1)! > 110);
+    live.finish();
+    stage.server.publish("/live/", live.files);
+    clearInterval(writing);
+    await page.getByText("The stream has ended; it is a recording now.").waitFor();
+    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"));
+    expect(await errors(page)).toEqual([]);
+    expectQuiet();
+  });
+
+  test("a host that fails for a while is told of, and gone on with", async () => {
+    const live = run(FEW, 10, { frameSeconds: 1 });
+    const page = await open('src="live/manifest.json" autoplay');
+    await shows(page, 9);
+    for (const [name, bytes] of live.files) stage.server.put(`/live/${name}`, bytes, { status: 503 });
+    await page.getByText("The server answered 503 where manifest.json was asked for. The next attempt is in").waitFor();
+    await page.waitForTimeout(1500);
+    expect((await notices(page)).length).toBe(1);
+    write(live, 2);
+    await shows(page, 11);
+    expect((await notices(page)).at(-1)).toBe("The stream can be reached again.");
+    expect(await errors(page)).toEqual([]);
+    expectQuiet(/503/);
+  });
+
+  test("a slow viewer skips to newer key frames", async () => {
+    const live = run(CLIP, 12, { fps: 10, frameSeconds: 0.1 });
+    const page = await open('src="live/manifest.json" autoplay');
+    await page.waitForFunction(() => heard.frames.length > 0);
+    // What is written in a second takes several to come.
+    writing = setInterval(() => {
+      live.write(1);
+      stage.server.publish("/live/", live.files, { bytesPerSecond: 500 });
+      stage.server.put("/live/manifest.json", live.files.get("manifest.json")!);
+    }, 100);
+    await page.getByText("This was too slow to keep up: went on with the newest frames.").waitFor({ timeout: 50_000 });
+    const frames = await ask(page, (_, __, shown) => shown);
+    expect(frames).toEqual([...frames].sort((a, b) => a - b));
+    expect(await errors(page)).toEqual([]);
+    expectQuiet();
+  });
+
+  test("no frame between two periods is blank", async () => {
+    const live = run(FEW, 12, { fps: 5 });
+    live.begin(FEW);
+    live.write(12).finish();
+    stage.server.publish("/live/", live.files);
+    const page = await open('src="live/manifest.json" controls="off"');
+    await shows(page, 0);
+    await ask(page, (player) => {
+      const least = { light: 1000, pictures: 0 };
+      Object.assign(globalThis, { least });
+      const small = document.createElement("canvas").getContext("2d", { willReadFrequently: true })!;
+      // Right after it was drawn: a browser clears what it has shown.
+      player.on("drawn", ({ stats }) => {
+        if (stats.frameIndex! < 10 || stats.frameIndex! > 14) return;
+        small.drawImage(player.shadowRoot!.querySelector("canvas")!, 0, 0, 16, 16);
+        const { data } = small.getImageData(0, 0, 16, 16);
+        const light = data.reduce((sum, value, i) => sum + (i % 4 === 3 ? 0 : value), 0) / 768;
+        least.light = Math.min(least.light, light);
+        least.pictures++;
+      });
+      player.play();
+    });
+    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
+    const { light, pictures } = (await page.evaluate("least")) as { light: number; pictures: number };
+    expect(pictures).toBeGreaterThan(3);
+    expect(light).toBeGreaterThan(5);
+    expect(stage.server.requests.filter(({ path }) => path.includes("init-")).length).toBe(2);
+    expect(await errors(page)).toEqual([]);
+    expectQuiet();
+  });
+
+  test("a period may have other cameras and another scene", async () => {
+    const live = run(FEW, 3, { fps: 5 });
+    live.begin(CLIP);
+    live.write(3).finish();
+    stage.server.publish("/live/", live.files);
+    const page = await open('src="live/manifest.json"');
+    await shows(page, 0);
+    const before = await ask(page, (player) => player.cameras);
+    await ask(page, (player) => player.seek(1));
+    await shows(page, 5);
+    const after = await ask(page, (player) => player.cameras);
+    expect(after.length).toBe(10);
+    expect(after).not.toEqual(before);
+    await ask(page, (player) => player.seek(0.2));
+    await shows(page, 1);
+    expect(await ask(page, (player) => player.cameras)).toEqual(before);
+    expect(await errors(page)).toEqual([]);
+    expectQuiet();
+  });
+
+  test("the page's token opens its streams, and is told to no other host", async () => {
+    run(FEW, 5, { frameSeconds: 1 });
+    const elsewhere = await TestServer.started();
+    try {
+      elsewhere.publish("/live/", new LiveRun(FEW).write(5).files, { cors: true });
+      const page = await open('src="live/manifest.json" autoplay', "?token=v1.a-b_c");
+      await shows(page, 4);
+      const ours = stage.server.requests.filter(({ path }) => path.startsWith("/live/"));
+      expect(ours.every(({ query }) => new URLSearchParams(query).get("token") === "v1.a-b_c")).toBe(true);
+      await ask(
+        page,
+        new Function("player", `player.load(${JSON.stringify(`${elsewhere.origin}/live/manifest.json`)})`) as never,
+      );
+      await expect.poll(() => elsewhere.requests.length, { timeout: 15_000 }).toBeGreaterThan(3);
+      expect(elsewhere.requests.every(({ query }) => !query.includes("token"))).toBe(true);
+      expect(await errors(page)).toEqual([]);
+      expectQuiet();
+    } finally {
+      await elsewhere.stop();
+    }
+  });
+
+  test.each([
+    [
+      "a file elsewhere",
+      (text: string) => text.replaceAll(/"part-[^"]*"/g, '"https://elsewhere.test/x"'),
+      "plain name",
+    ],
+    ["a file above", (text: string) => text.replaceAll(/"init-[^"]*"/g, '"../page.html"'), "plain name"],
+    ["a wrong number", (text: string) => text.replace(/"frames":\d+/, '"frames":1e9'), "a whole number from 1"],
+    ["more bytes than may be", (text: string) => `${text}${" ".repeat(5e6)}`, "more than 4194304 bytes"],
+    ["no JSON", () => "<html></html>", "is no JSON"],
+    ["another format", (text: string) => text.replace("structgstream-segments", "other"), "expected"],
+  ])("a hostile manifest with %s is refused in a sentence", async (_, change, sentence) => {
+    const live = run(FEW, 8);
+    const text = new TextDecoder().decode(live.files.get("manifest.json")!);
+    stage.server.put("/live/manifest.json", change(text));
+    const page = await open('src="live/manifest.json" autoplay');
+    await page.getByRole("alert").getByText(sentence).waitFor();
+    const asked = stage.server.requests.map(({ path }) => path).filter((path) => path.startsWith("/live/"));
+    expect(asked).toEqual(["/live/manifest.json"]);
+    expectQuiet();
+  });
+
+  test("300 frames at the edge take no more memory than 100", async () => {
+    const live = run(FEW, 20, { fps: 20, windowSegments: 6, pageSegments: 4 });
+    const page = await open('src="live/manifest.json" autoplay controls="off"', "", {
+      viewport: { width: 160, height: 120 },
+    });
+    keepWriting(live, 20);
+    const client = await page.context().newCDPSession(page);
+    const state = async () => {
+      await client.send("HeapProfiler.collectGarbage");
+      const { usedSize } = await client.send("Runtime.getHeapUsage");
+      const counts = await ask(page, (player) => player.resources);
+      return { usedSize, workers: page.workers().length, ...counts };
+    };
+    const reach = (frame: number) =>
+      page.waitForFunction((wanted) => heard.frames.at(-1)! >= wanted, frame, { timeout: 40_000, polling: 200 });
+    await reach(100);
+    const before = await state();
+    await reach(300);
+    const after = await state();
+    expect({ ...after, usedSize: 0 }).toEqual({ ...before, usedSize: 0 });
+    expect(after.usedSize).toBeLessThan(before.usedSize * 1.1 + 2e5);
+    expect(await errors(page)).toEqual([]);
+    // The window goes on while requests are under way.
+    expectQuiet(/404/);
+  });
+});

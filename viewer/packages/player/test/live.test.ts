@@ -1,0 +1,509 @@
+// SPDX-License-Identifier: Apache-2.0
+/** Live streams from segments folders: engine, decoder and fetcher together, without a browser. */
+
+import { existsSync, readdirSync, readFileSync } from "node:fs";
+import { readStream } from "@structgstream/core";
+import { afterEach, describe, expect, test, vi } from "vitest";
+import { Ladder } from "../src/decode/ladder.ts";
+import { Throughput } from "../src/decode/throughput.ts";
+import { Host, LiveRun, type RunOptions } from "./liveRun.ts";
+import { CLIP, type Playing, playing } from "./served.ts";
+
+vi.setConfig({ testTimeout: 60_000 });
+
+const ADDRESS = "http://test/manifest.json";
+let open: Playing[] = [];
+
+afterEach(() => {
+  for (const { engine, close } of open) {
+    engine.destroy();
+    close();
+  }
+  open = [];
+});
+
+function run(frames: number, options: RunOptions = {}): LiveRun {
+  return new LiveRun(CLIP, options).write(frames);
+}
+
+function opened(host: Host, startSeconds?: number, url = ADDRESS, own = true, options = {}): Playing {
+  const found = playing(host.fetch as typeof fetch, options);
+  open.push(found);
+  found.engine.load({ kind: "segments", url, name: "manifest.json", own }, startSeconds);
+  return found;
+}
+
+/** Time goes on: the clock's, and with a run that of the run, which is slower because hosts and workers take real time. */
+function goingOn(play: Playing, live?: LiveRun): () => boolean {
+  let due = play.seconds;
+  return () => {
+    play.seconds += live ? 1 / 240 : 1 / 60;
+    for (; live && play.seconds >= due; due += 1 / 30) live.write(1);
+    return true;
+  };
+}
+
+test("begins with the last key frame that is far enough behind the edge", async () => {
+  const host = new Host({ "": run(40, { targetSeconds: 0.5 }) });
+  const play = opened(host);
+  await play.settled();
+  // The edge is frame 39, at 1.3 s; keys are every three frames.
+  expect(play.engine.frames.count).toBe(40);
+  expect(play.shown).toEqual([24]);
+  expect(play.engine.edge.following).toBe(true);
+  expect(play.engine.behindSeconds).toBeCloseTo(0.5, 1);
+  // Nothing was fetched but what is needed for that.
+  expect(host.asked("init-")).toBe(1);
+  expect(host.asked("segment-")).toBe(1);
+  expect(host.asked("part-")).toBe(0);
+  expect(play.errors).toEqual([]);
+});
+
+test("frames are exact, those of parts too", async () => {
+  const live = run(10, { frameSeconds: 4 });
+  const play = opened(new Host({ "": live }), 0);
+  await play.settled();
+  const expected = readStream(CLIP);
+  // What an update leaves out is what the first frame had, which was taken before.
+  const fields = new Map<string, { data: unknown }>(expected.frame(0).fields);
+  for (const index of [0, 9, 4, 9, 2]) {
+    play.engine.seekFrame(index);
+    for (let last = -1; last !== index; ) {
+      const update = play.engine.tick();
+      for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
+      last = update?.index ?? last;
+      await new Promise((resolve) => setTimeout(resolve, 1));
+    }
+    const { fields: right } = expected.frame(index);
+    for (const name of expected.header!.dynamic) expect(fields.get(name)?.data).toEqual(right.get(name)!.data);
+  }
+});
+
+test.each([true, false])("keeps to the edge of a stream at full speed, waiting host: %s", async (waits) => {
+  const live = run(30);
+  const host = new Host({ "": live });
+  host.waits = waits;
+  const play = opened(host);
+  await play.settled();
+  play.engine.play();
+  const on = goingOn(play, live);
+  await play.until(() => on() && play.shown.at(-1)! > 150, "frames");
+  expect(play.shown).toEqual([...play.shown].sort((a, b) => a - b));
+  expect(play.engine.edge.following).toBe(true);
+  expect(play.engine.behindSeconds).toBeLessThan(5);
+  expect(play.errors).toEqual([]);
+});
+
+test("a stream slower than its media: each frame when it comes, and when the next one will", async () => {
+  const live = run(8, { frameSeconds: 4 });
+  const play = opened(new Host({ "": live }));
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1) === 7, "edge");
+  // It begins with the last key frame.
+  expect(play.shown[0]).toBe(6);
+  await play.until(() => on() && play.engine.stalled, "stall");
+  for (const frame of [8, 9, 10]) {
+    live.write(1);
+    await play.until(() => on() && play.shown.at(-1) === frame, `frame ${frame}`);
+  }
+  expect(play.engine.growing).toBe(true);
+  expect(play.engine.nextFrameSeconds).toBeGreaterThan(2);
+  expect(play.engine.nextFrameSeconds).toBeLessThanOrEqual(4);
+  expect(play.errors).toEqual([]);
+});
+
+test("who is far behind jumps to a key frame, who is a little behind goes a little faster", async () => {
+  const live = run(60);
+  const play = opened(new Host({ "": live }));
+  await play.settled();
+  play.engine.play();
+  const on = goingOn(play, live);
+  await play.until(() => on() && play.shown.length > 10, "frames");
+  live.write(60); // two seconds at once
+  await play.until(() => play.engine.frames.count >= 120);
+  const from = play.engine.currentTime;
+  const at = play.seconds;
+  await play.until(() => on() && play.engine.currentTime > from + 2, "two seconds");
+  expect((play.engine.currentTime - from) / (play.seconds - at)).toBeGreaterThan(1.03);
+  expect((play.engine.currentTime - from) / (play.seconds - at)).toBeLessThan(1.12);
+  expect(play.notices).toEqual([]);
+  live.write(600);
+  await play.until(() => on() && play.notices.length > 0, "jump");
+  expect(play.notices[0]).toContain("went on with the newest frames");
+  await play.until(() => on() && !play.engine.seeking && play.shown.at(-1)! > 600, "edge");
+  expect(play.engine.behindSeconds).toBeLessThan(5);
+});
+
+test("who plays up to the edge follows it", async () => {
+  const live = run(12, { frameSeconds: 2 });
+  const play = opened(new Host({ "": live }), 0);
+  play.engine.play();
+  await play.settled();
+  expect(play.engine.edge.following).toBe(false);
+  const on = goingOn(play);
+  await play.until(() => on() && play.engine.stalled && play.shown.at(-1) === 11, "edge");
+  expect(play.engine.edge.following).toBe(true);
+});
+
+test("scrubbing back leaves the edge, and LIVE goes back to it", async () => {
+  const live = run(90, { pageSegments: 4 });
+  const host = new Host({ "": live });
+  const play = opened(host);
+  await play.settled();
+  play.engine.play();
+  expect(host.asked("history-")).toBe(0);
+  play.engine.seek(0.5);
+  await play.until(() => play.shown.at(-1) === 15, "frame 15");
+  expect(host.asked("history-")).toBeGreaterThan(0);
+  expect(play.engine.edge.following).toBe(false);
+  const on = goingOn(play, live);
+  await play.until(() => on() && play.shown.at(-1)! >= 40, "frames");
+  expect(play.engine.behindSeconds).toBeGreaterThan(1);
+  expect(play.engine.playbackRate).toBe(1);
+  play.engine.goLive();
+  await play.until(
+    () => on() && !play.engine.seeking && play.engine.behindSeconds < play.engine.edge.distance + 1,
+    "edge",
+  );
+  expect(play.engine.edge.following).toBe(true);
+  expect(play.errors).toEqual([]);
+});
+
+test("every frame of a long recording can be reached over pages of pages", async () => {
+  const live = run(240, { pageSegments: 3 }).finish();
+  const host = new Host({ "": live });
+  const play = opened(host);
+  await play.settled();
+  // A run that is over is a recording: from its first frame.
+  expect(play.shown).toEqual([0]);
+  expect(play.engine.growing).toBe(false);
+  for (const index of [239, 100, 17, 181, 3]) {
+    play.engine.seekFrame(index);
+    await play.until(() => play.shown.at(-1) === index, `frame ${index}`);
+  }
+  play.engine.seekFrame(225);
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.engine.ended, "end");
+  expect(play.shown.at(-1)).toBe(239);
+  expect(play.errors).toEqual([]);
+});
+
+test("what has left the window is gone on after", async () => {
+  const live = run(30, { windowSegments: 8 });
+  const play = opened(new Host({ "": live }));
+  await play.settled();
+  play.engine.seek(0);
+  expect(play.engine.frames.first).toBe(3);
+  await play.until(() => play.shown.at(-1) === 3, "oldest frame");
+  live.write(30);
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1)! >= 33, "a frame of the window");
+  expect(play.notices.join()).toContain("no longer has this part");
+  expect(play.errors).toEqual([]);
+});
+
+test("the end of the run makes it a recording", async () => {
+  const live = run(20);
+  const play = opened(new Host({ "": live }));
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1) === 19, "edge");
+  expect(play.engine.ended).toBe(false);
+  live.finish();
+  await play.until(() => on() && play.engine.ended, "end");
+  expect(play.notices).toEqual(["The stream has ended; it is a recording now."]);
+  expect(play.engine.edge.live).toBe(false);
+  play.engine.play();
+  await play.until(() => play.shown.at(-1) === 0, "first frame");
+});
+
+describe("a host in trouble", () => {
+  test.each(["offline", 503, 404] as const)("%s for a while: said once, gone on after", async (trouble) => {
+    const live = run(12, { frameSeconds: 1 });
+    const host = new Host({ "": live });
+    const play = opened(host);
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.shown.at(-1) === 11 && play.engine.stalled, "edge");
+    host.trouble = trouble;
+    live.write(9);
+    await play.until(() => on() && play.notices.length > 0, "notice");
+    for (let i = 0; i < 50; i++) await play.until(on);
+    expect(play.notices.length).toBe(1);
+    expect(play.notices[0]).toContain("The next attempt is in");
+    host.trouble = undefined;
+    await play.until(() => on() && play.shown.at(-1) === 20, "newest frame");
+    expect(play.notices.at(-1)).toBe("The stream can be reached again.");
+    expect(play.errors).toEqual([]);
+  });
+
+  test("a file that is another costs its group, and is told", async () => {
+    const live = run(30, {}).finish();
+    const host = new Host({ "": live });
+    const bad = [...live.files.keys()].find((name) => name.startsWith("segment-00000003"))!;
+    host.instead.set(`/${bad}`, new Uint8Array(live.files.get(bad)!.length));
+    const play = opened(host, 0.2);
+    await play.settled();
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.engine.ended, "end");
+    expect(play.shown.filter((index) => index >= 9 && index < 12)).toEqual([]);
+    expect(play.errors.length).toBeGreaterThan(0);
+    expect(play.errors.join()).toMatch(/Frames? 9.* lost/);
+  });
+
+  test("a file that is not there is asked for again, and then told", async () => {
+    const live = run(30, {}).finish();
+    const host = new Host({ "": live });
+    const gone = [...live.files.keys()].find((name) => name.startsWith("segment-00000003"))!;
+    live.files.delete(gone);
+    const play = opened(host, 0.2);
+    await play.settled();
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.engine.ended, "end");
+    expect(host.asked(gone)).toBe(3);
+    expect(play.errors).toEqual([
+      `Frames 9 to 11 are lost: ${gone} was not found on the server (404). Check the address.`,
+    ]);
+  });
+
+  test("a part that has become a segment meanwhile is taken from there", async () => {
+    const live = run(13, { frameSeconds: 1 });
+    const host = new Host({ "": live });
+    const part = live.newest("part-");
+    const play = opened(host, 0);
+    await play.settled();
+    live.files.delete(part);
+    play.engine.seekFrame(12);
+    await play.until(() => host.asked(part) > 0, "request");
+    live.write(4);
+    await play.until(() => play.shown.at(-1) === 12, "frame 12");
+    expect(play.errors).toEqual([]);
+  });
+
+  test("a replaced stream is told", async () => {
+    const live = run(10);
+    const host = new Host({ "": live });
+    const play = opened(host);
+    await play.settled();
+    const other = new LiveRun(CLIP.slice());
+    other.sequence = 100;
+    other.write(3);
+    const text = new TextDecoder().decode(other.files.get("manifest.json")!);
+    const sha256 = /"sha256":"([\da-f]{64})","period":0/.exec(text)![1]!;
+    host.instead.set("/manifest.json", new TextEncoder().encode(text.replace(sha256, "0".repeat(64))));
+    await play.until(() => play.errors.length > 0, "error");
+    expect(play.errors[0]).toContain("it was replaced. Load it again");
+  });
+});
+
+test("periods are crossed without a break, in both directions", async () => {
+  const live = run(12, { frameSeconds: 1 / 30 });
+  live.begin(CLIP);
+  live.write(12).finish();
+  const host = new Host({ "": live });
+  const play = opened(host, 0);
+  await play.settled();
+  const headers: number[] = [];
+  const take = () => {
+    const update = play.engine.tick();
+    if (update?.header) headers.push(update.index);
+    // A new header comes with every dynamic field.
+    if (update?.header) expect([...update.fields.keys()].sort()).toEqual([...update.header.dynamic].sort());
+    return update;
+  };
+  const stalls: boolean[] = [];
+  play.engine.on("stall", ({ stalled }) => stalls.push(stalled));
+  play.engine.play();
+  await play.until(() => (play.engine.buffered.at(-1)?.[1] ?? 0) > 0.7, "buffer");
+  while (!play.engine.ended) {
+    play.seconds += 1 / 60;
+    take();
+    await new Promise((resolve) => setTimeout(resolve, 2));
+  }
+  expect(play.shown.filter((index, i) => index !== play.shown[i - 1]).slice(-3)).toEqual([21, 22, 23]);
+  expect(headers).toEqual([12]);
+  expect(stalls).toEqual([]);
+  play.engine.seekFrame(5);
+  for (let last = -1; last !== 5; ) {
+    last = take()?.index ?? last;
+    await new Promise((resolve) => setTimeout(resolve, 1));
+  }
+  expect(headers).toEqual([12, 3]);
+  expect(host.asked("init-0000")).toBe(1);
+  expect(host.asked("init-0001")).toBe(1);
+});
+
+test("memory is bounded: packets that are far away are let go of", async () => {
+  const live = run(300, { pageSegments: 8 }).finish();
+  const play = opened(new Host({ "": live }), 0, ADDRESS, true, { budgetBytes: 20_000 });
+  await play.settled();
+  play.engine.play();
+  const on = goingOn(play);
+  let most = 0;
+  play.engine.on("progress", ({ buffered }) => {
+    most = Math.max(
+      most,
+      buffered.reduce((sum, [start, end]) => sum + (end - start) * 30, 0),
+    );
+  });
+  await play.until(() => on() && play.engine.ended, "end");
+  expect(play.errors).toEqual([]);
+  expect(most).toBeLessThan(100);
+});
+
+describe("qualities", () => {
+  const LIST = "http://test/qualities.json";
+  const listed = (entries: unknown[]) =>
+    new TextEncoder().encode(JSON.stringify({ format: "structgstream-qualities", version: 1, qualities: entries }));
+  const ENTRIES = [
+    { manifest: "high/manifest.json", bits_per_second: 4e6, name: "high" },
+    { manifest: "low/manifest.json", bits_per_second: 2e5, name: "low" },
+  ];
+
+  test("of one stream: begins low, goes up at a key frame, keeps frame numbers", async () => {
+    const [high, low] = [run(60).finish(), run(60).finish()];
+    const host = new Host({ high, low });
+    host.instead.set("/qualities.json", listed(ENTRIES));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    expect(play.engine.qualities).toMatchObject({ names: ["low", "high"], at: 0 });
+    expect(host.asked("/high/")).toBe(0);
+    const headers: number[] = [];
+    play.engine.play();
+    for (let quality: number | undefined = 1; !play.engine.ended; ) {
+      if (quality !== undefined && play.engine.frameIndex >= 7) {
+        play.engine.chooseQuality(quality);
+        quality = undefined;
+      }
+      play.seconds += 1 / 400;
+      const update = play.engine.tick();
+      if (update?.header) headers.push(update.index);
+      await new Promise((resolve) => setTimeout(resolve, 2));
+    }
+    expect(play.engine.qualities.at).toBe(1);
+    expect(headers.length).toBe(1);
+    expect(headers[0]! % 3).toBe(0);
+    expect(play.shown).toEqual([...Array(60).keys()].filter((index) => play.shown.includes(index)));
+    expect(play.shown.length).toBeGreaterThan(50);
+    expect(play.errors).toEqual([]);
+  });
+
+  test("follow what the connection bears, up and down", async () => {
+    const [high, low] = [run(3000).finish(), run(3000).finish()];
+    const host = new Host({ high, low });
+    host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second: 5e5 }, ENTRIES[1]]));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.play();
+    const began = performance.now();
+    const on = () => {
+      play.seconds = 100 + (performance.now() - began) / 1000;
+      return true;
+    };
+    await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
+    expect(performance.now() - began).toBeGreaterThan(3000);
+    host.bytesPerSecond = 4000;
+    await play.until(() => on() && play.engine.qualities.at === 0, "lower quality");
+    host.bytesPerSecond = undefined;
+    const at = play.shown.at(-1)!;
+    await play.until(() => on() && play.shown.at(-1)! > at + 10, "frames");
+    expect(play.shown).toEqual([...play.shown].sort((a, b) => a - b));
+    expect(play.errors).toEqual([]);
+  });
+
+  test("throughput is what comes while anything is waited for", () => {
+    const clock = { seconds: 0 };
+    const throughput = new Throughput(() => clock.seconds);
+    expect(throughput.bitsPerSecond).toBeUndefined();
+    throughput.begin();
+    clock.seconds = 1;
+    throughput.begin();
+    throughput.take(25_000);
+    throughput.end();
+    expect(throughput.bitsPerSecond).toBeUndefined(); // too little to know
+    clock.seconds = 2;
+    throughput.take(25_000);
+    throughput.end();
+    expect(throughput.bitsPerSecond).toBe(2e5);
+    clock.seconds = 100; // nothing was waited for
+    expect(throughput.bitsPerSecond).toBe(2e5);
+    throughput.begin();
+    clock.seconds = 120; // and now nothing comes
+    expect(throughput.bitsPerSecond).toBeLessThan(2e4);
+    throughput.end();
+  });
+
+  test("one that cannot be had is told and left alone", async () => {
+    const low = run(30).finish();
+    const host = new Host({ low });
+    host.instead.set("/qualities.json", listed(ENTRIES));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.chooseQuality(1);
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.engine.ended, "end");
+    expect(play.notices).toEqual(["high/manifest.json was not found on the server (404). Check the address."]);
+    expect(play.engine.qualities.at).toBe(0);
+    expect(play.shown.at(-1)).toBe(29);
+  });
+
+  test("are changed by what the connection bears, and not to and fro", () => {
+    const clock = { seconds: 0 };
+    const ladder = new Ladder(
+      [1e6, 4e6, 2e6].map((bits_per_second) => ({ manifest: "m.json", bits_per_second, name: `${bits_per_second}` })),
+      () => clock.seconds,
+    );
+    const at = (seconds: number, bits: number | undefined) => {
+      clock.seconds = seconds;
+      const step = ladder.wanted(bits);
+      if (step !== ladder.at) ladder.change(step);
+      return step;
+    };
+    expect(ladder.steps.map(({ name }) => name)).toEqual(["1000000", "2000000", "4000000"]);
+    expect(at(0, undefined)).toBe(0);
+    expect(at(1, 9e6)).toBe(0); // not before it has held
+    expect(at(5, 9e6)).toBe(1);
+    expect(at(6, 9e6)).toBe(1);
+    expect(at(10, 9e6)).toBe(2);
+    expect(at(11, 4.5e6)).toBe(2); // not at once
+    expect(at(13, 4.7e6)).toBe(2);
+    expect(at(14, 1.2e6)).toBe(0);
+    expect(at(20, 9e6)).toBe(0); // having fallen it waits for longer
+    expect(at(35, 3e6)).toBe(0); // not enough to go up
+    expect(at(35, 3.3e6)).toBe(1);
+    ladder.choice = 0;
+    expect(at(36, 9e6)).toBe(0);
+  });
+});
+
+test("the address's token goes along with every file, and news are asked for by number", async () => {
+  const live = run(10, { pageSegments: 1 });
+  const host = new Host({ "": live });
+  const play = opened(host, 0, `${ADDRESS}?token=secret`);
+  await play.settled();
+  live.write(1);
+  await play.until(() => play.engine.frames.count === 11);
+  expect(host.requests.every(({ query }) => new URLSearchParams(query).get("token") === "secret")).toBe(true);
+  expect(host.requests.some(({ query }) => new URLSearchParams(query).get("after") === "10")).toBe(true);
+});
+
+const GOLDEN = new URL("../../../../tests/vectors/segments-1/", import.meta.url);
+
+test.skipIf(!existsSync(GOLDEN))("the golden folder of the writer is played to its edge", async () => {
+  const files = new Map(readdirSync(GOLDEN).map((name) => [name, new Uint8Array(readFileSync(new URL(name, GOLDEN)))]));
+  const host = new Host({ "": { files, live: false, sequence: 0 } });
+  const play = opened(host, 0);
+  await play.settled();
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1) === play.engine.frames.count - 1, "edge");
+  expect(play.shown.slice(0, 1)).toEqual([0]);
+  expect(play.shown.length).toBe(play.engine.frames.count);
+  expect(play.errors).toEqual([]);
+});
