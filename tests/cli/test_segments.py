@@ -14,6 +14,7 @@ import pytest
 
 from backends import QUICKEST
 from s3_emulator import BUCKET, emulator
+from segment_streams import header, packets
 from small_presets import few_points
 from structgstream.cli import main, segment_options
 from structgstream.cli.termination import Terminated, Termination
@@ -135,6 +136,27 @@ def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
+def test_the_manifest_says_when_a_live_frame_was_filmed(tmp_path: Path) -> None:
+    options = segment_options.SegmentOptions(sink="segments")
+    with options.storage(tmp_path / "now", may_exist=False, tell=print) as storage:
+        assert storage is not None
+        sink, resumed = storage(lambda frame: 1.7e9 + frame)(False)
+        assert resumed is None
+        sink.open(header())
+        for packet in packets(2):
+            sink.write(packet)
+        assert read_manifest(FolderStore(tmp_path / "now")).edge.captured_unix_seconds == 1.7e9 + 1
+        sink.close()
+
+
+def test_a_live_run_that_waits_is_woken_by_sigterm() -> None:
+    woken = []
+    with Termination(on_ask=lambda: woken.append(True)) as ending:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert ending.asked
+    assert woken == [True]
+
+
 def test_publishing_to_s3(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,7 @@ from structgstream.cli.segment_options import SegmentOptions
 from structgstream.cli.termination import Terminated, Termination
 
 if TYPE_CHECKING:
+    from structgstream.cli.segment_options import SegmentsStorage
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
@@ -95,34 +96,30 @@ def main(arguments: list[str]) -> None:
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
     console = Console()
     may_exist = options.resume or options.overwrite
-    live = None
-    if options.live.live:
-        live = open_live(options.scene, options.capture, options.live, stream=options.output, resume=options.resume)
-    else:
-        options.live.check(options.scene)
-    captured = None if live is None else live.captured
-    tell = partial(_say, console)
-    with options.segments.storage(options.output, may_exist=may_exist, tell=tell, captured=captured) as storage:
-        source = live or open_selected_capture(options.scene, options.capture)
-        _reconstruct(source, options, config, preset=preset, storage=storage, console=console)
+    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(_say, console)) as storage:
+        _reconstruct(options, config, preset=preset, storage=storage, console=console)
     _say(console, f"Wrote {options.output}")
 
 
 def _reconstruct(
-    source: "FrameStream",
     options: Reconstruct,
     config: "StreamConfig",
     *,
     preset: str,
-    storage: "Storage[Scene] | None",
+    storage: "SegmentsStorage | None",
     console: Console,
 ) -> None:
-    from structgstream.data.source import frame_count
     from structgstream.kernels.backend import select_backend
     from structgstream.presets import departures
 
+    if options.live.live:
+        source = open_live(options.scene, options.capture, options.live, stream=options.output, resume=options.resume)
+        length, captured = "live", source.captured
+    else:
+        options.live.check(options.scene)
+        source = open_selected_capture(options.scene, options.capture)
+        length, captured = f"{len(source)} frames", None
     backend = select_backend(options.device)
-    length = "live" if options.live.live else f"{frame_count(source)} frames"
     _say(
         console,
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
@@ -137,7 +134,7 @@ def _reconstruct(
         backend=backend,
         metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
         resume=options.resume,
-        storage=storage,
+        storage=None if storage is None else storage(captured),
         metrics=run_metrics(source, options.output),
     )
     if peaks:

@@ -4,6 +4,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,8 +13,14 @@ import tyro
 from structgstream.cli.app import UsageError
 
 if TYPE_CHECKING:
+    from structgstream.codec.segments.sink import SegmentsOptions
+    from structgstream.codec.segments.store import Store
     from structgstream.recorder import Storage
     from structgstream.scene.scene import Scene
+
+    Captured = Callable[[int], float | None]
+    SegmentsStorage = Callable[[Captured | None], Storage[Scene]]
+    """Given when frames were filmed, by their number, in seconds since 1970; None where that is not known."""
 
 FINISH_SECONDS = 60.0
 """How long the end of a run waits for what is still to be published."""
@@ -53,32 +60,25 @@ class SegmentOptions:
 
     @contextmanager
     def storage(
-        self,
-        output: Path,
-        *,
-        may_exist: bool,
-        tell: Callable[[str], object],
-        captured: Callable[[int], float | None] | None = None,
-    ) -> Iterator["Storage[Scene] | None"]:
+        self, output: Path, *, may_exist: bool, tell: Callable[[str], object]
+    ) -> Iterator["SegmentsStorage | None"]:
         """Where the stream goes, checked before anything takes time; None for the file ``output``.
 
-        ``captured`` gives the Unix time at which a frame was filmed, for live cameras.
         At the end of the block what is to be published is waited for, and ``tell`` gets a sentence if it is not done.
 
         Raises:
             StorageError: it exists and may not be replaced, or cannot be written.
             MissingExtraError: a package is missing that the URL needs.
         """
-        from structgstream.codec.segments.sink import Clocks, SegmentsOptions
-        from structgstream.recorder import check_output, segments_at, segments_folder
+        from structgstream.codec.segments.sink import SegmentsOptions
+        from structgstream.recorder import check_output, segments_folder
 
         options = SegmentsOptions(self.window, self.keep)
-        clocks = Clocks() if captured is None else Clocks(captured=captured)
         if self.chosen(output) == "file":
             check_output(output, may_exist=may_exist)
             yield None
         elif self.publish is None:
-            yield segments_at(segments_folder(output, may_exist=may_exist), options=options, clocks=clocks)
+            yield partial(_storage, segments_folder(output, may_exist=may_exist), options)
         else:
             from structgstream.codec.segments.cloud_store import CloudStore
             from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
@@ -88,10 +88,18 @@ class SegmentOptions:
             mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, tell))
             mirror.copy_all()  # What an earlier run has left, also if there is nothing to do now.
             try:
-                yield segments_at(mirror, options=options, clocks=clocks)
+                yield partial(_storage, mirror, options)
             finally:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
                     tell(
                         f"{left} files of {output} are not yet in {self.publish}; the next run with --resume, or any "
                         "program that copies folders, brings them there."
                     )
+
+
+def _storage(store: "Store", options: "SegmentsOptions", captured: "Captured | None") -> "Storage[Scene]":
+    from structgstream.codec.segments.sink import Clocks
+    from structgstream.recorder import segments_at
+
+    clocks = Clocks() if captured is None else Clocks(captured=captured)
+    return segments_at(store, options=options, clocks=clocks)
