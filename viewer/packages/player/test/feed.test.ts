@@ -2,8 +2,8 @@
 /** Following a manifest: what hosts are asked, and how often. */
 
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
-import { PATIENCE } from "../src/source/fetcher.ts";
 import { ManifestFeed } from "../src/source/manifestFeed.ts";
+import { PATIENCE } from "../src/source/patience.ts";
 import { LiveRun } from "./liveRun.ts";
 import { CLIP } from "./served.ts";
 

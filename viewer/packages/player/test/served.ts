@@ -4,9 +4,11 @@
 import { readFileSync } from "node:fs";
 import { Decoding } from "../src/decode/decoding.ts";
 import type { FromDecoder, ToDecoder } from "../src/decode/messages.ts";
-import { Engine, type EngineOptions } from "../src/engine/engine.ts";
+import { Engine } from "../src/engine/engine.ts";
+import type { EngineOptions } from "../src/engine/options.ts";
 import type { ReadReply, ReadRequest } from "../src/source/description.ts";
-import { Fetcher, type Patience } from "../src/source/fetcher.ts";
+import { Fetcher } from "../src/source/fetcher.ts";
+import type { Patience } from "../src/source/patience.ts";
 import type { Port } from "../src/source/port.ts";
 
 export const CLIP = new Uint8Array(readFileSync(new URL("./fixtures/clip.sgs", import.meta.url)));

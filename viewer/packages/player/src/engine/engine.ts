@@ -10,18 +10,12 @@ import { Edge } from "./edge.js";
 import { Emitter } from "./emitter.js";
 import type { EngineEvents, TimeRange } from "./events.js";
 import { type DueUpdate, FrameQueue } from "./frameQueue.js";
+import type { EngineOptions } from "./options.js";
 import { PacketLog } from "./packetLog.js";
 import type { Pipeline } from "./pipeline.js";
 import { Rebuffering } from "./rebuffering.js";
 import { StoredFrames } from "./storedFrames.js";
 import { Timeline } from "./timeline.js";
-
-export interface EngineOptions {
-  /** Packets are kept in no more bytes than these. */
-  readonly budgetBytes?: number;
-  /** While playing, packets are fetched for so many seconds ahead. */
-  readonly aheadSeconds?: number;
-}
 
 const BUDGET_BYTES = 64 * 2 ** 20;
 const RATES: readonly [number, number] = [0.05, 16];

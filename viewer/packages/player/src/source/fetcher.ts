@@ -8,32 +8,13 @@ import { HttpSource } from "./httpSource.js";
 import { joined } from "./joined.js";
 import { type Manifest, MOST_MANIFEST_BYTES, pageIn, type Quality } from "./manifest.js";
 import { ManifestFeed } from "./manifestFeed.js";
+import { PATIENCE, type Patience } from "./patience.js";
 import { pause } from "./pause.js";
 import type { Port } from "./port.js";
 import { besides, verify } from "./storedFile.js";
 
 /** An init record or a packet that is larger is not taken. */
 const MOST_HELD_BYTES = 2 ** 28;
-
-/** How long is waited before looking again, in seconds. */
-export interface Patience {
-  /** After a connection broke; when all are used up, it failed. */
-  readonly retries: readonly number[];
-  /** For new bytes of a growing file: the first wait, the longest, and by how much each is longer than the last. */
-  readonly firstPoll: number;
-  readonly longestPoll: number;
-  readonly backOff: number;
-  /** A file that has not grown for so long is given up. */
-  readonly stillAfter: number;
-}
-
-export const PATIENCE: Patience = {
-  retries: [0.5, 1, 2, 4, 8],
-  firstPoll: 0.5,
-  longestPoll: 10,
-  backOff: 1.4,
-  stillAfter: 1800,
-};
 
 export class Fetcher {
   private description: SourceDescription | undefined;

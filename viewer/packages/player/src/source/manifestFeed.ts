@@ -7,10 +7,10 @@
  */
 
 import { SourceError } from "./byteSource.js";
-import type { Patience } from "./fetcher.js";
 import { answered, refusal } from "./httpSource.js";
 import { joined } from "./joined.js";
 import { type Manifest, MOST_MANIFEST_BYTES, manifestIn, type Quality } from "./manifest.js";
+import type { Patience } from "./patience.js";
 import { pause } from "./pause.js";
 
 /** A server that waits for news lets go after this at the latest; an answer that takes longer never comes. */
