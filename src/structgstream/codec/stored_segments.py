@@ -2,10 +2,9 @@
 """Continues a stream of segments: a sink, and the existing frames."""
 
 from collections.abc import Iterator, Sequence
-from typing import overload
 
 from structgstream.codec.packets import Packet, StreamHeader
-from structgstream.codec.reader import LOST, PacketInfo, StreamReader
+from structgstream.codec.reader import LOST, PacketInfo, PacketInfos, StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import Store
@@ -13,7 +12,7 @@ from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.scene.scene import Scene
 
 
-class StoredPackets(Sequence[PacketInfo]):
+class StoredPackets(PacketInfos):
     """Facts of all packets; of those that have left the window only size and kind are known."""
 
     def __init__(self, stored: StoredBytes, reader: StreamReader) -> None:
@@ -23,16 +22,8 @@ class StoredPackets(Sequence[PacketInfo]):
     def __len__(self) -> int:
         return len(self._stored.sizes)
 
-    @overload
-    def __getitem__(self, index: int) -> PacketInfo: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
-
-    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        index = range(len(self))[index]
+    def at(self, index: int) -> PacketInfo:
+        """Facts of the packet of a frame."""
         if self._reader.packets.offsets[index] != LOST:
             return self._reader.packets.at(index)
         return PacketInfo(self._stored.kinds[index], index, float("nan"), LOST, self._stored.sizes[index], {})
