@@ -4,14 +4,10 @@
 import asyncio
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from pictures import decoded_picture
 from rigs import random_scene
-from segment_folders import GrowingFolder
 from streams import compact_header, moved, write_stream
-from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import MemorySink
 from structgstream.server import preview_picture, previews
 from structgstream.server.catalog import Catalog, ServedStream
@@ -134,35 +130,6 @@ def test_what_cannot_be_rendered_is_not_tried_again_at_once(tmp_path: Path) -> N
 @pytest.mark.parametrize("content", [b"", b"<svg/>", b"GIF89a", PNG + bytes(MOST_PICTURE_BYTES)])
 def test_what_is_no_picture(content: bytes) -> None:
     assert picture_in(content) is None
-
-
-def test_the_picture_is_of_the_middle_key_frame_of_a_finished_file(tmp_path: Path, stream: bytes) -> None:
-    (tmp_path / "ball.sgs").write_bytes(stream)
-    found = decoded_picture(preview_picture.preview(Catalog(tmp_path).found["ball.sgs"]))
-    with StreamReader(stream) as reader:
-        name = reader.header.rig.training[len(reader.header.rig.training) // 2]
-        assert np.array_equal(found, reader.render(3, name))
-
-
-def test_the_picture_is_of_the_first_frame_of_a_growing_file(tmp_path: Path, stream: bytes) -> None:
-    (tmp_path / "ball.sgs").write_bytes(stream[:-1])
-    found = decoded_picture(preview_picture.preview(Catalog(tmp_path).found["ball.sgs"]))
-    with StreamReader(stream) as reader:
-        name = reader.header.rig.training[len(reader.header.rig.training) // 2]
-        assert np.array_equal(found, reader.render(0, name))
-
-
-def test_the_picture_is_of_the_newest_key_frame_of_segments(tmp_path: Path, stream: bytes) -> None:
-    growing = GrowingFolder(tmp_path / "studio", stream)
-    with StreamReader(stream) as reader:
-        name = reader.header.rig.training[len(reader.header.rig.training) // 2]
-        for key in (0, 0, 0, 3, 3, 3, 6):
-            growing.write()
-            found = decoded_picture(preview_picture.preview(Catalog(tmp_path).found["studio"]))
-            assert np.array_equal(found, reader.render(key, name))
-        growing.finish()
-        found = decoded_picture(preview_picture.preview(Catalog(tmp_path).found["studio"]))
-        assert np.array_equal(found, reader.render(6, name))
 
 
 def test_the_process_apart_gives_the_whole_picture(tmp_path: Path, stream: bytes) -> None:

@@ -88,9 +88,9 @@ class ManifestWatch:
             BrokenManifest: the file is no manifest.
             OSError: the system cannot open files now.
         """
-        first = found = await self.current()
-        self.waiters += 1
+        self.waiters += 1  # Before anything is awaited: those who come meanwhile see that someone waits.
         try:
+            first = found = await self.current()
             with suppress(TimeoutError):
                 async with asyncio.timeout(seconds):
                     while found is first and found is not None and found.live and found.sequence <= after:

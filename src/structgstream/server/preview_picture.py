@@ -101,7 +101,9 @@ def _newest(stream: ServedStream, manifest: Manifest) -> tuple[bytes, bytes]:
         entry, file, count = manifest.segments[-1], manifest.segments[-1].file, manifest.segments[-1].key_bytes
     else:
         raise StreamError(f"{stream.name} has no key packet yet.")
-    period = next(one for one in manifest.periods if one.period == entry.period)
+    period = next((one for one in manifest.periods if one.period == entry.period), None)
+    if period is None:  # A manifest need not name the period of a segment that has left its window.
+        raise StreamError(f"{stream.name} has no key packet in its window.")
     return _read(stream, period.file, most=period.bytes), _read(stream, file, most=count)
 
 

@@ -68,6 +68,8 @@ class BoundedConnection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        if self.client is not None:  # On "::" an IPv4 address comes as ::ffff:192.0.2.1, which no --proxy would match.
+            self.client = without_mapping(self.client[0]), self.client[1]
         self._address = self.client[0] if self.client else ""
         self._header_time: asyncio.TimerHandle | None = None
         self._stalled_time: asyncio.TimerHandle | None = None
@@ -115,6 +117,16 @@ class BoundedConnection(H11Protocol):
     def _close_late(self, reason: str) -> None:
         self.door.late(reason)
         self.transport.abort()
+
+
+def without_mapping(address: str) -> str:
+    """The IPv4 address in an IPv6 one that stands for it; any other text as it is."""
+    try:
+        found = ipaddress.ip_address(address)
+    except ValueError:
+        return address
+    mapped = found.ipv4_mapped if isinstance(found, ipaddress.IPv6Address) else None
+    return address if mapped is None else str(mapped)
 
 
 def _ended(timer: asyncio.TimerHandle | None) -> None:
