@@ -222,7 +222,10 @@ def test_what_cannot_be_resumed(tmp_path: Path) -> None:
     for content, message in [
         (b"Dear", "is not a structgstream file"),
         (b"A long letter to someone.", "is not a structgstream file"),
-        (bytes(damaged), "Cannot continue .*a.sgs: the record at byte 12 .* damaged. Start again with --overwrite"),
+        (
+            bytes(damaged),
+            "Cannot continue .*a.sgs: the record at byte 12 .* damaged. Keep a copy; then start again with --overwrite",
+        ),
         (bytes(newer), "format version 3.0"),
     ]:
         path = tmp_path / "a.sgs"

@@ -62,10 +62,9 @@ def test_what_a_client_writes_is_what_is_read(token: str, after: int) -> None:
 def test_nothing_but_a_query_or_a_sentence_comes_out(raw: bytes, authorization: str) -> None:
     try:
         found = parsed_query(raw, {"authorization": authorization})
-    except BadQuery as bad:
-        assert str(bad).startswith("The query")
-    else:
-        assert found.after is None or 0 <= found.after < 10**16
+    except BadQuery:
+        return
+    assert found.after is None or 0 <= found.after < 10**16
 
 
 def test_validators() -> None:

@@ -29,6 +29,11 @@ def response(pieces: Pieces) -> PieceResponse:
     return PieceResponse(pieces(), status_code=206, headers=headers, media_type="application/octet-stream")
 
 
+def others() -> list[asyncio.Task[None]]:
+    """What else runs and is not about to end."""
+    return [one for one in asyncio.all_tasks() if one is not asyncio.current_task() and not one.cancelling()]
+
+
 async def never() -> Message:
     await asyncio.Event().wait()
     raise AssertionError
@@ -49,6 +54,7 @@ def test_all_pieces_come_in_their_order() -> None:
             (b"\0", True), (b"\1", True), (b"\2", True), (b"", False),
         ]  # fmt: skip
         assert pieces.closed
+        assert not others()
 
     asyncio.run(run())
 

@@ -32,10 +32,10 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
             break
         end = record.end
         frames += record.type in (RecordType.KEY, RecordType.DELTA)
+    # A crash cannot leave whole frames after a damaged one; a failing disk can.
+    lost = not complete and PacketSearch(data).next(end, expected=frames, after_seconds=-math.inf) is not None
     if end > PREFIX.size:
-        # A crash cannot leave whole frames after a damaged one; a failing disk can.
-        search = PacketSearch(data)
-        if not complete and search.next(end, expected=frames, after_seconds=-math.inf) is not None:
+        if lost:
             raise StreamError(
                 f"Cannot continue {name}: {incomplete_reason(data, end)}, and continuing would overwrite the whole "
                 f"frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to fit them "
@@ -43,6 +43,6 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
             )
         return end
     reason = incomplete_reason(data, end)
-    if "damaged" in reason:
-        raise StreamError(f"Cannot continue {name}: {reason}. Start again with --overwrite.")
+    if lost or "damaged" in reason:
+        raise StreamError(f"Cannot continue {name}: {reason}. Keep a copy; then start again with --overwrite.")
     return None

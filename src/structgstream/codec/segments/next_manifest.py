@@ -32,7 +32,8 @@ def empty_manifest(header: StreamHeader, period: PeriodEntry, *, sequence: int =
         sequence=sequence,
         live=True,
         fps=header.fps,
-        name=str(header.metadata.get("capture", ""))[:1000],
+        # A folder's name may hold bytes that are no text, which Python keeps as halves of characters.
+        name=str(header.metadata.get("capture", "")).encode(errors="replace").decode()[:1000],
         target_latency_seconds=0.0,
         frame_seconds=None,
         edge=Edge(-1, 0.0, None, 0.0),

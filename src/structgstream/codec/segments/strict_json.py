@@ -2,11 +2,13 @@
 """Reading JSON of a host that may be hostile: every value is checked for its type and bounds before it is used."""
 
 import json
-import math
 import re
 from typing import Any, NoReturn
 
 from structgstream.errors import StreamError
+
+MOST = 1e15
+"""The largest number where nothing else is said: beyond it seconds are no longer told apart."""
 
 _FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
 _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
@@ -40,7 +42,7 @@ class Fields:
             self._refuse(name, values, f"a list of {count} whole numbers")
         return tuple(self._whole(name, value, least, most) for value in values)
 
-    def number(self, name: str, *, least: float = -math.inf, most: float = 1e15) -> float:
+    def number(self, name: str, *, least: float = -MOST, most: float = MOST) -> float:
         """A finite number."""
         return self._number(name, self._get(name), least, most)
 
@@ -49,15 +51,15 @@ class Fields:
         values = self._get(name)
         if not isinstance(values, list) or len(values) != 2:
             self._refuse(name, values, "two numbers")
-        first, last = (self._number(name, value, -1e15, 1e15) for value in values)
+        first, last = (self._number(name, value, -MOST, MOST) for value in values)
         if first > last:
             self._refuse(name, values, "two numbers that do not fall")
         return first, last
 
     def text(self, name: str, *, most: int = 1000) -> str:
-        """A text of at most ``most`` characters."""
+        """A text of at most ``most`` characters, which can be printed: JSON may hold halves of characters."""
         value = self._get(name)
-        if not isinstance(value, str) or len(value) > most:
+        if not isinstance(value, str) or len(value) > most or any("\ud800" <= one <= "\udfff" for one in value):
             self._refuse(name, value, f"a text of at most {most} characters")
         return value
 
@@ -109,9 +111,7 @@ class Fields:
 
     def _number(self, name: str, value: Any, least: float, most: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-            self._refuse(name, value, "a finite number" if least == -math.inf else f"a number from {least:g}")
-        if not math.isfinite(value):
-            self._refuse(name, value, "a finite number")
+            self._refuse(name, value, f"a number from {least:g} to {most:g}")
         return float(value)
 
     def _refuse(self, name: str, value: object, expected: str) -> NoReturn:

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stream of segments as one stream file."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from segment_folders import GrowingFolder
+from segment_streams import as_file, folder, packets, written
+from streams import small_stream
+from structgstream.codec.segments import archive
+from structgstream.codec.segments.archive import write_archive
+from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.stored_bytes import read_manifest
+from structgstream.errors import StorageError, StreamError
+
+SENT = packets(7)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> FolderStore:
+    found = folder(tmp_path / "out")
+    written(found, SENT)
+    return found
+
+
+def test_the_bytes_of_the_file_sink(store: FolderStore, tmp_path: Path) -> None:
+    assert write_archive(store, tmp_path / "a.sgs") == 7
+    assert (tmp_path / "a.sgs").read_bytes() == as_file(SENT)
+    assert sorted(os.listdir(tmp_path)) == ["a.sgs", "out"]
+
+
+def test_a_run_that_has_not_ended_gives_a_file_without_an_index(tmp_path: Path) -> None:
+    stream = small_stream(4)
+    growing = GrowingFolder(tmp_path / "out", stream)
+    for frames in (1, 2, 3):
+        growing.write()
+        assert write_archive(folder(tmp_path / "out"), tmp_path / "a.sgs") == frames
+        assert stream.startswith((tmp_path / "a.sgs").read_bytes())
+
+
+@pytest.mark.parametrize("which", ["init", "segment"])
+def test_what_was_there_stays_when_a_file_is_damaged(store: FolderStore, tmp_path: Path, which: str) -> None:
+    (tmp_path / "a.sgs").write_bytes(b"an earlier archive")
+    manifest = read_manifest(store)
+    name = manifest.periods[0].file if which == "init" else manifest.segments[-1].file
+    data = bytearray(store.get(name))
+    data[len(data) // 2] ^= 1
+    store.put(name, bytes(data))
+    with pytest.raises(StreamError, match=f"{name} in .* is damaged"):
+        write_archive(store, tmp_path / "a.sgs")
+    assert (tmp_path / "a.sgs").read_bytes() == b"an earlier archive"
+    assert sorted(os.listdir(tmp_path)) == ["a.sgs", "out"]
+
+
+def test_a_stream_with_gaps_is_refused(tmp_path: Path) -> None:
+    store = folder(tmp_path / "out")
+    written(store, packets(30), options=SegmentsOptions(window_seconds=0.25, grace_seconds=0.0))
+    with pytest.raises(StreamError, match="out is not whole: frames 3 to 20 have left its window"):
+        write_archive(store, tmp_path / "a.sgs")
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing(
+    store: FolderStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(StorageError, match=r"nowhere/a\.sgs cannot be written \(No such file or directory\)"):
+        write_archive(store, tmp_path / "nowhere" / "a.sgs")
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(archive.os, "fsync", full)
+    with pytest.raises(StorageError, match=r"a\.sgs cannot be written \(No space left on device\)"):
+        write_archive(store, tmp_path / "a.sgs")
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_folder_is_not_replaced_by_a_file(store: FolderStore, tmp_path: Path) -> None:
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(StorageError, match="taken cannot be written"):
+        write_archive(store, tmp_path / "taken")
+    assert sorted(os.listdir(tmp_path)) == ["out", "taken"]
