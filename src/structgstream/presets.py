@@ -47,7 +47,11 @@ class StreamConfig:
     rate: RateConfig = field(default_factory=RateConfig)
     """Rate control; only with the codec ``compact``."""
     seed: int = 0
-    """Random seed."""
+    """Random seed, from 0 on."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ConfigError(f"A random seed is a whole number from 0 on, got {self.seed}.")
 
 
 def to_json(config: StreamConfig) -> dict[str, Any]:

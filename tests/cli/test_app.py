@@ -4,11 +4,13 @@
 import importlib.metadata
 import subprocess
 import sys
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
 
 import structgstream
+from quick_streams import CLIP, error_of
 from structgstream.cli import app
 from structgstream.cli.app import COMMANDS, main
 from structgstream.errors import CaptureError, OutOfMemoryError
@@ -168,3 +170,22 @@ def test_commands_of_other_distributions_are_looked_for_only_when_asked_for() ->
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_exit_status_of_the_program(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "structgstream", "export", str(tmp_path / "no.sgs"), "--format", "html"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert result.stderr.count("\n") == 1
+    assert result.stdout == ""
+
+
+def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    new = str(tmp_path / "new.sgs")
+    assert "does not exist" in error_of(["reconstruct", str(tmp_path / "no"), "-o", new], capsys, status=1)
+    assert "is a folder" in error_of(["reconstruct", CLIP, "-o", str(tmp_path)], capsys, status=1)
+    assert "cannot be created" in error_of(["reconstruct", CLIP, "-o", str(stream / "x" / "y")], capsys, status=1)
+    assert str(tmp_path / "no") in error_of(["inspect", str(tmp_path / "no")], capsys, status=1)
+    (tmp_path / "text").write_text("hello, this is no stream at all")
+    assert "text" in error_of(["evaluate", str(tmp_path / "text"), CLIP], capsys, status=1)
+    assert "is a file" in error_of(["demo", "--output", str(stream)], capsys, status=2)

@@ -2,6 +2,7 @@
 """The command ``inspect``: bytes by field of header and packets, listed and drawn."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -142,3 +143,37 @@ def test_what_came_and_went_is_told_where_the_log_is(
     packets = json.loads(output.read_text())["packets"]
     assert packets[0]["changes"] == {"grown": 1_200, "removed": 30, "spawned": 0, "pruned": 0}
     assert packets[1]["changes"] == {}
+
+
+def test_inspect_lists_header_and_packets(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(stream), "--json", str(tmp_path / "i.json")]) == 0
+    content = json.loads((tmp_path / "i.json").read_text())
+    assert set(content) == {"header", "packets"}
+    header = content["header"]
+    assert header["complete"]
+    assert header["config"]["initial"]["iterations"] == 3
+    assert header["cameras"]["cam00"]["held_out"]
+    scales = header["fields"]["base_scales"]
+    assert 0 < scales["bytes"] < 4 * math.prod(scales["shape"]), "coded"
+    assert header["metadata"] == {"capture": "clip", "preset": "tiny", "start": 0, "scale": 0.25}
+    assert [packet["kind"] for packet in content["packets"]] == ["key", "delta", "delta"]
+    assert set(content["packets"][0]) == {
+        "kind", "index", "pts_seconds", "offset", "bytes", "fields", "changes", "counts"
+    }  # fmt: skip
+    assert sum(packet["bytes"] for packet in content["packets"]) + header["header_bytes"] < stream.stat().st_size
+    text = capsys.readouterr().out
+    assert "complete" in text
+    assert "held out: cam00" in text
+
+
+def test_inspect_prints_the_resolved_configuration(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(["inspect", str(stream), "--config"]) == 0
+    assert json.loads(capsys.readouterr().out)["online"]["iterations"] == 2
+
+
+def test_inspect_of_a_cut_file_says_so(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cut, last = tmp_path / "cut.sgs", open_stream(stream).packets[-1]
+    cut.write_bytes(stream.read_bytes()[: last.offset + last.bytes // 2])
+    assert main(["inspect", str(cut)]) == 0
+    assert "not finished" in capsys.readouterr().out

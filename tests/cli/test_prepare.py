@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands prepare and board, as a user types them."""
+"""The command prepare, as a user types it."""
 
 import json
 from pathlib import Path
@@ -40,13 +40,6 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     capsys.readouterr()
     assert main(["prepare", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
     assert "is missing; give the folder" in capsys.readouterr().err
-
-
-def test_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["board", "-o", str(tmp_path / "new" / "board.pdf"), "--paper", "A4", "--square", "30mm"]) == 0
-    assert (tmp_path / "new" / "board.pdf").read_bytes().startswith(b"%PDF")
-    assert "--calibration board --board 7x5:30mm" in capsys.readouterr().out
-    assert main(["board", "-o", str(tmp_path / "board.pdf"), "--squares", "5x5"]) == 2
 
 
 def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 """A folder of segments goes through every command as a file does, and the two are the same bytes."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -14,10 +13,8 @@ import pytest
 
 from backends import QUICKEST
 from s3_emulator import BUCKET, emulator
-from segment_streams import header, packets
 from small_presets import few_points
 from structgstream.cli import main, segment_options
-from structgstream.cli.termination import Terminated, Termination
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.cloud_store import CloudStore
@@ -123,38 +120,6 @@ def test_sigterm_finishes_the_frame_and_closes_the_stream(tmp_path: Path) -> Non
     done = manifest.edge.frame + 1
     assert 1 <= done < 12
     assert f"{out} has {done} of 12 frames; continue with the same command and --resume." in error.decode()
-
-
-def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
-    before, asked = signal.getsignal(signal.SIGTERM), []
-    with Termination(lambda: asked.append(True)) as ending:
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert (ending.asked, asked) == (True, [True])
-        with pytest.raises(Terminated, match="was given up"):
-            os.kill(os.getpid(), signal.SIGTERM)
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-def test_the_manifest_says_when_a_live_frame_was_filmed(tmp_path: Path) -> None:
-    options = segment_options.SegmentOptions(sink="segments")
-    with options.storage(tmp_path / "now", may_exist=False, tell=print) as storage:
-        assert storage is not None
-        sink, resumed = storage(lambda frame: 1.7e9 + frame)(False)
-        assert resumed is None
-        sink.open(header())
-        for packet in packets(2):
-            sink.write(packet)
-        assert read_manifest(FolderStore(tmp_path / "now")).edge.captured_unix_seconds == 1.7e9 + 1
-        sink.close()
-
-
-def test_a_live_run_that_waits_is_woken_by_sigterm() -> None:
-    woken = []
-    with Termination(on_ask=lambda: woken.append(True)) as ending:
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert ending.asked
-    assert woken == [True]
 
 
 def test_publishing_to_s3(

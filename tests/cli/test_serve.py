@@ -123,24 +123,6 @@ def test_what_is_no_folder_of_streams(folder: Path, capsys: pytest.CaptureFixtur
     assert "is a file; serve takes a folder" in output_of(["serve", str(file)], capsys, expected=1)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ([], "name one stream, or say --every"),
-        (["studio", "--every"], "name one stream, or say --every"),
-        (["studio", "--hours", "0"], "--hours 0 is not above 0"),
-        (["studio", "--hours", "nan"], "--hours nan is not above 0"),
-        (["studio", "--hours", "1e9"], "a year"),
-        (["../studio"], "is no name of a stream"),
-    ],
-)
-def test_tokens_that_are_refused(
-    folder: Path, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    secret = ["--secret-file", str(folder.parent / "secret")]
-    assert words in output_of(["token", *arguments, *secret], capsys, expected=2)
-
-
 def test_a_missing_extra_is_told(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

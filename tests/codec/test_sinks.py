@@ -224,7 +224,7 @@ def test_what_cannot_be_resumed(tmp_path: Path) -> None:
         (b"A long letter to someone.", "is not a structgstream file"),
         (
             bytes(damaged),
-            "Cannot continue .*a.sgs: the record at byte 12 .* damaged. Keep a copy; then start again with --overwrite",
+            "Cannot continue .*a.sgs: the record at byte 12 .* damaged. Keep a copy; then start again",
         ),
         (bytes(newer), "format version 3.0"),
     ]:

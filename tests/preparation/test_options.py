@@ -1,9 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Options as they are written on the command line."""
+
+import math
+
 import pytest
 
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.options import board_text, parse_board, parse_distance, parse_length, parse_size
+from structgstream.preparation.options import (
+    PrepareOptions,
+    board_text,
+    parse_board,
+    parse_distance,
+    parse_length,
+    parse_size,
+)
 
 
 def test_lengths() -> None:
@@ -29,5 +40,16 @@ def test_a_board_is_named_and_read(board: Board) -> None:
 
 
 def test_what_names_no_board() -> None:
-    with pytest.raises(ConfigError, match="COLUMNSxROWS:SQUARE"):
-        parse_board("7x5")
+    for text in ("7x5", "7:50mm", "7 5:50mm", "0x5:50mm", "7x5:50mm:a:b", "", "9" * 5000 + "x5:50mm"):
+        with pytest.raises(ConfigError, match="COLUMNSxROWS:SQUARE"):
+            parse_board(text)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_numbers_that_cannot_be(value: float) -> None:
+    with pytest.raises(ConfigError, match="The near plane must be positive"):
+        PrepareOptions(near=value)
+    with pytest.raises(ConfigError, match="Frames a second must be positive"):
+        PrepareOptions(fps=value)
+    with pytest.raises(ConfigError, match="at least one instant"):
+        PrepareOptions(instants=0)

@@ -56,7 +56,7 @@ def resolve_config(
     """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name.
 
     Raises:
-        UsageError: there is no such preset.
+        UsageError: there is no such preset, or the seed is negative.
     """
     from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named
 
@@ -72,7 +72,8 @@ def resolve_config(
         args=overrides,
         config=(tyro.conf.FlagConversionOff,),
     )
-    return (config if seed is None else replace(config, seed=seed)), name
+    with usage_errors():
+        return (config if seed is None else replace(config, seed=seed)), name
 
 
 def open_selected_capture(scene: Path, options: CaptureOptions) -> "FrameSource":

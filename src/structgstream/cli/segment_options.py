@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options of a stream that is written as segments, and where it goes."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -54,8 +55,8 @@ class SegmentOptions:
         sink = self.sink or found
         if sink == "file" and (self.window is not None or self.publish is not None):
             raise UsageError(f"{'--publish' if self.window is None else '--window'} is for --sink segments.")
-        if (self.window is not None and self.window <= 0) or self.keep < 0:
-            raise UsageError("--window must be positive, and --keep zero or more.")
+        if not (self.window is None or 0 < self.window < math.inf) or not self.keep >= 0:
+            raise UsageError("--window must be a positive number of seconds, and --keep zero or more.")
         return sink
 
     @contextmanager

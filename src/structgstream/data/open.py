@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens a capture from a folder of any supported layout."""
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -93,7 +94,7 @@ def selected(
     if held_out is not None:
         rig = rig.with_held_out(_chosen(held_out, rig))
     if near is not None:
-        if not near > 0:
+        if not 0 < near < math.inf:
             raise ConfigError(f"The near plane must be positive, got {near:g}.")
         rig = with_near(rig, near)
     sized = resized(source, scale)

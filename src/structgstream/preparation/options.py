@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a user may ask of a preparation."""
 
+import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,9 +71,9 @@ class PrepareOptions:
     tone: bool = False
 
     def __post_init__(self) -> None:
-        if self.near is not None and not self.near > 0:
+        if self.near is not None and not 0 < self.near < math.inf:
             raise ConfigError(f"The near plane must be positive, got {self.near:g}.")
-        if self.fps is not None and not self.fps > 0:
+        if self.fps is not None and not 0 < self.fps < math.inf:
             raise ConfigError(f"Frames a second must be positive, got {self.fps:g}.")
         if self.instants < 1:
             raise ConfigError(f"Structure from motion needs at least one instant, got {self.instants}.")
@@ -108,10 +109,10 @@ def parse_board(text: str) -> Board:
         ConfigError: anything else, or sizes that make no board.
     """
     squares, *rest = text.split(":")
-    if not 1 <= len(rest) <= 2:
+    numbers = _two_numbers(squares)
+    if numbers is None or not 1 <= len(rest) <= 2:
         raise ConfigError(f"A board is COLUMNSxROWS:SQUARE, such as 7x5:50mm; got {text!r}.")
-    columns, rows = parse_size(squares)
-    board = Board(columns, rows, parse_length(rest[0]))
+    board = Board(*numbers, parse_length(rest[0]))
     return board if len(rest) == 1 else replace(board, dictionary=rest[1])
 
 
@@ -127,7 +128,13 @@ def parse_size(text: str) -> tuple[int, int]:
     Raises:
         ConfigError: anything else.
     """
-    found = re.fullmatch(r"\s*(\d+)\s*x\s*(\d+)\s*", text)
-    if found is None or not (int(found[1]) and int(found[2])):
+    numbers = _two_numbers(text)
+    if numbers is None:
         raise ConfigError(f"A size is WIDTHxHEIGHT in pixels, such as 1280x720; got {text!r}.")
-    return int(found[1]), int(found[2])
+    return numbers
+
+
+def _two_numbers(text: str) -> tuple[int, int] | None:
+    """The positive numbers of ``1280x720``; None of any other text."""
+    found = re.fullmatch(r"\s*(\d{1,9})\s*x\s*(\d{1,9})\s*", text)
+    return (int(found[1]), int(found[2])) if found and int(found[1]) and int(found[2]) else None

@@ -46,8 +46,7 @@ class Left:
     def found(self) -> Manifest:
         draft = find(self.store)
         assert draft is not None
-        records = [draft_file for draft_file in draft.records]
-        assert [len(record) for record in records] == [part.bytes for part in draft.manifest.parts]
+        assert [len(record) for record in draft.records] == [part.bytes for part in draft.manifest.parts]
         return draft.manifest
 
 

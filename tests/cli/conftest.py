@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tests of several commands share."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from quick_streams import CLIP, QUICK, SMALL
+from small_presets import few_points
+from structgstream.cli import main
+
+
+@pytest.fixture(scope="session")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of 80x60 pixels, hardly trained; nobody changes it."""
+    path = tmp_path_factory.mktemp("stream") / "clip.sgs"
+    with few_points("tiny"):
+        assert main(["reconstruct", CLIP, "-o", str(path), *SMALL, *QUICK]) == 0
+    return path
+
+
+@pytest.fixture
+def quick_presets() -> Iterator[None]:
+    """Presets with few initial points."""
+    with few_points("tiny", "paper-meetroom"):
+        yield

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``board``."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from quick_streams import error_of
+from structgstream.cli import main
+from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.options import parse_board
+
+
+def test_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["board", "-o", str(tmp_path / "new" / "board.pdf"), "--paper", "A4", "--square", "30mm"]) == 0
+    assert (tmp_path / "new" / "board.pdf").read_bytes().startswith(b"%PDF")
+    assert "--calibration board --board 7x5:30mm" in capsys.readouterr().out
+    assert main(["board", "-o", str(tmp_path / "board.pdf"), "--squares", "5x5"]) == 2
+
+
+def test_what_is_printed_names_the_board_for_prepare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command that is shown, typed, is this board."""
+    given = ["--paper", "A0", "--squares", "9x6", "--square", "7.5cm", "--dictionary", "DICT_4X4_250"]
+    assert main(["board", "-o", str(tmp_path / "b.pdf"), *given]) == 0
+    shown = re.search(r"--board (\S+)", capsys.readouterr().out)
+    assert shown
+    assert parse_board(shown[1]) == Board(9, 6, 0.075, dictionary="DICT_4X4_250")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--squares", "7"], "COLUMNSxROWS"),
+        (["--square", "0mm"], "0mm"),
+        (["--square", "nan"], "nan"),
+        (["--square", "900mm"], "A3"),
+        (["--dictionary", "DICT_9X9"], "DICT_9X9"),
+        (["--squares", "1x1"], "1 x 1"),
+        (["--paper", "B5"], "B5"),
+    ],
+)
+def test_what_is_no_board(tmp_path: Path, given: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert words in error_of(["board", "-o", str(tmp_path / "b.pdf"), *given], capsys, status=2)
+    assert not (tmp_path / "b.pdf").exists()
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file" / "b.pdf", tmp_path):
+        assert f"The board {out} cannot be written" in error_of(["board", "-o", str(out)], capsys, status=1)

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``evaluate``."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from backends import QUICKEST
+from quick_streams import CLIP, error_of
+from structgstream.cli import main
+
+
+def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    numbers, folder = tmp_path / "numbers.json", tmp_path / "report"
+    arguments = ["evaluate", str(stream), CLIP, "--json", str(numbers), "--report", str(folder)]
+    assert main([*arguments, "--device", QUICKEST]) == 0
+    content = json.loads(numbers.read_text())
+    assert list(content["cameras"]) == ["cam00"]
+    assert len(content["frames"]) == 3
+    assert 8 < content["mean"]["psnr"] < 40
+    assert content["mean"]["seconds"] > 0
+    assert content["stream"]["total_bytes"] == stream.stat().st_size
+    assert content["stream"]["metadata"]["scale"] == 0.25
+    assert content["environment"]["backend"] == QUICKEST
+    assert {entry.name for entry in folder.iterdir()} == {"report.json", "over_time.png", "contact_sheet.png"}
+    assert json.loads((folder / "report.json").read_text())["mean"]["psnr"] == content["mean"]["psnr"]
+    table = capsys.readouterr().out
+    headline, beside = (f"{content['mean'][name]:.2f}" for name in ("psnr", "psnr_camera_color"))
+    assert re.search(rf"mean +{headline} +{beside} ", table)
+    assert "with the header shared over them" in " ".join(table.split())
+    assert max(len(line) for line in table.splitlines() if str(folder) not in line) <= 80
+
+
+def test_evaluate_says_what_it_could_not_measure(
+    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STRUCTGSTREAM_LPIPS_WEIGHTS", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    evaluate = ["evaluate", str(stream), CLIP, "--device", QUICKEST]
+    assert main(evaluate) == 0
+    table = " ".join(capsys.readouterr().out.split())
+    assert "lpips_alex, t_lpips: the weights of AlexNet were not found" in table
+    assert "ms_ssim: pictures need 161 pixels a side" in table
+    assert "tFLIP" in table
+    assert main([*evaluate, "--metrics", "basic"]) == 0
+    table = capsys.readouterr().out
+    assert "tFLIP" not in table
+    assert "not available" not in table
+    nowhere = [*evaluate, "--lpips-weights", str(tmp_path / "none")]
+    assert "none, where the path given has the weights" in error_of(nowhere, capsys, status=1)

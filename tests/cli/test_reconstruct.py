@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``reconstruct``: what it writes, what it refuses, and how it goes on."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from quick_streams import CLIP, QUICK, SMALL, error_of
+from structgstream import recorder
+from structgstream.cli import main
+from structgstream.cli.progress import Lines
+from structgstream.codec.reader import open_stream
+from structgstream.session import FrameReport
+
+pytestmark = pytest.mark.usefixtures("quick_presets")
+
+
+def test_reconstruct_writes_the_log_beside_the_stream(stream: Path) -> None:
+    entries = [json.loads(line) for line in stream.with_suffix(".log.jsonl").read_text().splitlines()]
+    assert [entry["index"] for entry in entries] == [0, 1, 2]
+    assert [entry["kind"] for entry in entries] == ["key", "delta", "delta"]
+    assert all(entry["total_seconds"] == entry["seconds"]["total"] > 0 for entry in entries)
+    assert all(entry["peak_memory_bytes"] == max(entry["peak_memory_bytes_by_stage"].values()) for entry in entries)
+    stages = [[*entry["peak_memory_bytes_by_stage"]] for entry in entries]
+    assert stages == [["read", "fit", "store", "prepare"], *2 * [["read", "fit", "store"]]]
+    assert all(entry["peak_memory_bytes"] > 1e6 for entry in entries)
+    assert {entry["peak_memory_kind"] for entry in entries} <= {"stage", "process"}
+
+
+def test_a_rig_that_is_not_the_papers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--frames", "1", "--scale", "0.25", *QUICK]
+    assert main([*asked, "--preset", "paper-meetroom"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The paper's data of paper-meetroom are others: pictures of 80x60 instead of 1280x720;" in said
+
+
+def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
+    base = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--scale", "0.25", "--frames", "1", *QUICK]
+    assert main([*base, "--codec", "compact", "--quality", "1.5", "--mbits", "0.5"]) == 0
+    header = open_stream(tmp_path / "s.sgs").header
+    rounding = header.config["online"]["rounding"]
+    assert rounding["quality"] == 1.5
+    assert header.steps["free_log_scales"] == pytest.approx(rounding["free_log_scale_step"] / 2**1.5)
+    assert header.config["rate"] == {"target_mbits": 0.5, "window_seconds": 1.0}
+
+
+def test_an_existing_stream_is_not_replaced_by_accident(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = stream.read_bytes()
+    error = error_of(["reconstruct", CLIP, "-o", str(stream), *SMALL, *QUICK], capsys, status=1)
+    assert "--resume" in error
+    assert "--overwrite" in error
+    assert stream.read_bytes() == before
+
+
+def test_resuming_with_another_configuration_changes_nothing(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = stream.read_bytes()
+    arguments = ["reconstruct", CLIP, "-o", str(stream), *SMALL, *QUICK, "--resume", "--online.losses.ssim", "0.3"]
+    assert "online.losses.ssim" in error_of(arguments, capsys, status=1)
+    assert stream.read_bytes() == before
+
+
+def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
+    stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(self: Lines, report: FrameReport) -> None:
+        if report.index == 1:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "again.sgs"
+    arguments = ["reconstruct", CLIP, "-o", str(path), *SMALL, *QUICK]
+    with monkeypatch.context() as patch:
+        patch.setattr(Lines, "frame", interrupted)
+        error = error_of(arguments, capsys, status=130)
+    assert "again.sgs" in error
+    assert "--resume" in error
+    assert path.stat().st_size < stream.stat().st_size
+    assert main([*arguments, "--resume"]) == 0
+    assert path.read_bytes() == stream.read_bytes()
+    assert len(path.with_suffix(".log.jsonl").read_text().splitlines()) == 3
+
+
+@pytest.mark.parametrize(
+    ("extra", "status", "words"),
+    [
+        (["--preset", "tny"], 2, "there is no preset 'tny'; there are paper-n3dv"),
+        (["--resume", "--overwrite"], 2, "choose one"),
+        (["--seed", "-1"], 2, "A random seed is a whole number from 0 on, got -1."),
+        (["--near", "inf"], 1, "The near plane must be positive, got inf"),
+        (["--preset", "tiny", "--online.iteration", "5"], 2, "--online.iterations"),
+        (["--preset", "tiny", "--online.iterations", "many"], 2, "many"),
+        (["--preset", "tiny", "--held-out", "cam77"], 1, "cam77"),
+        (["--preset", "tiny", "--scale", "3"], 1, "(0, 1]"),
+        (["--preset", "tiny", "--start", "12"], 1, "12 frames"),
+        (["--preset", "rig", "--quality", "1"], 2, "--quality is for streams with the codec compact; the preset 'rig'"),
+        (
+            ["--preset", "motion", "--mbits", "5"],
+            2,
+            "--mbits is for streams with the codec compact; the preset 'motion'",
+        ),
+        (["--preset", "compact", "--codec", "raw", "--mbits", "5"], 2, "Add --preset compact"),
+        (["--preset", "compact", "--quality", "90"], 2, "--quality 90 is not one of -6 to 6"),
+        (["--preset", "compact", "--quality", "nan"], 2, "--quality nan is not one of"),
+        (["--preset", "compact", "--mbits", "0"], 2, "--mbits 0 is no rate"),
+        (["--preset", "compact", "--mbits", "inf"], 2, "--mbits inf is no rate"),
+        (["--preset", "compact", "--mbits", "5M"], 2, "5M"),
+    ],
+)
+def test_wrong_options_are_told_before_anything_is_written(
+    tmp_path: Path, extra: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new.sgs"
+    assert words in error_of(["reconstruct", CLIP, "-o", str(out), *extra], capsys, status=status)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("given", [["--preset", "fast"], ["--preset=fast"], ["--preset", "rig", "--preset=fast"]])
+def test_the_configuration_has_help_of_its_own(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    from structgstream.presets import DEFAULT_PRESET, PRESETS
+
+    assert main(["reconstruct", *given, "--help-config"]) == 0
+    text = capsys.readouterr().out
+    assert "--online.patching.grad-threshold" in text
+    assert "'fast'" in text
+    ours, default = (PRESETS[name].initial.iterations for name in ("fast", DEFAULT_PRESET))
+    shown = text[text.index("--initial.iterations") :].split("default: ")[1]
+    assert shown.startswith(f"{ours})")
+    assert ours != default
+
+
+@pytest.mark.parametrize("given", [["--preset", "tny"], ["--preset=tny"], ["--preset"]])
+def test_a_wrong_preset_has_no_help(given: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(["reconstruct", "--help-config", *given], capsys, status=2)
+    assert error.count("\n") == 1
+    assert "preset" in error
+
+
+def test_the_presets_named_in_help_are_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    from structgstream.presets import PRESETS
+
+    assert main(["reconstruct", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in PRESETS)
+
+
+def test_the_check_before_the_first_frame_sees_a_folder_without_permission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(recorder.os, "access", lambda path, mode: False)  # root may write anywhere
+    assert "permission" in error_of(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs")], capsys, status=1)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``render``: cameras and paths, as videos and pictures."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import pytest
+
+from backends import QUICKEST
+from drawn import pixels_of
+from quick_streams import CLIP, error_of
+from structgstream.cli import main, render
+from structgstream.cli.options import parse_options
+from structgstream.codec.reader import open_stream
+from structgstream.evaluation.camera_path import central_camera
+
+
+def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> None:
+    base = ["render", str(stream), "--device", QUICKEST, "-o"]
+    assert main([*base, str(tmp_path / "v.mp4")]) == 0
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 3
+    assert main([*base, str(tmp_path / "all"), "--camera", "cam03"]) == 0
+    assert sorted(entry.name for entry in (tmp_path / "all").iterdir()) == ["00000.png", "00001.png", "00002.png"]
+    assert main([*base, str(tmp_path / "one.png"), "--camera", "cam03", "--frame", "1"]) == 0
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "all" / "00001.png").read_bytes()
+
+
+@pytest.mark.parametrize("path", ["orbit", "arc"])
+def test_render_a_path_beside_the_stream(stream: Path, tmp_path: Path, path: str) -> None:
+    copy = tmp_path / "ball.sgs"
+    shutil.copy(stream, copy)
+    assert main(["render", str(copy), "--path", path, "--seconds", "0.2", "--device", QUICKEST]) == 0
+    with av.open(str(tmp_path / f"ball-{path}.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 6
+
+
+def test_render_beside_the_truth(stream: Path, tmp_path: Path) -> None:
+    out = tmp_path / "side.png"
+    arguments = ["render", str(stream), CLIP, "--compare", "--frame", "2", "-o", str(out), "--device", QUICKEST]
+    assert main(arguments) == 0
+    assert pixels_of(out).shape == (60, 3 * 80 + 8, 3)
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--camera", "cam99"], "no camera 'cam99'"),
+        (["--frame", "7", "-o", "x.png"], "frames 0 to 2"),
+        (["-o", "x.png"], "--frame"),
+        (["--compare"], "needs the capture"),
+        (["--between", "cam01", "cam02"], "--path arc"),
+        ([CLIP], "only used with --compare"),
+        (["--seconds", "3"], "--seconds is the duration of a --path"),
+        *((["--path", "orbit", "--seconds", text], "above 0") for text in ("0", "-3", "nan", "inf", "1e9")),
+    ],
+)
+def test_render_refuses_what_does_not_go_together(
+    stream: Path, extra: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert words in error_of(["render", str(stream), *extra, "--device", QUICKEST], capsys, status=2)
+
+
+@pytest.mark.parametrize(("count", "frames"), [(6, [0, 1, 1, 2, 1, 1]), (2, [0, 1])])
+def test_time_on_a_path_runs_forth_and_back(count: int, frames: list[int]) -> None:
+    class Reader:
+        packets = (0, 1, 2)
+
+        def scenes(self, start: int) -> list[tuple[int, int]]:
+            return [(i, i) for i in self.packets[start:]]
+
+    assert list(render._ping_pong(Reader(), None, count=count)) == frames  # pyright: ignore
+
+
+class Truth:
+    """As many scenes as numbers, for what chooses among them."""
+
+    def __init__(self, count: int) -> None:
+        self.packets = range(count)
+
+    def scenes(self, start: int) -> list[tuple[int, int]]:
+        return [(i, i) for i in self.packets[start:]]
+
+    def scene(self, frame: int) -> int:
+        return frame
+
+
+@pytest.mark.parametrize(("frames", "count"), [(1, 5), (3, 3), (5, 3)])
+def test_a_stream_as_long_as_the_path_plays_straight(frames: int, count: int) -> None:
+    shown = list(render._ping_pong(Truth(frames), None, count=count))  # pyright: ignore
+    assert shown == ([0] * 5 if frames == 1 else [0, 1, 2])
+    assert list(render._ping_pong(Truth(frames), 0, count=count)) == [0] * count  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ([], "ball-cam00.mp4"),
+        (["--camera", "cam02"], "ball-cam02.mp4"),
+        (["--camera", "cam02", "--frame", "1"], "ball-cam02-1.png"),
+        (["--path", "orbit", "--frame", "1"], "ball-orbit.mp4"),
+        (["x", "--compare"], "ball-cam00-compare.mp4"),
+        (["x", "--compare", "--frame", "2"], "ball-cam00-compare-2.png"),
+    ],
+)
+def test_the_name_of_a_result(stream: Path, arguments: list[str], name: str) -> None:
+    options = parse_options(render.Render, "render", arguments=["videos/ball.sgs", *arguments])
+    with open_stream(stream) as reader:
+        assert render.default_output(options, reader) == Path("videos") / name
+
+
+def test_a_video_that_is_there_stays_when_the_frame_is_not(stream: Path, tmp_path: Path) -> None:
+    """Whether it can be rendered is known before the file is opened."""
+    (tmp_path / "old.mp4").write_bytes(b"precious")
+    for more in (["--frame", "9"], ["--camera", "nobody"], ["--path", "orbit", "--frame", "9"]):
+        assert main(["render", str(stream), "-o", str(tmp_path / "old.mp4"), *more]) == 2
+    assert (tmp_path / "old.mp4").read_bytes() == b"precious"
+
+
+def test_the_camera_in_the_middle_where_none_is_held_out(stream: Path) -> None:
+    with open_stream(stream) as reader:
+        assert render.choose_camera(reader, None) == "cam00"
+        header = replace(reader.header, rig=reader.header.rig.with_held_out(frozenset()))
+        reader.header = header
+        assert render.choose_camera(reader, None) == central_camera(header.rig)

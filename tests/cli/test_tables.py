@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers as tables for a terminal, from scores that are made up."""
+
+import io
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from structgstream.cli.tables import SHOWN_FRAMES, quality_text, report_tables
+from structgstream.evaluation.report import FrameScores, Report, Scores
+
+FACTS: dict[str, Any] = {
+    "metrics": "all", "not_available": {}, "cameras": {"cam[0]": "held out"}, "absent_frames": {}, "masked_share": {},
+    "psnr_first": 31.0, "psnr_last": 30.0, "psnr_worst": 29.5, "drift_db_per_frame": -0.0125, "total_bytes": 5_000_000,
+    "header_bytes": 1_000_000, "packet_bytes": 4_000_000, "frames": 4, "megabits_per_second": 240.0,
+    "megabits_per_second_with_header": 300.0, "fps": 30.0, "render_fps": 12.34, "decode_and_render_fps": 5.0,
+    "field_bytes": {"small": 10, "large": 3_000_000, "none": 0},
+}  # fmt: skip
+MACHINE = {"gpu": None, "cpu": "a [fast] one", "cores": 2, "backend": "cpu", "torch": "2.0", "peak_memory_bytes": None}
+
+
+def scores(**known: Any) -> Scores:
+    """Scores of 30 dB, and None for what is not ``known``."""
+    values: dict[str, Any] = {field.name: None for field in fields(Scores)}
+    return Scores(**{**values, "psnr": 30.0, "psnr_affine": 31.5, "ssim": 0.9, **known})
+
+
+def frame(index: int, *, mean: Scores | None = None, **log: Any) -> FrameScores:
+    values: dict[str, Any] = {field.name: {} for field in fields(FrameScores)}
+    known = {"index": index, "mean": mean, "bytes": 1_000_000, "anchors": 12_345, "free": 67, "log": log}
+    return FrameScores(**{**values, **known})
+
+
+def report(frames: int = 4, **facts: Any) -> Report:
+    values: dict[str, Any] = {field.name: {} for field in fields(Report)}
+    known = {
+        "frames": tuple(frame(i, mean=scores(psnr=20.0 + i), total_seconds=1.25) for i in range(frames)),
+        "cameras": {"cam[0]": scores(psnr_camera_color=30.5)}, "mean": scores(psnr_camera_color=30.5),
+        "stream": {**FACTS, **facts}, "environment": MACHINE,
+    }  # fmt: skip
+    return Report(**{**values, **known})
+
+
+def shown(of: Report, *, title: str = "ball.sgs") -> str:
+    console = Console(file=io.StringIO(), width=200, color_system=None)
+    console.print(report_tables(of, title=title))
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def row(text: str, first: str) -> list[str]:
+    """The words of the line that begins so."""
+    return next(line.split() for line in text.splitlines() if line.strip().startswith(first))
+
+
+def test_frames_and_their_mean() -> None:
+    text = shown(report(), title="[a] ball.sgs")
+    assert "[a] ball.sgs" in text
+    assert row(text, "0 ")[:2] == ["0", "20.00"]
+    assert row(text, "3 ") == ["3", "23.00", "-", "0.9000", "-", "-", "1.0", "MB", "12,345", "67", "1.2"]
+    assert row(text, "mean")[:3] == ["mean", "30.00", "30.50"]
+
+
+@pytest.mark.parametrize("count", [1, 23, 24, 25, 48, 49, 100, 1000])
+def test_a_long_stream_is_shown_in_part_with_its_first_and_last_frame(count: int) -> None:
+    text = shown(report(count))
+    numbers = [int(words[0]) for line in text.splitlines() if len(words := line.split()) > 9 and words[0].isdigit()]
+    assert (numbers[0], numbers[-1], numbers) == (0, count - 1, sorted(set(numbers)))
+    assert len(numbers) <= SHOWN_FRAMES + 1
+    assert len(numbers) == count or len(numbers) > SHOWN_FRAMES / 2
+
+
+def test_a_frame_without_pictures_or_log() -> None:
+    of = report()
+    text = shown(replace(of, frames=(of.frames[0], frame(1))))
+    assert row(text, "1 ") == ["1", "-", "-", "-", "-", "-", "1.0", "MB", "12,345", "67", "-"]
+
+
+def test_cameras_with_names_that_look_like_markup() -> None:
+    assert row(shown(report()), "cam[0]") == ["cam[0]", "held", "out", "30.00", "30.50", "0.9000", "-", "-", "31.50"]
+
+
+def test_further_scores_only_where_they_were_asked_for() -> None:
+    assert "tFLIP" in shown(report())
+    assert "tFLIP" not in shown(report(metrics="basic"))
+
+
+def test_what_is_missing_and_why_once_a_reason() -> None:
+    text = shown(report(not_available={"a": "no weights", "b": "too small", "c": "no weights"}))
+    assert text.count("no weights") == 1
+    assert "a, c: no weights" in text
+    assert "b: too small" in text
+    assert "not available" not in shown(report())
+
+
+def test_facts_of_the_file() -> None:
+    text = " ".join(shown(report()).split())
+    assert "first 31.00, last 30.00, worst 29.50 dB; drift -0.013 dB a frame" in text
+    assert "5.0 MB: header 1.0 MB, 4 packets 4.0 MB; a frame 1.0 MB, 1.2 MB with the header" in text
+    assert "240.00 Mbit/s at 30 frames a second, 300.00 with the header" in text
+    assert "large 3.0 MB, small 10 B" in text
+    assert "none" not in text
+    assert "12.3 pictures a second, 5.0 with the decoding" in text
+    assert "a [fast] one, 2 cores, back-end cpu, torch 2.0" in text
+    for absent in ("absent", "masked", "training", "this evaluation"):
+        assert absent not in text
+
+
+def test_facts_that_only_some_files_have() -> None:
+    trained = {"peak_memory_bytes": 10**9, "seconds_first": 61.0, "seconds_online_mean": None}
+    of = report(
+        absent_frames={"cam1": 2}, masked_share={"cam2": 0.125}, peak_memory_bytes_by_stage={"fit": 10**6}, **trained
+    )
+    text = " ".join(shown(replace(of, environment={**MACHINE, "gpu": "GPU X", "peak_memory_bytes": 10**6})).split())
+    assert "cam1 from 2 of 4 frames; means are over the pictures that exist" in text
+    assert "cam2 12.5% of the pixels, which are not scored" in text
+    assert "first frame 61.0 s, each further one -, peak memory 1.00 GB" in text
+    assert "memory by stage fit 1.0 MB" in text
+    assert "GPU X, 2 cores" in text
+    assert "this evaluation peak memory 1.0 MB" in text
+
+
+def test_the_quality_in_a_line() -> None:
+    assert quality_text(report()) == "30.00 dB (30.50 after frame 0's colour fit)"
+    assert quality_text(replace(report(), mean=scores())) == "30.00 dB"

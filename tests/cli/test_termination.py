@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first SIGTERM asks, the second ends."""
+
+import os
+import signal
+import threading
+
+import pytest
+
+from structgstream.cli.termination import Terminated, Termination
+
+
+def send() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
+    before, asked = signal.getsignal(signal.SIGTERM), []
+    with Termination(lambda: asked.append(True)) as ending:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert (ending.asked, asked) == (True, [True])
+        with pytest.raises(Terminated, match="was given up"):
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_live_run_that_waits_is_woken_by_sigterm() -> None:
+    woken = []
+    with Termination(on_ask=lambda: woken.append(True)) as ending:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert ending.asked
+    assert woken == [True]
+
+
+def test_what_was_there_before_comes_back_however_the_block_ends() -> None:
+    heard: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+    try:
+        with Termination():
+            pass
+        with pytest.raises(KeyError), Termination():
+            raise KeyError
+        send()
+        assert heard == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_nothing_is_asked_where_no_signal_came() -> None:
+    with Termination(lambda: pytest.fail("nobody asked")) as ending:
+        assert not ending.asked
+    assert not ending.asked
+
+
+def test_another_thread_has_no_signals_and_changes_nothing() -> None:
+    before, found = signal.getsignal(signal.SIGTERM), []
+
+    def run() -> None:
+        with Termination() as ending:
+            found.append((ending.asked, signal.getsignal(signal.SIGTERM)))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert found == [(False, before)]
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_error_of_who_is_woken_is_not_lost() -> None:
+    def broken() -> None:
+        raise RuntimeError("cannot wake")
+
+    with pytest.raises(RuntimeError, match="cannot wake"), Termination(broken) as ending:
+        send()
+    assert ending.asked
