@@ -15,8 +15,8 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.codec.encoder import Encoded
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
-from structgstream.codec.reader import PacketInfo
 from structgstream.data.points import PointsConfig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend

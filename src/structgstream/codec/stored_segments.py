@@ -3,8 +3,9 @@
 
 from collections.abc import Iterator, Sequence
 
+from structgstream.codec.packet_table import LOST, PacketInfo, PacketInfos
 from structgstream.codec.packets import Packet, StreamHeader
-from structgstream.codec.reader import LOST, PacketInfo, PacketInfos, StreamReader
+from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import Store
@@ -49,6 +50,14 @@ class StoredSegments:
 
     def __len__(self) -> int:
         return len(self.packets)
+
+    def header_of(self, index: int) -> StreamHeader:
+        """The header of the period of a frame, see :meth:`StreamReader.header_of`."""
+        return self._reader.header_of(index)
+
+    def period_start(self, index: int) -> int:
+        """The first frame of the period of a frame."""
+        return self._reader.period_start(index)
 
     def group(self, index: int) -> Iterator[Packet]:
         """The packets needed to decode frame ``index``, see :meth:`StreamReader.group`."""

@@ -33,8 +33,8 @@ from structgstream.codec.container.records import (
 )
 from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import pack_header, unpack_header
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.reader import PacketInfo
 from structgstream.errors import StorageError, StreamError
 from structgstream.pipeline import State
 from structgstream_studies.peers.method import Arrays, PeerMethod
@@ -252,6 +252,14 @@ class PeerSink:
         self._count, self._end = len(self._resumed), self._resumed.end
         self._file.truncate(self._end)
         return 0
+
+    def begin(self, header: StreamHeader) -> int:
+        """Not possible: a peer's file has one header.
+
+        Raises:
+            StorageError: always.
+        """
+        raise StorageError(f"{self._path} is a peer's file, which has one header; a new period needs a stream file.")
 
     def write(self, packet: Packet) -> int:
         """Append one frame; returns the bytes that it takes.
