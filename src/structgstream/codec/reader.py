@@ -116,9 +116,9 @@ class StreamReader:
         """
         return self._table.header(self._table.place(index))
 
-    def period_start(self, index: int) -> int:
-        """The first frame of the period that frame ``index`` belongs to."""
-        return self._table.periods[self._table.place(index)].first_frame
+    def period(self, index: int) -> Period:
+        """The period that frame ``index`` belongs to."""
+        return self._table.periods[self._table.place(index)]
 
     @property
     def header_bytes(self) -> int:

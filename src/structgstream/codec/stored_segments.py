@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from structgstream.codec.container.periods import Period, period_at
 from structgstream.codec.packet_table import LOST, PacketInfo, PacketInfos
 from structgstream.codec.packets import Packet, StreamHeader
 from structgstream.codec.reader import StreamReader
@@ -40,6 +41,7 @@ class StoredSegments:
 
     def __init__(self, stored: StoredBytes, *, name: str) -> None:
         self._reader = StreamReader(stored, name=name, gone=stored.gone)
+        self._periods = stored.periods
         self.packets: Sequence[PacketInfo] = StoredPackets(stored, self._reader)
         self.complete = self._reader.complete
 
@@ -55,9 +57,9 @@ class StoredSegments:
         """The header of the period of a frame, see :meth:`StreamReader.header_of`."""
         return self._reader.header_of(index)
 
-    def period_start(self, index: int) -> int:
-        """The first frame of the period of a frame."""
-        return self._reader.period_start(index)
+    def period(self, index: int) -> Period:
+        """The period of a frame, also of one that has left the window."""
+        return self._periods[period_at(self._periods, index)]
 
     def group(self, index: int) -> Iterator[Packet]:
         """The packets needed to decode frame ``index``, see :meth:`StreamReader.group`."""

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 from structgstream.codec.container.byte_source import ByteSource
 from structgstream.codec.container.index import INDEX_ENTRY, indexed_frames
+from structgstream.codec.container.init_record import LENGTH
 from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.container.records import CHECKSUM, RECORD, Head, Record, RecordType, read_record
 
 LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
-LEAST_PERIOD_BYTES = RECORD.size + CHECKSUM.size + LEAST_PACKET_BYTES
+_ZSTD = bytes.fromhex("28b52ffd")  # which an init record's description begins with
 _CHUNK_BYTES = 2**20
 _WORK = 4
 
@@ -49,10 +50,6 @@ class Standing:
     def last_frame_at(self, offset: int) -> int:
         """The last frame that a packet at ``offset`` may be: frames before it take bytes, too."""
         return self.frames + (offset - self.offset) // LEAST_PACKET_BYTES
-
-    def last_period_at(self, offset: int) -> int:
-        """The last period that an init record at ``offset`` may begin."""
-        return self.period + 1 + (offset - self.offset) // LEAST_PERIOD_BYTES
 
 
 class PacketSearch:
@@ -98,7 +95,8 @@ class PacketSearch:
         """Whether a record at ``offset`` is, by its head, consistent with what is known before the damage."""
         last = standing.last_frame_at(offset)
         if head.type == RecordType.INIT:
-            return standing.period < head.period <= standing.last_period_at(offset)
+            start = offset + RECORD.size + LENGTH.size
+            return head.period > standing.period and bytes(self._data[start : start + len(_ZSTD)]) == _ZSTD
         if head.type == RecordType.INDEX:
             entries = head.length // INDEX_ENTRY.size
             return head.length % INDEX_ENTRY.size == 0 and standing.frames <= entries <= 2 * last

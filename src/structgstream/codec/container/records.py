@@ -83,8 +83,10 @@ def packed(kind: RecordType, payload: bytes, *, period: int = 0) -> bytes:
         period: number of the period that an init record begins, or that a packet belongs to.
 
     Raises:
-        StreamError: the payload is longer than a record can hold.
+        StreamError: the payload is longer than a record can hold, or there are too many periods.
     """
+    if period >= MAX_PERIODS:
+        raise StreamError(f"A stream has at most {MAX_PERIODS} periods; begin another one.")
     if len(payload) > MAX_RECORD_BYTES:
         raise StreamError(f"A record of {len(payload)} bytes is too long; the format holds {MAX_RECORD_BYTES}.")
     head = RECORD.pack(kind, 0, period, len(payload))

@@ -4,10 +4,11 @@
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from structgstream.codec.container.index import pack_index
+from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import PREFIX, RecordType
 from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.history import segments_from, verified
@@ -44,6 +45,7 @@ class StoredBytes:
         gone: frames that are no longer there, in order.
         sizes: of every frame from 0 on, in bytes, gone ones included.
         kinds: of every frame.
+        periods: those of all frames; of one that is no longer there, offset and length are 0.
 
     Raises:
         StreamError: a file is missing or not what the manifest states; also on slicing.
@@ -61,6 +63,7 @@ class StoredBytes:
         self.gone: list[range] = []
         self.sizes: list[int] = []
         self.kinds: list[PacketKind] = []
+        self.periods: list[Period] = []
         self._periods = {period.period: period for period in manifest.periods}
         self._period: int | None = None  # whose init record has been added
         entries: list[tuple[int, int, int]] = []
@@ -118,6 +121,8 @@ class StoredBytes:
         if not first:
             entries.append((frame, RecordType.INIT, self._size))
         # Every file of a period begins with a prefix, and a stream has one.
+        offset, size = self._size + (PREFIX.size if first else 0), self._periods[number].bytes - PREFIX.size
+        self.periods[-1] = replace(self.periods[-1], offset=offset, bytes=size)
         self._add(self._periods[number], skipped=0 if first else PREFIX.size)
 
     def _add_frames(
@@ -133,6 +138,8 @@ class StoredBytes:
         else:
             first, sizes = entry.first_frame, entry.frame_bytes
             kinds = [PacketKind.KEY, *[PacketKind.DELTA] * (entry.frames - 1)]
+        if not self.periods or self.periods[-1].number != entry.period:
+            self.periods.append(Period(entry.period, first, 0, 0))
         self.sizes += sizes
         self.kinds += kinds
         if entry.file not in there:

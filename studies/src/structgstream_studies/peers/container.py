@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.codec.container.byte_source import ByteSource
+from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import (
     PREFIX,
     RecordType,
@@ -178,6 +179,14 @@ class PeerReader(Generic[State]):
             StreamError: it was damaged after the file was opened.
         """
         return arrays_of(self.packet(index), where=f"Frame {index} of {self._name}")
+
+    def header_of(self, index: int) -> StreamHeader:
+        """The header, which holds for all frames."""
+        return self.header
+
+    def period(self, index: int) -> Period:
+        """The only period."""
+        return Period(0, 0, PREFIX.size, self.header_bytes - PREFIX.size)
 
     def group(self, index: int) -> Iterator[Packet]:
         """The packets needed to decode frame ``index``, from the key packet to its own."""
