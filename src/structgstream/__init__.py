@@ -17,8 +17,9 @@ from structgstream.version import __version__ as __version__
 if TYPE_CHECKING:
     from structgstream.api import check, evaluate, export, prepare, reconstruct
     from structgstream.cameras import Camera, CameraRig
+    from structgstream.codec.packet_table import PacketInfo
     from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-    from structgstream.codec.reader import PacketInfo, StreamReader, open_stream
+    from structgstream.codec.reader import StreamReader, open_stream
     from structgstream.codec.sinks import FileSink, MemorySink
     from structgstream.data.open import open_capture
     from structgstream.data.source import FrameSource
@@ -53,7 +54,7 @@ _HOMES = {
     "MultiViewFrame": "frames",
     "PRESETS": "presets",
     "Packet": "codec.packets",
-    "PacketInfo": "codec.reader",
+    "PacketInfo": "codec.packet_table",
     "PacketKind": "codec.packets",
     "PeakKind": "memory",
     "Pipeline": "pipeline",

@@ -30,7 +30,8 @@ class FrameReport:
     Peaks of memory are by stage: ``read``, ``fit``, ``store`` (encoding and writing), and ``prepare`` (computing frame
     0's data for later frames). ``peak_memory_kind`` states whether they are per stage (Note [Peaks]);
     ``peak_device_bytes`` are the GPU's, if any. ``cpu_seconds`` is the CPU time of all threads of the process.
-    ``absent`` are the cameras without a picture of this frame, held-out ones among them.
+    ``absent`` are the cameras without a picture of this frame, held-out ones among them. ``begins`` says why the frame
+    begins another period, and is None if it does not.
     """
 
     index: int
@@ -53,6 +54,7 @@ class FrameReport:
     cpu_seconds: float = 0.0
     counts: Mapping[str, int] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
+    begins: str | None = None
 
 
 class FrameMeter:
@@ -72,9 +74,15 @@ class FrameMeter:
         self._seconds[stage], self._last = now - self._last, now
 
     def report(
-        self, fit: FitResult[StateT], encoded: Encoded[StateT], size: int, *, absent: tuple[str, ...] = ()
+        self,
+        fit: FitResult[StateT],
+        encoded: Encoded[StateT],
+        size: int,
+        *,
+        absent: tuple[str, ...] = (),
+        begins: str | None = None,
     ) -> FrameReport:
-        """The report of the frame whose packet takes ``size`` bytes, and from which the cameras ``absent`` are."""
+        """The report of the frame whose packet takes ``size`` bytes; for ``absent`` and ``begins`` see there."""
         packet, state = encoded.packet, encoded.reconstruction
         read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
         return FrameReport(
@@ -97,6 +105,7 @@ class FrameMeter:
             peak_memory_kind=self._peaks.kind,
             cpu_seconds=time.process_time() - self._cpu_started,
             absent=absent,
+            begins=begins,
         )
 
 

@@ -14,12 +14,14 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
+from structgstream.codec.container.periods import Period
 from structgstream.codec.encoder import Encoded
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
-from structgstream.codec.reader import PacketInfo
 from structgstream.data.points import PointsConfig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.periods import PeriodConfig
 from structgstream.rate_control import RateConfig
 from structgstream.scene.render import Drawable
 from structgstream.similarity import Similarity
@@ -46,6 +48,7 @@ class FrameTask:
         seed: of all random numbers, so that a frame can be repeated alone.
         steps: the codec's quantization steps by name; empty in frame 0.
         pressure: of the rate control (``rate_control``, Note [Pressure]).
+        begins: why the frame begins another period, in a few words (``periods``); None if it does not.
         on_step: called after every optimisation step.
     """
 
@@ -57,6 +60,7 @@ class FrameTask:
     seed: int
     steps: Mapping[str, float] = field(default_factory=dict)
     pressure: float = 1.0
+    begins: str | None = None
     on_step: StepListener | None = None
 
     @property
@@ -72,7 +76,7 @@ class Past(Generic[State, Memory]):
     Args:
         state: the previous decoded frame (``codec.encoder``, Note [Closed loop]).
         memory: see :meth:`Method.prepare`.
-        older: the decoded frame before that, if the method needs it.
+        older: the decoded frame before that, if the method needs it and it is of the same period.
     """
 
     state: State
@@ -104,11 +108,12 @@ class Method(Protocol[State, Memory]):
         ...
 
     def prepare(self, state: State, task: Callable[[], FrameTask]) -> Memory:
-        """The data that later frames need of the decoded frame 0 and, if ``task`` is called, of its pictures."""
+        """The data that later frames need of a period's first decoded frame and, if ``task`` is called, of its
+        pictures."""
         ...
 
     def next(self, past: Past[State, Memory], task: FrameTask) -> FitResult[State]:
-        """Fit a later frame."""
+        """Fit a later frame; one that ``begins`` another period as frame 0 is, with static fields of its own."""
         ...
 
 
@@ -146,6 +151,14 @@ class StoredStream(Protocol[State_co]):
     def complete(self) -> bool: ...
 
     def __len__(self) -> int: ...
+
+    def header_of(self, index: int) -> StreamHeader:
+        """The header of the period of frame ``index``."""
+        ...
+
+    def period(self, index: int) -> Period:
+        """The period of frame ``index``."""
+        ...
 
     def group(self, index: int) -> Iterator[Packet]:
         """The packets that frame ``index`` needs, from a key packet to its own."""
@@ -185,11 +198,11 @@ class StreamCodec(Protocol[State]):
         ...
 
     def prepare(self, fitted: State, task: FrameTask, facts: StreamFacts) -> tuple[State, StreamHeader]:
-        """Frame 0 as later frames and receivers get it, and the header of the stream."""
+        """A period's first frame as later frames and receivers get it, and the header of the period."""
         ...
 
     def coder(self, header: StreamHeader, device: torch.device) -> FrameCoder[State]:
-        """The coder of the stream of this header; decoded states may be on ``device``."""
+        """The coder of the period of this header; decoded states may be on ``device``."""
         ...
 
 
@@ -206,6 +219,8 @@ class Pipeline(Generic[State, Memory]):
         points: configuration of initial points, for captures without points.
         rate: rate control.
         metadata: plain JSON values for every header.
+        period: when another period begins.
+        residual: how much a decoded frame differs from its pictures, which ``period.residual`` needs.
     """
 
     method: Method[State, Memory]
@@ -216,3 +231,5 @@ class Pipeline(Generic[State, Memory]):
     points: PointsConfig
     rate: RateConfig = field(default_factory=RateConfig)
     metadata: Mapping[str, Any] = field(default_factory=dict)
+    period: PeriodConfig = field(default_factory=PeriodConfig)
+    residual: Callable[[State, FrameTask], float] | None = None

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
+from structgstream.periods import PeriodConfig
 from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig
 from structgstream.training.environment import EnvironmentConfig
@@ -46,6 +47,8 @@ class StreamConfig:
     """Coding of frames: ``raw`` float32, or ``compact``, quantized (``online.rounding``) and entropy coded."""
     rate: RateConfig = field(default_factory=RateConfig)
     """Rate control; only with the codec ``compact``."""
+    period: PeriodConfig = field(default_factory=PeriodConfig)
+    """When the stream goes on with another header; while off, it is left out of headers."""
     seed: int = 0
     """Random seed, from 0 on."""
 
@@ -66,7 +69,10 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
             return [plain(item) for item in value]
         return value
 
-    return plain(asdict(config))
+    found = plain(asdict(config))
+    if config.period == PeriodConfig():
+        del found["period"]
+    return found
 
 
 def preset_named(name: str) -> StreamConfig:

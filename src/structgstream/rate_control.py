@@ -84,22 +84,25 @@ class RateController:
         self._ahead = max(1, round(_AHEAD * window))
         self._last: deque[int] = deque(maxlen=window)
         self._count = 0
+        self._origin = 0  # the first frame of the period
         self._key: tuple[int, int] | None = None  # the last key packet's size and frame
         self._delta: tuple[int, float] | None = None  # the last delta packet's size, and its pressure
         self._usual = 0.0  # size of delta packets, a running mean
         self._said = False
 
-    def add(self, size: int, kind: PacketKind) -> None:
-        """Record a written packet of ``size`` bytes."""
+    def add(self, size: int, kind: PacketKind, *, begins: bool = False) -> None:
+        """Record a written packet of ``size`` bytes; ``begins``: with a header of its own, which is not counted."""
         if self._budget is None:
             return
         self._last.append(size)
+        if begins:
+            self._origin = self._count
         self._count += 1
         if kind is PacketKind.DELTA:
             self._usual = size if self._delta is None else 0.8 * self._usual + 0.2 * size
             self._delta = size, self.pressure
-        elif self._count > 1:  # The first key packet is nearly empty: the header has its fields.
-            self._key = size, self._count - 1
+        elif self._count - 1 > self._origin:  # A period's first packet is nearly empty: the header has its fields.
+            self._key = size, self._count - 1 - self._origin
         if self._delta is not None:
             last, pressure = self._delta
             factor = min(max(last / self._room(self._budget), _FALL), _RISE)
@@ -128,7 +131,7 @@ class RateController:
         """Predicted size of the next key packet in bytes (Note [Windows])."""
         frame = -(-self._count // self._interval) * self._interval
         size, known = (self._usual, 1) if self._key is None else self._key
-        return size * (frame / known) ** 0.5
+        return size * ((frame - self._origin) / known) ** 0.5
 
     @property
     def rate_mbits(self) -> float | None:

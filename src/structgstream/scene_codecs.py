@@ -65,7 +65,7 @@ class SceneCodec(ABC):
         return SceneEncoder(header)
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
-        """Frame 0 as later frames and receivers get it, and the header of the stream."""
+        """A period's first frame as later frames and receivers get it, and the header of the period."""
         scene, step_sizes = self._initialize_stream(fitted, task)
         state, dynamic = state_of(scene), self.config.online.dynamic
         reference = dynamic.difference(fields_of("free")) if step_sizes.steps else ()
@@ -82,6 +82,7 @@ class SceneCodec(ABC):
             steps=step_sizes.steps,
             reference={name: state[name].cpu() for name in reference},
             init_steps=step_sizes.init_steps,
+            periods=self.config.period.enabled,
         )
         return scene, header
 

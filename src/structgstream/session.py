@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Generic
 
+from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.source import FrameStream, frame_count, may_read_ahead
@@ -20,6 +21,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
+from structgstream.periods import PeriodPlan
 from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
 from structgstream.rate_control import RateController
 from structgstream.resuming import check_resumable
@@ -73,6 +75,7 @@ class Session(Generic[State, Memory]):
             metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
         )
         self._key_interval = pipeline.codec.key_interval(source.fps)
+        self._plan = PeriodPlan(pipeline.period, key_interval=self._key_interval, most=MAX_PERIODS)
         self._controller = RateController(pipeline.rate, source.fps, key_interval=self._key_interval)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
@@ -109,11 +112,11 @@ class Session(Generic[State, Memory]):
                 meter.end("fit", peak="fit")
                 encoded = self._encode(fit.scene, task)
                 meter.end("encode")
-                size = self._write(encoded.packet)
+                size = self._write(encoded.packet, task)
                 meter.end("write", peak="store")
                 past = self._advance(past, encoded.reconstruction, task)
                 meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
-                yield meter.report(fit, encoded, size, absent=task.absent)
+                yield meter.report(fit, encoded, size, absent=task.absent, begins=task.begins)
 
     def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
         """Each frame from ``start`` on with its preprocessed pictures."""
@@ -130,9 +133,9 @@ class Session(Generic[State, Memory]):
     def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
         """The tasks of frames; each is made after the previous frame is written, on which its pressure depends."""
         for frame, pictures in observed:
-            yield self._task(frame, pictures)
+            yield self._task(frame, pictures, begins=self._plan.due(frame.index, frame.pts_seconds))
 
-    def _task(self, frame: MultiViewFrame, pictures: FramePictures) -> FrameTask:
+    def _task(self, frame: MultiViewFrame, pictures: FramePictures, *, begins: str | None = None) -> FrameTask:
         pipeline = self._pipeline
         points = partial(
             initial_points_of,
@@ -151,52 +154,71 @@ class Session(Generic[State, Memory]):
             seed=frame_seed(pipeline.seed, frame.index),
             steps=self._steps,
             pressure=self._controller.pressure,
+            begins=begins,
             on_step=self._on_step,
         )
 
     def _encode(self, fitted: State, task: FrameTask) -> Encoded[State]:
-        """The packet of a frame; for frame 0 the header is written first."""
-        if self._coder is None:
+        """The packet of a frame; for the first of a period the header is written before it."""
+        if self._coder is None or task.begins is not None:
             fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
             self._coder = self._open(header)
         index = task.frame.index
         kind = PacketKind.KEY if index % self._key_interval == 0 else PacketKind.DELTA
         return self._coder.encode(fitted, index=index, pts_seconds=task.frame.pts_seconds, kind=kind)
 
-    def _write(self, packet: Packet) -> int:
+    def _write(self, packet: Packet, task: FrameTask) -> int:
         size = self._sink.write(packet)
-        self._controller.add(size, packet.kind)
+        self._controller.add(size, packet.kind, begins=task.begins is not None)
         return size
 
     def _open(self, header: StreamHeader) -> FrameCoder[State]:
+        """The coder of a period, whose header the sink gets."""
         self._steps = header.steps
         coder = self._pipeline.codec.coder(header, self._backend.device)
-        self._sink.open(header)
+        if self._coder is None:
+            self._sink.open(header)
+        else:
+            self._sink.begin(header)
         return coder
 
     def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
         """The state from which the next frame is fitted."""
-        method = self._pipeline.method
-        if past is None:
+        method, begins = self._pipeline.method, past is None or task.begins is not None
+        if begins:
+            self._plan.begin(task.frame.index, task.frame.pts_seconds)
+        self._measure(state, task)
+        if begins:
             return Past(state, method.prepare(state, lambda: task))
         return Past(state, past.memory, past.state if method.needs_older else None)
 
+    def _measure(self, state: State, task: FrameTask) -> None:
+        """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
+        if self._pipeline.residual is not None and self._plan.measures(task.frame.index):
+            self._plan.add(task.frame.index, self._pipeline.residual(state, task))
+
     def _reopen(self, resumed: StoredStream[State]) -> None:
         """Continue an existing stream."""
-        self._coder = self._open(resumed.header)
+        self._coder = self._open(resumed.header_of(len(resumed) - 1))
         for info in resumed.packets:
-            self._controller.add(info.bytes, info.kind)
+            begins = info.index > 0 and resumed.period(info.index).first_frame == info.index
+            self._controller.add(info.bytes, info.kind, begins=begins)
 
     def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
         """The state from which the next frame is fitted, decoded from the existing stream."""
         assert self._coder is not None, "reopened before"
         method, count = self._pipeline.method, len(resumed)
         state = deque(map(self._coder.replay, resumed.group(count - 1)), maxlen=1).pop()
-        older = resumed.scene(count - 2) if method.needs_older and count > 1 else None
-        return Past(state, method.prepare(resumed.scene(0), self._first_task), older)
+        period = resumed.period(count - 1)
+        first = period.first_frame
+        older = resumed.scene(count - 2) if method.needs_older and count - 1 > first else None
+        self._plan.begin(first, resumed.packets[first].pts_seconds, number=period.number)
+        for index in self._plan.needed(count):
+            self._measure(resumed.scene(index), self._task_again(index))
+        return Past(state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older)
 
-    def _first_task(self) -> FrameTask:
-        """The task of frame 0, whose pictures are read again."""
-        frame = next(self._source.frames(0))
+    def _task_again(self, index: int) -> FrameTask:
+        """The task of an existing frame, whose pictures are read again."""
+        frame = next(self._source.frames(index))
         check_enough_pictures(frame, self._rig, self._source.name)
         return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))

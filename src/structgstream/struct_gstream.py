@@ -15,10 +15,10 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.scene_codecs import scene_codec
 from structgstream.training.environment import fit_environment
-from structgstream.training.initial import fit_first_frame
+from structgstream.training.initial import fit_first_frame, fit_first_frame_again
 from structgstream.training.online import fit_next_frame, needs_older
 from structgstream.training.pictures import FramePictures, pictures_of
-from structgstream.training.residuals import ResidualFloor, residual_floor
+from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
 from structgstream.training.result import FitResult
 
 
@@ -54,8 +54,8 @@ class StructGStream:
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """Fit frame 0, with its environment if enabled."""
-        config, backend = self.config, task.backend
-        if self.fitted is not None:
+        config = self.config
+        if self.fitted is not None and task.begins is None:
             fit = self.fitted()
         else:
             fit = fit_first_frame(
@@ -63,10 +63,14 @@ class StructGStream:
                 task.rig,
                 task.points(),
                 config=config.initial,
-                backend=backend,
+                backend=task.backend,
                 seed=task.seed,
                 on_step=task.on_step,
             )
+        return self._with_environment(fit, task)
+
+    def _with_environment(self, fit: FitResult[Scene], task: FrameTask) -> FitResult[Scene]:
+        config, backend = self.config, task.backend
         if not config.environment.enabled:
             return fit
         views = task.pictures.views
@@ -84,6 +88,8 @@ class StructGStream:
 
     def next(self, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
         """Fit a later frame."""
+        if task.begins is not None:
+            return self._anew(past.state, task)
         device = task.backend.device
         return fit_next_frame(
             on_device(past.state, device),
@@ -99,6 +105,28 @@ class StructGStream:
             on_step=task.on_step,
         )
 
+    def _anew(self, state: Scene, task: FrameTask) -> FitResult[Scene]:
+        """Fit the first frame of another period, after the decoded ``state``."""
+        initial, period = self.config.initial, self.config.period
+        if period.start == "points":
+            return self.first(task)
+        fit = fit_first_frame_again(
+            task.frame,
+            task.rig,
+            on_device(state, task.backend.device),
+            iterations=max(round(period.share * initial.iterations), 1),
+            config=initial,
+            backend=task.backend,
+            seed=task.seed,
+            on_step=task.on_step,
+        )
+        return self._with_environment(fit, task)
+
+    def residual(self, state: Scene, task: FrameTask) -> float:
+        """Mean absolute difference, in 0 ... 1, of the decoded ``state`` to the frame's training pictures."""
+        scale, backend = self.config.online.motion.picture_scale, task.backend
+        return mean_residual(on_device(state, backend.device), task.pictures.views, scale=scale, backend=backend)
+
 
 def stream_pipeline(
     config: StreamConfig, *, fitted: Callable[[], FitResult[Scene]] | None = None
@@ -113,12 +141,15 @@ def stream_pipeline(
             f"A target of {config.rate.target_mbits:g} Mbit/s was given for a stream with codec {config.codec!r}, "
             "which has no rate control; take --preset compact, or leave the target out."
         )
+    method = StructGStream(config, fitted)
     return Pipeline(
-        StructGStream(config, fitted),
+        method,
         scene_codec(config),
         config=to_json(config),
         seed=config.seed,
         normalised_radius=config.normalised_radius,
         points=config.points,
         rate=config.rate,
+        period=config.period,
+        residual=method.residual,
     )

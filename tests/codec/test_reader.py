@@ -127,7 +127,11 @@ def test_another_major_version_is_refused_and_a_newer_minor_is_not() -> None:
         ),
         ([packet_record(0, PacketKind.KEY, pts_seconds=float("nan"))], "it is damaged"),
         ([packed(RecordType.KEY, b"short")], "too short"),
-        ([packed(RecordType.INIT, b"")], "second init record"),
+        (
+            [packed(RecordType.INIT, b"")],
+            "init record of period 0, at byte 984, where one of period 1, or a packet, belongs",
+        ),
+        ([packed(RecordType.INIT, b"", period=1)], "init record of period 1, at byte 984, where a packet belongs"),
     ],
 )
 def test_records_that_contradict_each_other(records: list[bytes], message: str) -> None:

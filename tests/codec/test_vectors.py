@@ -25,6 +25,9 @@ from vectors.generate import (
     COMPACT_STEPS,
     COMPACT_STREAM,
     EXPECTED,
+    LATER,
+    PERIODS_EXPECTED,
+    PERIODS_STREAM,
     SEGMENTS,
     STREAM,
     SUMS,
@@ -56,8 +59,9 @@ def relative_index(data: bytes) -> list[tuple[int, int, int]]:
 def test_the_files_are_those_that_were_published() -> None:
     assert STREAM.stat().st_size < 20_000
     assert COMPACT_STREAM.stat().st_size < 20_000
+    assert PERIODS_STREAM.stat().st_size < 20_000
     lines = SUMS.read_text().splitlines()
-    assert len(lines) == 4 + len(list(SEGMENTS.iterdir()))
+    assert len(lines) == 6 + len(list(SEGMENTS.iterdir()))
     for line in lines:
         digest, name = line.split()
         assert hashlib.sha256((STREAM.parent / name).read_bytes()).hexdigest() == digest, name
@@ -69,11 +73,22 @@ def test_today_s_encoder_writes_the_golden_stream() -> None:
     assert relative_index(today) == relative_index(golden)
 
 
-@pytest.mark.parametrize(("stream", "wanted", "count"), [(STREAM, EXPECTED, 3), (COMPACT_STREAM, COMPACT_EXPECTED, 6)])
+@pytest.mark.parametrize(
+    ("stream", "wanted", "count"),
+    [(STREAM, EXPECTED, 3), (COMPACT_STREAM, COMPACT_EXPECTED, 6), (PERIODS_STREAM, PERIODS_EXPECTED, 8)],
+)
 def test_today_s_decoder_reads_a_golden_stream(stream: Path, wanted: Path, count: int) -> None:
     reader = open_stream(stream)
     assert reader.complete
     check(reader, json.loads(wanted.read_text())["frames"], count)
+
+
+def test_the_second_period_has_a_header_of_its_own() -> None:
+    reader = open_stream(PERIODS_STREAM, by_index=True)
+    assert [(one.number, one.first_frame) for one in reader.periods] == [(0, 0), (1, LATER)]
+    notes = [reader.header_of(frame).metadata["note"] for frame in (LATER - 1, LATER)]
+    assert notes == ["ä", "later"]
+    assert "covariance_mlp" in reader.header.dynamic - reader.header_of(LATER).dynamic
 
 
 def check(reader: StreamReader, frames: list[dict[str, Any]], count: int) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the golden streams of format version 2, one of each codec, and what a decoder must find in them.
+"""Makes the golden streams of format version 2, one of each codec and one of two periods, and what a decoder must find.
 
 With ``raw`` every number is a small multiple of a power of two; with ``compact`` it is the product of a whole number
 and a float32, which need not be one: exact in JSON and on any machine. Run from the repository's root, only when a new
@@ -31,11 +31,15 @@ from structgstream.similarity import Similarity
 FOLDER = Path(__file__).parent
 STREAM, EXPECTED, SUMS = (FOLDER / name for name in ("version-2.sgs", "version-2.json", "SHA256SUMS"))
 COMPACT_STREAM, COMPACT_EXPECTED = (FOLDER / f"version-2-compact.{suffix}" for suffix in ("sgs", "json"))
+PERIODS_STREAM, PERIODS_EXPECTED = (FOLDER / f"version-2-periods.{suffix}" for suffix in ("sgs", "json"))
 SEGMENTS = FOLDER / "segments-1"
 ANCHORS, K, FEATURES, HIDDEN = 3, 2, 2, 3
 KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.KEY)
 COMPACT_KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA)
 COMPACT_ANCHORS = 21
+PERIODS_KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA, PacketKind.KEY) * 2
+LATER = 4
+"""The first frame of the second period."""
 COMPACT_BIRTHS = (
     (0, 1, 5),
     (0, 1, 5, 2**32, 2**32 + 1),
@@ -187,6 +191,51 @@ def compact_header() -> StreamHeader:
     )
 
 
+def later_scene(frame: int) -> Scene:
+    """Of the second period: the scenes of the first with fewer anchors, a still F_Sigma, no environment, own births."""
+    state = state_of(compact_scene(frame - LATER))
+    rows = ("anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "anchor_features", "appearance")
+    state |= {name: state[name][9:] for name in rows}
+    state["covariance_mlp"] = state_of(compact_scene(0))["covariance_mlp"]
+    state["free_births"] = state["free_births"] + LATER * 2**32
+    del state["environment"]
+    return scene_of(state, distance_input=True)
+
+
+def later_header() -> StreamHeader:
+    """That of the second period, in which F_Sigma is not dynamic."""
+    state, dynamic = state_of(later_scene(LATER)), PAPER_DYNAMIC - {"covariance_mlp"}
+    return replace(
+        compact_header(),
+        dynamic=dynamic,
+        static={name: value for name, value in state.items() if name not in dynamic},
+        steps={name: step for name, step in COMPACT_STEPS.items() if name != "covariance_mlp"},
+        reference={name: state[name] for name in ("anchor_positions", "offset_scales")},
+        init_steps={name: step for name, step in COMPACT_INIT_STEPS.items() if name != "environment"},
+        metadata={"capture": "golden", "note": "later"},
+        periods=True,
+    )
+
+
+def periods_scenes() -> list[Scene]:
+    """Of both periods."""
+    return [compact_scene(i) if i < LATER else later_scene(i) for i in range(len(PERIODS_KINDS))]
+
+
+def periods_stream() -> bytes:
+    """That of two periods."""
+    headers, sink = (replace(compact_header(), periods=True), later_header()), MemorySink()
+    sink.open(headers[0])
+    encoder = SceneEncoder(headers[0])
+    for index, (scene, kind) in enumerate(zip(periods_scenes(), PERIODS_KINDS, strict=True)):
+        if index == LATER:
+            sink.begin(headers[1])
+            encoder = SceneEncoder(headers[1])
+        sink.write(encoder.encode(scene, index=index, pts_seconds=index / 4, kind=kind).packet)
+    sink.close()
+    return sink.data
+
+
 def streamed(header: StreamHeader, scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> bytes:
     """The whole stream as today's encoder writes it."""
     encoder, sink = SceneEncoder(header), MemorySink()
@@ -243,6 +292,8 @@ def main() -> None:
         EXPECTED: (json.dumps(told(raw, KINDS)) + "\n").encode(),
         COMPACT_STREAM: compact_stream(),
         COMPACT_EXPECTED: (json.dumps(told(compact, COMPACT_KINDS)) + "\n").encode(),
+        PERIODS_STREAM: periods_stream(),
+        PERIODS_EXPECTED: (json.dumps(told(periods_scenes(), PERIODS_KINDS)) + "\n").encode(),
     }
     for path, data in files.items():
         if not path.exists():

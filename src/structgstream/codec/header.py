@@ -51,6 +51,7 @@ def pack_header(header: StreamHeader) -> bytes:
         "metadata": header.metadata,
         **({"steps": dict(header.steps)} if header.steps else {}),
         **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
+        **({"periods": True} if header.periods else {}),
     }
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encode_fields(fields, header.init_steps) if header.codec == "compact" else {}
@@ -118,8 +119,9 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
     dynamic: frozenset[FieldName] = frozenset(description["dynamic"])
     x, y, z = (_number(value) for value in description["similarity"]["center"])
     plain = [description["config"], description["metadata"]]
-    if not all(isinstance(value, dict) for value in plain) or not isinstance(description["distance_input"], bool):
-        raise TypeError("config and metadata must be objects, distance_input true or false")
+    flags = [description["distance_input"], description.get("periods", False)]
+    if not all(isinstance(value, dict) for value in plain) or not all(isinstance(value, bool) for value in flags):
+        raise TypeError("config and metadata must be objects, distance_input and periods true or false")
     return StreamHeader(
         rig=CameraRig(cameras, frozenset(entry["name"] for entry in description["cameras"] if entry["held_out"])),
         similarity=Similarity((x, y, z), _positive(description["similarity"]["scale"])),
@@ -133,6 +135,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         steps=_steps(description.get("steps", {})),
         init_steps=_steps(description.get("init_steps", {})),
         reference={name: value for name, value in static.items() if name in dynamic},
+        periods=flags[1],
     )
 
 

@@ -34,6 +34,7 @@ class StreamHeader:
         reference: ``compact`` only: the dynamic fields of anchors and MLPs from which key packets are predicted.
         init_steps: ``compact`` only: quantization steps by field of ``static`` and ``reference``
             (``static_fields.py``), each a float32 number.
+        periods: whether other periods, with init records of their own, may follow.
     """
 
     rig: CameraRig
@@ -48,6 +49,7 @@ class StreamHeader:
     steps: Mapping[str, float] = field(default_factory=dict)
     reference: Mapping[FieldName, Tensor] = field(default_factory=dict)
     init_steps: Mapping[FieldName, float] = field(default_factory=dict)
+    periods: bool = False
 
     def camera(self, camera: Camera | str) -> Camera:
         """A camera in the normalised units of the decoded scenes; it shows the same picture.
@@ -91,6 +93,10 @@ class PacketSink(Protocol):
     """Receives a stream. ``write`` returns the number of bytes that the packet takes in the sink."""
 
     def open(self, header: StreamHeader) -> int: ...
+
+    def begin(self, header: StreamHeader) -> int:
+        """Begin another period with the next packet, a key packet; returns the bytes of its init record."""
+        ...
 
     def write(self, packet: Packet) -> int: ...
 

@@ -3,137 +3,36 @@
 
 Note [Nothing is kept]
 ~~~~~~~~~~~~~~~~~~~~~~
-Streams can be long, so a reader keeps only the header, eight bytes per packet and the scene rendered last. Everything
+Streams can be long, so a reader keeps only two headers, eight bytes per packet and the scene rendered last. Everything
 else is read on demand: the facts of a packet from the heads of its record and fields, a scene from its record, whose
 checksum is verified then. With the ``raw`` codec packets are independent, so random access costs one packet.
 """
 
-import math
-from abc import abstractmethod
-from array import array
-from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.codec.container.blocks import iterate_blocks
-from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes
-from structgstream.codec.container.damage import Damage, PacketSearch, next_index
-from structgstream.codec.container.index import read_index_offsets
-from structgstream.codec.container.init_record import field_sizes
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.payload import parse_packet
-from structgstream.codec.container.records import (
-    CHECKSUM,
-    PREFIX,
-    RECORD,
-    Record,
-    RecordType,
-    check_prefix,
-    incomplete_reason,
-    read_head,
-    read_record,
-    scan_records,
-)
+from structgstream.codec.container.byte_source import ByteSource, FileBytes
+from structgstream.codec.container.damage import Damage
+from structgstream.codec.container.index import read_index
+from structgstream.codec.container.periods import Period
+from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, incomplete_reason, read_record
+from structgstream.codec.contents import Scan, contents_by_index, first_run
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.frame_renderer import FrameRenderer
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.packet_table import PacketInfo, Packets
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.period_table import PeriodTable
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName
 from structgstream.scene.scene import Scene
 
-_KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
-
-
 NOTHING = -2  # index of the last decoded frame if there is none: no frame follows it
-LOST = 2**64 - 1
-"""Offset of a packet that is lost."""
-
-
-@dataclass(frozen=True)
-class PacketInfo:
-    """Facts of one packet: ``bytes`` is the length of its record, ``field_bytes`` that of each field's part."""
-
-    kind: PacketKind
-    index: int
-    pts_seconds: float
-    offset: int
-    bytes: int
-    field_bytes: Mapping[str, int]
-
-
-class PacketInfos(Sequence[PacketInfo]):
-    """Facts of packets, each found when it is asked for."""
-
-    @abstractmethod
-    def at(self, index: int) -> PacketInfo:
-        """Facts of the packet of a frame."""
-
-    @overload
-    def __getitem__(self, index: int) -> PacketInfo: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
-
-    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return self.at(range(len(self))[index])
-
-
-class Packets(PacketInfos):
-    """The packets of a stream in order, up to the first lost one. Only offsets are in memory; indexing reads the heads
-    of the packet's record and fields.
-
-    Attributes:
-        offsets: of all packets, including those after a lost one; :data:`LOST` for lost ones.
-        whole: number of packets before the first lost one.
-
-    Raises:
-        StreamError: on indexing a packet that was damaged after the stream was opened.
-    """
-
-    def __init__(self, data: ByteSource, name: str) -> None:
-        self._data = data
-        self._name = name
-        self.offsets: array[int] = array("Q")
-        self.whole = 0
-
-    def __len__(self) -> int:
-        return self.whole
-
-    def at(self, index: int) -> PacketInfo:
-        """Facts of the packet of a frame that is not lost."""
-        offset = self.offsets[index]
-        head = read_head(self._data, offset)
-        if head is None or head[0] not in _KINDS or head[1] < FRAME.size:
-            raise self.damaged(index)
-        start = offset + RECORD.size
-        payload = ByteSlice(self._data, start, start + head[1])
-        number, pts_seconds = FRAME.unpack(payload[: FRAME.size])
-        if number != index:
-            raise self.damaged(index)
-        try:
-            blocks = [*iterate_blocks(payload, FRAME.size, where=f"Packet {index}")]
-        except StreamError as error:
-            if read_record(self._data, offset) is None:  # The record was damaged after opening.
-                raise self.damaged(index) from error
-            raise
-        field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
-        size = RECORD.size + head[1] + CHECKSUM.size
-        return PacketInfo(_KINDS[RecordType(head[0])], index, pts_seconds, offset, size, field_bytes)
-
-    def damaged(self, index: int) -> StreamError:
-        """The error for a packet that was damaged after opening."""
-        return StreamError(f"Packet {index} of {self._name}, at byte {self.offsets[index]}, is damaged.")
 
 
 class StreamReader:
@@ -152,9 +51,10 @@ class StreamReader:
         gone: frames that are known not to be in ``data`` any more, in order; they count as lost.
 
     Attributes:
-        header: content of the init record.
-        header_bytes: offset of the first packet.
-        header_field_bytes: bytes of each field in the init record.
+        header: content of the first init record. What all periods share (cameras, similarity, frame rate, codec) holds
+            for the stream; :meth:`header_of` has the rest.
+        periods: where periods begin; at least one.
+        header_bytes: of prefix and init records.
         packets: every whole packet before the first lost one, in order.
         runs: the frames that can be decoded, as ranges of consecutive frames.
         damage: the damaged records that whole records follow, with the frames lost to each.
@@ -176,65 +76,59 @@ class StreamReader:
         check_prefix(data, name)
         self._data = data
         self._name = name
-        self._gone = {frames.start: frames for frames in gone}
+        self._gone = tuple(gone)
         self.total_bytes = len(data)
-        self.complete = False
         self.packets = Packets(data, name)
-        self.runs: list[range] = []
-        self.damage: list[Damage] = []
         init = read_record(data, PREFIX.size)
         if init is None:
             raise StreamError(f"No frame of {name} can be decoded: {incomplete_reason(data, PREFIX.size)}.")
         if init.type != RecordType.INIT:
             raise StreamError(f"{name} begins with a record of type {init.type}; an init record was expected.")
-        self.header = unpack_header(init.payload)
-        self.header_bytes = end = init.end
-        self.header_field_bytes = field_sizes(init.payload)
-        offsets = read_index_offsets(data, end) if by_index and not gone else None
-        if offsets is not None:
-            self.packets.offsets = offsets
-            self.packets.whole = len(offsets)
-            self.runs = [range(len(offsets))]
-            self.complete = True
+        self._table = PeriodTable(data, name, init)
+        index = read_index(data, init.end, period=init.period) if by_index and not gone else None
+        if index is not None:
+            contents = contents_by_index(index, self.packets, self._table, init.end)
         else:
-            end = self._scan(end)
-        self.cut_reason = None if self.complete else self._reason(end)
-        self._decoder = SceneDecoder(self.header)
+            contents = Scan(data, name, self.packets, self._table, gone=gone).contents(init.end)
+        self.runs: list[range] = [*contents.runs]
+        self.damage: list[Damage] = [*contents.damage]
+        self.complete = contents.complete
+        self.cut_reason = None if self.complete else self._reason(contents.end)
+        self._decoder: tuple[int, SceneDecoder] = 0, SceneDecoder(self.header)
         self._decoded = NOTHING
         self._renderer = FrameRenderer()
 
-    def _scan(self, end: int) -> int:
-        """Verify every record from byte ``end`` on; returns the end of the last whole one."""
-        search, seconds = PacketSearch(self._data), -math.inf
-        offsets = self.packets.offsets
-        found: list[tuple[int, int]] = []  # damaged records and the frames expected there
-        ended = False
-        while not ended:
-            for record in scan_records(self._data, end):
-                end = record.end
-                if ended := record.type == RecordType.INDEX:
-                    break
-                seconds = self._add(record, seconds)
-            following = None if ended else search.next(end, expected=len(offsets), after_seconds=seconds)
-            if following is None:
-                break
-            found.append((end, len(offsets)))
-            offsets.extend([LOST] * (next_index(following) - len(offsets)))
-            end = following.offset
-        self.complete = ended and not found
-        self.damage = [Damage(offset, range(frame, self._shown_from(frame))) for offset, frame in found]
-        lost = [*(damage.frames for damage in self.damage), *self._gone.values()]
-        self.packets.whole = min([frames.start for frames in lost if frames], default=len(offsets))
-        return end
+    @property
+    def header(self) -> StreamHeader:
+        """Content of the first init record."""
+        return self._table.first
 
-    def _run(self, index: int) -> int:
-        """Index of the first of :attr:`runs` that does not end before frame ``index``."""
-        return bisect_right(self.runs, index, key=lambda run: run.stop)
+    @property
+    def periods(self) -> Sequence[Period]:
+        """Where periods begin."""
+        return tuple(self._table.periods)
 
-    def _shown_from(self, index: int) -> int:
-        """The first frame from ``index`` on that can be decoded, or the number of frames."""
-        place = self._run(index)
-        return max(self.runs[place].start, index) if place < len(self.runs) else len(self.packets.offsets)
+    def header_of(self, index: int) -> StreamHeader:
+        """The header of the period that frame ``index`` belongs to.
+
+        Raises:
+            StreamError: its init record has been damaged.
+        """
+        return self._table.header(self._table.place(index))
+
+    def period(self, index: int) -> Period:
+        """The period that frame ``index`` belongs to."""
+        return self._table.periods[self._table.place(index)]
+
+    @property
+    def header_bytes(self) -> int:
+        """Bytes of prefix and init records."""
+        return PREFIX.size + sum(period.bytes for period in self._table.periods)
+
+    @property
+    def header_field_bytes(self) -> dict[str, int]:
+        """Bytes of each field in the first init record."""
+        return self._table.field_bytes(0)
 
     def _reason(self, end: int) -> str:
         """Why the stream, read up to byte ``end``, is not complete."""
@@ -243,38 +137,16 @@ class StreamReader:
         reason = f"the record at byte {self.damage[0].offset} of {self.total_bytes} is damaged"
         if len(self.damage) > 1:
             reason += f", and {len(self.damage) - 1} more"
-        lost = len(self.packets.offsets) - sum(map(len, self.runs))
+        frames = len(self.packets.offsets)
+        lost = frames - sum(map(len, self.runs))
         if not lost:
             return f"{reason}; no frame is lost"
         first = len(self.packets)
-        shown = self._shown_from(first)
-        again = (
-            f"frame {shown} can be shown again" if shown < len(self.packets.offsets) else "none after it can be shown"
-        )
-        return f"{reason}; {lost} of {len(self.packets.offsets)} frames are lost, the first is {first}, {again}"
-
-    def _add(self, record: Record, before_seconds: float) -> float:
-        """Record a packet's offset; returns its presentation time, or ``before_seconds`` for another record."""
-        if record.type == RecordType.INIT:
-            raise StreamError(f"{self._name} has a second init record, at byte {record.offset}.")
-        if record.type not in _KINDS:
-            return before_seconds
-        packet = parse_packet(record.payload, _KINDS[RecordType(record.type)])
-        offsets = self.packets.offsets
-        if (gone := self._gone.get(len(offsets))) is not None and packet.index == gone.stop:
-            offsets.extend([LOST] * len(gone))
-        if packet.index != len(offsets):
-            raise StreamError(f"{self._name} has packet {packet.index} where packet {len(offsets)} belongs.")
-        if packet.index == 0 and packet.kind is not PacketKind.KEY:
-            raise StreamError(f"{self._name} begins with a delta packet; the first must be a key packet.")
-        if packet.index and packet.pts_seconds <= before_seconds:
-            raise StreamError(f"In {self._name} the presentation time of packet {packet.index} does not increase.")
-        offsets.append(record.offset)
-        if self.runs and self.runs[-1].stop == packet.index:
-            self.runs[-1] = range(self.runs[-1].start, packet.index + 1)
-        elif packet.kind is PacketKind.KEY or self.header.codec == "raw":
-            self.runs.append(range(packet.index, packet.index + 1))
-        return packet.pts_seconds
+        place = first_run(self.runs, first)
+        again = "none after it can be shown"
+        if place < len(self.runs):
+            again = f"frame {max(self.runs[place].start, first)} can be shown again"
+        return f"{reason}; {lost} of {frames} frames are lost, the first is {first}, {again}"
 
     def __len__(self) -> int:
         return len(self.packets)
@@ -298,14 +170,15 @@ class StreamReader:
         Raises:
             StreamError: there is no such frame, or it has been damaged.
         """
-        place = self._run(index)
+        place = first_run(self.runs, index)
         if place == len(self.runs) or index not in self.runs[place]:
             raise self._missing(index)
         follows = index == self._decoded + 1
         self._decoded = NOTHING  # Until a packet has been decoded.
         scene: Scene | None = None
-        for packet in [self._packet(index)] if follows else self.group(index):
-            scene = self._decoder.decode(packet)
+        decoder = self._decoder_of(index)
+        for packet in [self.packets.packet(index)] if follows else self.group(index):
+            scene = decoder.decode(packet)
         assert scene is not None, "a group ends with its frame"
         self._decoded = index
         return scene
@@ -325,8 +198,15 @@ class StreamReader:
         """
         return self._renderer.picture(index, self.header.camera(camera), decode=self.scene, backend=backend)
 
+    def _decoder_of(self, index: int) -> SceneDecoder:
+        """The decoder of the period of a frame; a new one unless that is the period of the last decoded frame."""
+        place = self._table.place(index)
+        if self._decoder[0] != place:
+            self._decoder = place, SceneDecoder(self._table.header(place))
+        return self._decoder[1]
+
     def _missing(self, index: int) -> StreamError:
-        if any(index in frames for frames in self._gone.values()):
+        if any(index in frames for frames in self._gone):
             return StreamError(f"Frame {index} of {self._name} has left the window of frames that are kept.")
         for damage in self.damage:
             if index in damage.frames:
@@ -348,16 +228,7 @@ class StreamReader:
         while self.header.codec != "raw" and self.packets.at(first).kind is not PacketKind.KEY:
             first -= 1
         for number in range(first, index + 1):
-            yield self._packet(number)
-
-    def _packet(self, index: int) -> Packet:
-        record = read_record(self._data, self.packets.offsets[index])
-        if record is None or record.type not in _KINDS:
-            raise self.packets.damaged(index)
-        packet = parse_packet(record.payload, _KINDS[RecordType(record.type)])
-        if packet.index != index:
-            raise self.packets.damaged(index)
-        return packet
+            yield self.packets.packet(number)
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
         """Every frame from ``start`` on, one at a time, up to the first lost one."""

@@ -26,7 +26,8 @@ class _Writer:
     """Appends records to an unbuffered binary file and keeps the index.
 
     ``_end`` advances in one step, after a record is completely on the disk. An exception at any time, Ctrl-C included,
-    leaves at most extra bytes after ``_end``, which the next write or :meth:`finish` replaces.
+    leaves at most extra bytes after ``_end``, which the next write or :meth:`finish` replaces. What begins another
+    period is written together with its first packet, so that no file ends with it in an orderly way.
     """
 
     def __init__(self, file: BinaryIO, name: str, *, free: Callable[[], int | None] = lambda: None) -> None:
@@ -36,45 +37,64 @@ class _Writer:
         self._header_bytes = self._largest = 0
         self._end = 0
         self._entries = bytearray()  # packed INDEX_ENTRYs; those with an offset of _end or more were interrupted
+        self._period = 0
+        self._init = b""  # of the period that the next packet begins
         self._failed = False
 
     def continue_at(self, end: int, reader: StreamReader) -> None:
         """Continue after byte ``end`` of a file with the packets of ``reader``."""
-        entries = (INDEX_ENTRY.pack(info.index, _TYPES[info.kind], info.offset) for info in reader.packets)
-        self._entries = bytearray(b"".join(entries))
+        begun = {period.first_frame: period for period in reader.periods[1:]}
+        for info in reader.packets:
+            if (period := begun.get(info.index)) is not None:
+                self._entries += INDEX_ENTRY.pack(info.index, RecordType.INIT, period.offset)
+            self._entries += INDEX_ENTRY.pack(info.index, _TYPES[info.kind], info.offset)
+        self._period = reader.periods[-1].number
         self._end = end
-        self._header_bytes = reader.header_bytes
+        self._header_bytes = reader.periods[-1].bytes
         self._file.truncate(end)
 
     def open(self, header: StreamHeader) -> int:
-        self._header_bytes = self._append(prefix() + packed(RecordType.INIT, pack_header(header)))
+        data = prefix(periods=header.periods) + packed(RecordType.INIT, pack_header(header))
+        self._header_bytes = self._append(data)
         return self._header_bytes
 
+    def begin(self, header: StreamHeader) -> int:
+        self._init = packed(RecordType.INIT, pack_header(header), period=self._period + 1)
+        return len(self._init)
+
     def write(self, packet: Packet) -> int:
-        kind = _TYPES[packet.kind]
-        record = packed(kind, packet.payload)
+        assert packet.kind is PacketKind.KEY or not self._init, "a period begins with a key packet"
+        kind, period = _TYPES[packet.kind], self._period + bool(self._init)
+        record = packed(kind, packet.payload, period=period)
         self._largest = max(self._largest, len(record))
         check_room(
             self._free(),
             largest=self._largest,
-            closing=self._header_bytes + len(self._entries) + INDEX_ENTRY.size,
+            closing=max(self._header_bytes, len(self._init)) + len(self._entries) + 2 * INDEX_ENTRY.size,
             where=self._name,
-            frames=len(self._entries) // INDEX_ENTRY.size,
+            frames=self._frames(),
         )
-        self._entries += INDEX_ENTRY.pack(packet.index, kind, self._end)
-        return self._append(record)
+        if self._init:
+            self._entries += INDEX_ENTRY.pack(packet.index, RecordType.INIT, self._end)
+        self._entries += INDEX_ENTRY.pack(packet.index, kind, self._end + len(self._init))
+        self._append(self._init + record)
+        self._init, self._period = b"", period
+        return len(record)
 
     def finish(self) -> None:
         """Write index and footer and truncate the rest of an interrupted write; does nothing after a failed write."""
         if self._failed:
             return
-        self._append(pack_index(self._written().values(), self._end))
+        self._frames()
+        self._append(pack_index(INDEX_ENTRY.iter_unpack(self._entries), self._end))
         self._file.truncate(self._end)
 
-    def _written(self) -> dict[int, tuple[int, int, int]]:
-        """Offset to index entry of every whole packet; of an interrupted and repeated write the later entry."""
-        entries = INDEX_ENTRY.iter_unpack(self._entries)
-        return {offset: (index, kind, offset) for index, kind, offset in entries if offset < self._end}
+    def _frames(self) -> int:
+        """The number of whole packets; entries of an interrupted write are forgotten."""
+        size = INDEX_ENTRY.size
+        while self._entries and INDEX_ENTRY.unpack(self._entries[-size:])[2] >= self._end:
+            del self._entries[-size:]
+        return INDEX_ENTRY.unpack(self._entries[-size:])[0] + 1 if self._entries else 0
 
     def _append(self, data: bytes) -> int:
         try:
@@ -90,7 +110,7 @@ class _Writer:
                 self._file.truncate(self._end)
             raise StorageError(
                 f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). "
-                f"The {len(self._written())} frames "
+                f"The {self._frames()} frames "
                 "before are safe in it; make room and continue with --resume."
             ) from error
         self._end += len(data)
@@ -149,6 +169,15 @@ class FileSink:
             ) from error
         return self._writer.open(header)
 
+    def begin(self, header: StreamHeader) -> int:
+        """Begin another period with the next packet; its init record is written with that.
+
+        Raises:
+            StreamError: the header's description is too long.
+        """
+        assert self._writer is not None, "open() comes before begin()"
+        return self._writer.begin(header)
+
     def write(self, packet: Packet) -> int:
         """Append one packet; returns the bytes it took.
 
@@ -190,6 +219,10 @@ class MemorySink:
         size = self._writer.open(header)
         self._open = True
         return size
+
+    def begin(self, header: StreamHeader) -> int:
+        """Begin another period with the next packet."""
+        return self._writer.begin(header)
 
     def write(self, packet: Packet) -> int:
         """Append one packet; returns the bytes it took."""

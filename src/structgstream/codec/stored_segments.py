@@ -3,8 +3,10 @@
 
 from collections.abc import Iterator, Sequence
 
+from structgstream.codec.container.periods import Period, period_at
+from structgstream.codec.packet_table import LOST, PacketInfo, PacketInfos
 from structgstream.codec.packets import Packet, StreamHeader
-from structgstream.codec.reader import LOST, PacketInfo, PacketInfos, StreamReader
+from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import Store
@@ -39,6 +41,7 @@ class StoredSegments:
 
     def __init__(self, stored: StoredBytes, *, name: str) -> None:
         self._reader = StreamReader(stored, name=name, gone=stored.gone)
+        self._periods = stored.periods
         self.packets: Sequence[PacketInfo] = StoredPackets(stored, self._reader)
         self.complete = self._reader.complete
 
@@ -49,6 +52,14 @@ class StoredSegments:
 
     def __len__(self) -> int:
         return len(self.packets)
+
+    def header_of(self, index: int) -> StreamHeader:
+        """The header of the period of a frame, see :meth:`StreamReader.header_of`."""
+        return self._reader.header_of(index)
+
+    def period(self, index: int) -> Period:
+        """The period of a frame, also of one that has left the window."""
+        return self._periods[period_at(self._periods, index)]
 
     def group(self, index: int) -> Iterator[Packet]:
         """The packets needed to decode frame ``index``, see :meth:`StreamReader.group`."""

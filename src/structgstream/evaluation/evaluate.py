@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import PacketKind
-from structgstream.codec.reader import PacketInfo
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError

@@ -6,8 +6,8 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.reader import PacketInfo
 from structgstream.errors import BackendError
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene

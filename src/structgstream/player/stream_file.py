@@ -83,7 +83,7 @@ def check_has_header(data: ByteSource, name: str) -> None:
         raise StreamError(f"{name} is empty; expected a stream made by structgstream reconstruct.")
     check_prefix(data, name)
     head = read_head(data, PREFIX.size)
-    if head is None or head[0] != RecordType.INIT:
+    if head is None or head.type != RecordType.INIT:
         raise StreamError(f"No frame of {name} can be decoded: {incomplete_reason(data, PREFIX.size)}.")
 
 

@@ -26,6 +26,7 @@ from structgstream.training.solidity import SolidityConfig, depth_spread
 from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
+from structgstream.training.warm_start import warm_start
 
 _CONTRIBUTION_SCALE = 0.5  # Contributions are sums over many pixels, so half the resolution suffices.
 
@@ -198,9 +199,57 @@ def fit_first_frame(
         seed: of all random numbers.
         on_step: called after every iteration.
     """
-    generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
-    views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
+    generator = torch.Generator().manual_seed(seed)
     template = _seeded(points, cameras=len(rig.training), config=config, device=backend.device, generator=generator)
+    return _fit(frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step)
+
+
+def fit_first_frame_again(
+    frame: MultiViewFrame,
+    rig: CameraRig,
+    scene: Scene,
+    *,
+    iterations: int,
+    config: InitialConfig,
+    backend: Backend,
+    seed: int,
+    on_step: StepListener | None = None,
+) -> FitResult[Scene]:
+    """Reconstruct a frame as frame 0 is, from the scene of the frame before it (``training/warm_start.py``).
+
+    The iterations are the last ones of frame 0's schedule: learning rates, the growing of anchors and the scale of the
+    pictures are as they are there.
+
+    Args:
+        frame: the pictures; only those of ``rig.training`` are read.
+        rig: cameras in normalised units.
+        scene: of the frame before, decoded.
+        iterations: how many, at most those of ``config``.
+        config: of frame 0.
+        backend: the compute back-end.
+        seed: of all random numbers.
+        on_step: called after every iteration.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    template = warm_start(scene, cell=config.voxel_size * config.seed_voxels)
+    done = max(config.iterations - iterations, 0)
+    return _fit(frame, rig, template, config=config, backend=backend, generator=generator, done=done, on_step=on_step)
+
+
+def _fit(
+    frame: MultiViewFrame,
+    rig: CameraRig,
+    template: Scene,
+    *,
+    config: InitialConfig,
+    backend: Backend,
+    generator: torch.Generator,
+    done: int = 0,
+    on_step: StepListener | None = None,
+) -> FitResult[Scene]:
+    """Train ``template`` in the iterations of frame 0 after the first ``done``."""
+    watch = Stopwatch(backend.device)
+    views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
     parameters = Parameters.of(template, trained=_trained(config))
     adam = Adam(backend, parameters.values)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
@@ -210,11 +259,11 @@ def fit_first_frame(
     )
     samples = coarse_to_fine(
         views,
-        coarse_iterations=config.coarse_iterations,
+        coarse_iterations=max(config.coarse_iterations - done, 0),
         coarse_scale=config.coarse_scale,
         generator=generator,
     )
-    schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
+    schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
     iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     return FitResult(
         scene=detached(hooks.scene),

@@ -31,12 +31,14 @@ class Schedule(Generic[Name]):
         rates: gives the learning rate of every leaf in an iteration, counted from 1.
         before: steps of the frame in stages before this one, for progress.
         after: steps of the frame in stages after this one, for progress.
+        done: iterations that count as done: the first one is the one after them.
     """
 
     iterations: int
     rates: Callable[[int], Mapping[Name, float]]
     before: int = 0
     after: int = 0
+    done: int = 0
 
 
 class Hooks(ABC, Generic[SampleT, LossT]):
@@ -82,7 +84,7 @@ def optimize(
     """
     told_every = 1 if adam.backend.device.type == "cpu" else 10
     total = schedule.before + schedule.iterations + schedule.after
-    iteration = 0
+    iteration = schedule.done
     while iteration < schedule.iterations and not hooks.finished(iteration):
         iteration += 1
         sample = next(samples)
@@ -93,7 +95,7 @@ def optimize(
         hooks.after_step(iteration, sample, loss, screen_gradient)
         if on_step is not None and iteration % told_every == 0:
             on_step(Step(schedule.before + iteration, total, float(loss.total.detach()), *hooks.counts()))
-    return iteration
+    return iteration - schedule.done
 
 
 def gradients_of(

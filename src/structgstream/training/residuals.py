@@ -60,6 +60,22 @@ def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: 
     return residual(apply_camera_color(rendering.image, scene.camera_color, view.index), view.image, view.mask)
 
 
+def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> float:
+    """Mean over ``views`` of the mean absolute difference of ``scene`` to the picture, at ``scale`` of its size.
+
+    Masked pixels are left out; a view that is masked everywhere counts as 0.
+    """
+    scene = scene.with_folded_appearance()
+    sums = []
+    with torch.no_grad():
+        for view in views:
+            small = view.reduced(scale)
+            found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
+            pixels = found.numel() if small.mask is None else max(int(small.mask.sum()), 1)
+            sums.append(float(found.sum(dtype=torch.float64)) / pixels)
+    return sum(sums) / max(len(sums), 1)
+
+
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
     """Residuals of ``scene``, the decoded frame 0, at ``scale`` of the pictures' size."""
     scene = scene.with_folded_appearance()

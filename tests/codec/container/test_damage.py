@@ -10,7 +10,7 @@ import pytest
 
 from streams import compact_header, moved, same, small_scene, small_stream, write_stream
 from structgstream.codec.container import damage as damage_module
-from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, PacketSearch
+from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, PacketSearch, Standing
 from structgstream.codec.container.records import RECORD, RecordType, scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
@@ -164,7 +164,7 @@ def test_heads_across_pieces_of_a_search(monkeypatch: pytest.MonkeyPatch) -> Non
     data, _, offsets = whole()
     for size in (8, 9, 64, 1000):
         monkeypatch.setattr(damage_module, "_CHUNK_BYTES", size)
-        found = PacketSearch(data).next(offsets[1], expected=0, after_seconds=0.0)
+        found = PacketSearch(data).next(offsets[1], Standing(offsets[1], 0, 0.0))
         assert found is not None
         assert found.offset == offsets[2]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from streams import same, small_stream
-from structgstream.codec.container.index import FOOTER, FOOTER_MAGIC, INDEX_ENTRY, pack_index, read_index_offsets
+from structgstream.codec.container.index import FOOTER, FOOTER_MAGIC, INDEX_ENTRY, pack_index, read_index
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StreamError
@@ -52,9 +52,9 @@ def test_by_index_everything_is_the_same() -> None:
 
 def test_by_index_packets_are_not_read() -> None:
     data = Counted(STREAM)
-    offsets = read_index_offsets(data, START)
-    assert offsets is not None
-    assert [*offsets] == [offset for _, _, offset in ENTRIES]
+    index = read_index(data, START)
+    assert index is not None
+    assert [*index.offsets] == [offset for _, _, offset in ENTRIES]
     assert data.read < 200 < min(len(record.payload) for record in RECORDS[1:5])
 
 
@@ -62,7 +62,9 @@ def test_records_of_unknown_types_lie_between_packets() -> None:
     body = STREAM[: RECORDS[2].offset] + struct.pack("<BBHI", 77, 0, 0, 3) + b"abc" + b"crc?"
     moved = [*ENTRIES[:1], *((i, kind, offset + 15) for i, kind, offset in ENTRIES[1:])]
     data = with_index(body + STREAM[RECORDS[2].offset : RECORDS[5].offset], moved)
-    assert [*(read_index_offsets(data, START) or ())] == [offset for _, _, offset in moved]
+    index = read_index(data, START)
+    assert index is not None
+    assert [*index.offsets] == [offset for _, _, offset in moved]
 
 
 BODY = STREAM[: RECORDS[5].offset]
@@ -89,7 +91,7 @@ DISBELIEVED: dict[str, Callable[[], bytes]] = {
 @pytest.mark.parametrize("case", DISBELIEVED)
 def test_an_index_that_cannot_be_believed_is_not_used(case: str) -> None:
     data = DISBELIEVED[case]()
-    assert read_index_offsets(data, START) is None
+    assert read_index(data, START) is None
     by_index, scan = StreamReader(data, by_index=True), StreamReader(data)
     assert [*by_index.packets] == [*scan.packets]
     assert (by_index.complete, by_index.cut_reason) == (scan.complete, scan.cut_reason)
@@ -109,7 +111,7 @@ def test_an_index_that_cannot_be_believed_is_not_used(case: str) -> None:
 )
 def test_records_that_contradict_each_other_are_left_to_the_scan(records: list[bytes]) -> None:
     body = STREAM[:START] + b"".join(records)
-    assert read_index_offsets(with_index(body, []), START) is None
+    assert read_index(with_index(body, []), START) is None
     with pytest.raises(StreamError):
         StreamReader(with_index(body, []), by_index=True)
 

@@ -7,14 +7,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from structgstream.codec.container.byte_source import ByteSource
-from structgstream.codec.container.index import INDEX_ENTRY
+from structgstream.codec.container.index import INDEX_ENTRY, indexed_frames
+from structgstream.codec.container.init_record import LENGTH
 from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.records import CHECKSUM, RECORD, Record, RecordType, read_head, read_record
+from structgstream.codec.container.records import CHECKSUM, RECORD, Head, Record, RecordType, read_record
 
 LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
+_ZSTD = bytes.fromhex("28b52ffd")  # which an init record's description begins with
 _CHUNK_BYTES = 2**20
 _WORK = 4
-_HEAD = re.compile(rb"[\x02-\x04].\x00\x00", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -30,11 +31,25 @@ class Damage:
     frames: range
 
 
-def next_index(record: Record) -> int:
-    """A packet's frame number; for an index, the number of frames."""
-    if record.type == RecordType.INDEX:
-        return len(record.payload) // INDEX_ENTRY.size
-    return int(FRAME.unpack_from(record.payload)[0])
+@dataclass(frozen=True)
+class Standing:
+    """What is known of a stream where a record is not whole.
+
+    Args:
+        offset: where that record begins; of several in a row without a whole packet between them, where the first does.
+        frames: number of the next frame.
+        seconds: presentation time of the last frame.
+        period: number of the last whole init record.
+    """
+
+    offset: int
+    frames: int
+    seconds: float
+    period: int = 0
+
+    def last_frame_at(self, offset: int) -> int:
+        """The last frame that a packet at ``offset`` may be: frames before it take bytes, too."""
+        return self.frames + (offset - self.offset) // LEAST_PACKET_BYTES
 
 
 class PacketSearch:
@@ -48,46 +63,52 @@ class PacketSearch:
         self._data = data
         self._left = _WORK * len(data)
 
-    def next(self, damaged: int, *, expected: int, after_seconds: float) -> Record | None:
-        """The first whole packet or index after byte ``damaged``, where a record is not whole.
-
-        Args:
-            damaged: where that record begins.
-            expected: number of the next frame.
-            after_seconds: presentation time of the last frame.
-        """
-        for offset in self._heads(damaged + 1):
-            if not self._fits(offset, damaged, expected, after_seconds):
+    def next(self, damaged: int, standing: Standing) -> Record | None:
+        """The first whole packet, init record or index after byte ``damaged``, where a record is not whole."""
+        for offset, head in self._heads(damaged + 1, standing.period):
+            if not self._may_follow(head, offset, standing):
                 continue
-            head = read_head(self._data, offset)
-            assert head is not None, "it fits"
-            self._left -= head[1]
+            self._left -= head.length
             if self._left < 0:
                 return None
-            if (record := read_record(self._data, offset)) is not None:
+            record = read_record(self._data, offset)
+            if record is not None and _fits(record, standing):
                 return record
         return None
 
-    def _heads(self, start: int) -> Iterator[int]:
-        """Offsets from ``start`` on that may be the head of a packet or an index."""
+    def _heads(self, start: int, period: int) -> Iterator[tuple[int, Head]]:
+        """What may be heads of such records from ``start`` on, and where; all of each record is there."""
+        number = re.escape(period.to_bytes(2, "little"))
+        pattern = re.compile(rb"\x01|[\x02\x03].%b|\x04.\x00\x00" % number, re.DOTALL)
         while start + RECORD.size <= len(self._data):
             chunk = bytes(self._data[start : start + _CHUNK_BYTES])
             at = 0
-            while (match := _HEAD.search(chunk, at)) is not None:
-                at = match.start() + 1
-                yield start + match.start()
+            while (match := pattern.search(chunk, at)) is not None and match.start() + RECORD.size <= len(chunk):
+                offset, at = start + match.start(), match.start() + 1
+                kind, _, of, length = RECORD.unpack_from(chunk, match.start())
+                head = Head(kind, of, length)
+                if offset + head.bytes <= len(self._data):
+                    yield offset, head
             start += max(len(chunk) - RECORD.size + 1, 1)
 
-    def _fits(self, offset: int, damaged: int, expected: int, after_seconds: float) -> bool:
-        """Whether a record at ``offset`` is consistent with ``expected`` frames before the damage."""
-        if (head := read_head(self._data, offset)) is None:
-            return False
-        kind, length = head
-        last = expected + (offset - damaged) // LEAST_PACKET_BYTES
-        if kind == RecordType.INDEX:
-            return length % INDEX_ENTRY.size == 0 and expected <= length // INDEX_ENTRY.size <= last
-        if length < FRAME.size:
+    def _may_follow(self, head: Head, offset: int, standing: Standing) -> bool:
+        """Whether a record at ``offset`` is, by its head, consistent with what is known before the damage."""
+        last = standing.last_frame_at(offset)
+        if head.type == RecordType.INIT:
+            start = offset + RECORD.size + LENGTH.size
+            return head.period > standing.period and bytes(self._data[start : start + len(_ZSTD)]) == _ZSTD
+        if head.type == RecordType.INDEX:
+            entries = head.length // INDEX_ENTRY.size
+            return head.length % INDEX_ENTRY.size == 0 and standing.frames <= entries <= 2 * last
+        if head.length < FRAME.size:
             return False
         start = offset + RECORD.size
         index, pts_seconds = FRAME.unpack(self._data[start : start + FRAME.size])
-        return expected <= index <= last and math.isfinite(pts_seconds) and pts_seconds > after_seconds
+        return standing.frames <= index <= last and standing.seconds < pts_seconds < math.inf
+
+
+def _fits(record: Record, standing: Standing) -> bool:
+    """Whether an index lists as many frames as there may be; True for other records."""
+    if record.type != RecordType.INDEX:
+        return True
+    return standing.frames <= indexed_frames(record.payload) <= standing.last_frame_at(record.offset)

@@ -14,13 +14,16 @@ from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import StreamError
 
 MAGIC = b"\x89SGS\r\n\x1a\n"
-MAJOR, MINOR = 2, 0
+MAJOR = 2
+MINOR, MINOR_WITH_PERIODS = 0, 1
+"""Minor versions: of a stream of one period, and of one that may have several."""
 PREFIX = struct.Struct("<8sHH")
 RECORD = struct.Struct("<BBHI")
 CHECKSUM = struct.Struct("<I")
 FOOTER = struct.Struct("<Q8s")
 FOOTER_MAGIC = b"SGSINDEX"
 MAX_RECORD_BYTES = 2**32 - 1
+MAX_PERIODS = 2**16
 
 
 class RecordType(IntEnum):
@@ -33,12 +36,27 @@ class RecordType(IntEnum):
 
 
 @dataclass(frozen=True)
+class Head:
+    """The head of a record: its type, the number of its period, and the length of its payload."""
+
+    type: int
+    period: int
+    length: int
+
+    @property
+    def bytes(self) -> int:
+        """Length of the whole record."""
+        return RECORD.size + self.length + CHECKSUM.size
+
+
+@dataclass(frozen=True)
 class Record:
-    """One record: its type, its payload, and the offset of its first byte in the file."""
+    """One record: its type, its payload, the offset of its first byte in the file, and the number of its period."""
 
     type: int
     payload: bytes
     offset: int
+    period: int = 0
 
     @property
     def end(self) -> int:
@@ -46,20 +64,32 @@ class Record:
         return self.offset + RECORD.size + len(self.payload) + CHECKSUM.size
 
 
-def prefix() -> bytes:
-    """The first bytes of every file."""
-    return PREFIX.pack(MAGIC, MAJOR, MINOR)
+def prefix(*, periods: bool = False) -> bytes:
+    """The first bytes of a file, which may have several ``periods``."""
+    return PREFIX.pack(MAGIC, MAJOR, MINOR_WITH_PERIODS if periods else MINOR)
 
 
-def packed(kind: RecordType, payload: bytes) -> bytes:
+def may_be_prefix(data: bytes | memoryview) -> bool:
+    """Whether ``data`` is the beginning of some prefix, perhaps all of it."""
+    return any(prefix(periods=periods).startswith(bytes(data)) for periods in (False, True))
+
+
+def packed(kind: RecordType, payload: bytes, *, period: int = 0) -> bytes:
     """A record as bytes: header, payload, CRC-32 of both.
 
+    Args:
+        kind: its type.
+        payload: its content.
+        period: number of the period that an init record begins, or that a packet belongs to.
+
     Raises:
-        StreamError: the payload is longer than a record can hold.
+        StreamError: the payload is longer than a record can hold, or there are too many periods.
     """
+    if period >= MAX_PERIODS:
+        raise StreamError(f"A stream has at most {MAX_PERIODS} periods; begin another one.")
     if len(payload) > MAX_RECORD_BYTES:
         raise StreamError(f"A record of {len(payload)} bytes is too long; the format holds {MAX_RECORD_BYTES}.")
-    head = RECORD.pack(kind, 0, 0, len(payload))
+    head = RECORD.pack(kind, 0, period, len(payload))
     return head + payload + CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(head)))
 
 
@@ -83,12 +113,13 @@ def check_prefix(data: ByteSource, name: str) -> None:
         raise StreamError(f"{name} has format version {major}.{minor}; this program reads {MAJOR}.x. {advice}")
 
 
-def read_head(data: ByteSource, offset: int) -> tuple[int, int] | None:
-    """Type and payload length stated by the record at ``offset``; None if the data ends before them."""
+def read_head(data: ByteSource, offset: int) -> Head | None:
+    """The head of the record at ``offset``; None if the data ends before the end that it states."""
     if offset + RECORD.size + CHECKSUM.size > len(data):
         return None
-    kind, _, _, length = RECORD.unpack(data[offset : offset + RECORD.size])
-    return None if offset + RECORD.size + length + CHECKSUM.size > len(data) else (kind, length)
+    kind, _, period, length = RECORD.unpack(data[offset : offset + RECORD.size])
+    head = Head(kind, period, length)
+    return None if offset + head.bytes > len(data) else head
 
 
 def read_record(data: ByteSource, offset: int) -> Record | None:
@@ -96,12 +127,12 @@ def read_record(data: ByteSource, offset: int) -> Record | None:
     if (head := read_head(data, offset)) is None:
         return None
     start = offset + RECORD.size
-    end = start + head[1]
+    end = start + head.length
     payload = bytes(data[start:end])
     checksum = CHECKSUM.pack(zlib.crc32(payload, zlib.crc32(data[offset:start])))
     if bytes(data[end : end + CHECKSUM.size]) != checksum:
         return None
-    return Record(head[0], payload, offset)
+    return Record(head.type, payload, offset, head.period)
 
 
 def footer_offset(data: ByteSource) -> int | None:
@@ -116,7 +147,7 @@ def footer_offset(data: ByteSource) -> int | None:
     if magic != FOOTER_MAGIC or not PREFIX.size <= offset < at:
         return None
     head = read_head(data, offset)
-    if head is None or head[0] != RecordType.INDEX or offset + RECORD.size + head[1] + CHECKSUM.size != at:
+    if head is None or head.type != RecordType.INDEX or offset + head.bytes != at:
         return None
     return offset
 

@@ -12,7 +12,7 @@ from structgstream.errors import StreamError
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
 
 
-def part_of(record: bytes, *, period: int) -> PartEntry:
+def part_of(record: bytes) -> PartEntry:
     """The entry of a packet's record.
 
     Raises:
@@ -24,7 +24,7 @@ def part_of(record: bytes, *, period: int) -> PartEntry:
     frame, pts_seconds = FRAME.unpack_from(found.payload)
     sha256 = sha256_of(record)
     kind = _KINDS[RecordType(found.type)]
-    return PartEntry(part_name(frame, sha256), frame, period, kind, pts_seconds, len(record), sha256)
+    return PartEntry(part_name(frame, sha256), frame, found.period, kind, pts_seconds, len(record), sha256)
 
 
 def segment_of(parts: Sequence[PartEntry], data: bytes, *, segment: int) -> SegmentEntry:

@@ -4,10 +4,20 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from structgstream.codec.container.records import RecordType, packed, prefix
+from structgstream.codec.header import pack_header
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.segments.group import part_of, records_of, segment_of
 from structgstream.codec.segments.history import paged, verified
-from structgstream.codec.segments.manifest import Edge, Manifest, PartEntry, PeriodEntry, Window
+from structgstream.codec.segments.manifest import (
+    Edge,
+    Manifest,
+    PartEntry,
+    PeriodEntry,
+    Window,
+    init_name,
+    sha256_of,
+)
 from structgstream.codec.segments.store import Store
 
 
@@ -24,6 +34,17 @@ class Draft:
     manifest: Manifest
     records: tuple[bytes, ...] = ()
     files: tuple[tuple[str, bytes], ...] = ()
+
+
+def init_file(header: StreamHeader, number: int) -> bytes:
+    """The file of a period: prefix and init record."""
+    return prefix(periods=header.periods or number > 0) + packed(RecordType.INIT, pack_header(header), period=number)
+
+
+def period_entry(data: bytes, number: int, *, first_frame: int, first_segment: int) -> PeriodEntry:
+    """The entry of a period whose file is ``data``."""
+    sha256 = sha256_of(data)
+    return PeriodEntry(number, init_name(number, sha256), len(data), sha256, first_frame, first_segment)
 
 
 def empty_manifest(header: StreamHeader, period: PeriodEntry, *, sequence: int = 0) -> Manifest:
@@ -73,7 +94,7 @@ def reopened(draft: Draft, store: Store) -> Draft:
     manifest = draft.manifest
     *before, last = manifest.segments
     records = records_of(last, verified(store, last))
-    parts = tuple(part_of(record, period=last.period) for record in records)
+    parts = tuple(part_of(record) for record in records)
     files = tuple((part.file, record) for part, record in zip(parts, records, strict=True))
     return Draft(replace(manifest, segments=tuple(before), parts=parts), tuple(records), (*draft.files, *files))
 
@@ -83,6 +104,33 @@ def next_segment(manifest: Manifest) -> int:
     if manifest.segments:
         return manifest.segments[-1].segment + 1
     return manifest.history[-1].first_segment + manifest.history[-1].segments if manifest.history else 0
+
+
+def running_period(manifest: Manifest) -> PeriodEntry:
+    """The period of the newest frame; before the first frame, the first."""
+    frame = max(manifest.edge.frame, manifest.periods[0].first_frame)
+    return [period for period in manifest.periods if period.first_frame <= frame][-1]
+
+
+def without_empty_period(manifest: Manifest) -> Manifest:
+    """Without a period that no frame of the manifest belongs to: its first frame was never written."""
+    last = running_period(manifest)
+    return replace(manifest, periods=tuple(one for one in manifest.periods if one.period <= last.period))
+
+
+def with_period(draft: Draft, header: StreamHeader) -> Draft:
+    """With another period, which begins with the next frame; it is named before there is a frame of it.
+
+    So whoever goes on after a kill finds the init record of a frame that no manifest names, and players fetch it while
+    they show the frames before.
+    """
+    manifest = without_empty_period(draft.manifest)
+    number = manifest.periods[-1].period + 1
+    data = init_file(header, number)
+    segment = next_segment(manifest) + (1 if manifest.parts else 0)
+    entry = period_entry(data, number, first_frame=manifest.edge.frame + 1, first_segment=segment)
+    periods = (*manifest.periods, entry)
+    return replace(draft, manifest=replace(manifest, periods=periods), files=(*draft.files, (entry.file, data)))
 
 
 def periods_in(periods: Sequence[PeriodEntry], window: Window) -> tuple[PeriodEntry, ...]:

@@ -13,15 +13,18 @@ from structgstream.codec.header import unpack_header
 from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.group import part_of
 from structgstream.codec.segments.history import verified
-from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, PartEntry, PeriodEntry, sha256_of
+from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, PartEntry, sha256_of
 from structgstream.codec.segments.manifest_json import manifest_from_json
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
     next_segment,
+    period_entry,
     reopened,
+    running_period,
     with_frame,
     with_segment,
+    without_empty_period,
 )
 from structgstream.codec.segments.store import Store
 from structgstream.errors import StreamError
@@ -49,7 +52,7 @@ def find(store: Store) -> Draft | None:
             draft = reopened(draft, store)
         published = draft.manifest.edge.published_unix_seconds
         draft = with_frame(draft, part, record, Edge(part.frame, part.pts_seconds, None, published))
-    return None if draft.manifest.edge.frame < 0 else draft
+    return None if draft.manifest.edge.frame < 0 else replace(draft, manifest=without_empty_period(draft.manifest))
 
 
 def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
@@ -59,7 +62,7 @@ def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
     """
     first, listed = manifest.window.first_segment, min([entry.segment for entry in manifest.segments] or [0])
     listed = listed if manifest.segments else next_segment(manifest)
-    kept = manifest.periods[-1].first_segment
+    kept = running_period(manifest).first_segment
     named = {entry.file for entry in (*manifest.periods, *manifest.history, *manifest.parts)}
     named |= {one.file for one in manifest.segments if one.segment >= first or one.segment == kept} | {MANIFEST}
     stale = set()
@@ -121,14 +124,14 @@ def _unnamed(store: Store, there: frozenset[str]) -> Draft | None:
     inits = [match.string for match in found if match[1] == "init"]
     if len(inits) != 1:
         return None
-    data, sha256 = store.get(inits[0]), sha256_of(store.get(inits[0]))
-    if sha256[:16] not in inits[0]:
+    data = store.get(inits[0])
+    if sha256_of(data)[:16] not in inits[0]:
         return None
     check_prefix(data, f"{inits[0]} in {store.name}")
     record = read_record(data, PREFIX.size)
     if record is None or record.type != RecordType.INIT:
         return None
-    period = PeriodEntry(0, inits[0], len(data), sha256, first_frame=0, first_segment=0)
+    period = period_entry(data, 0, first_frame=0, first_segment=0)
     return Draft(empty_manifest(unpack_header(record.payload), period))
 
 
@@ -142,7 +145,8 @@ def _unnamed_part(store: Store, there: frozenset[str], manifest: Manifest) -> tu
         record = store.get(name)
         if sha256_of(record)[:16] != match[3]:
             continue
-        part = part_of(record, period=manifest.periods[-1].period)
-        if part.frame == frame and (frame == 0 or part.pts_seconds > manifest.edge.pts_seconds):
+        part = part_of(record)
+        later = frame == 0 or part.pts_seconds > manifest.edge.pts_seconds
+        if part.frame == frame and later and part.period == manifest.periods[-1].period:
             return part, record
     return None

@@ -15,8 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from structgstream.codec.container.disk_room import check_room
-from structgstream.codec.container.records import RecordType, packed, prefix
-from structgstream.codec.header import pack_header
+from structgstream.codec.container.records import RecordType, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.segments.group import part_of
 from structgstream.codec.segments.history import segments_from
@@ -27,17 +26,20 @@ from structgstream.codec.segments.manifest import (
     PeriodEntry,
     SegmentEntry,
     Window,
-    init_name,
-    sha256_of,
 )
 from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
+    init_file,
+    period_entry,
     periods_in,
     reopened,
+    running_period,
     with_frame,
+    with_period,
     with_segment,
+    without_empty_period,
 )
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import Store
@@ -108,6 +110,8 @@ class SegmentsSink:
         self._found = found
         self._draft: Draft | None = None
         self._present: list[SegmentEntry] = []  # segments in the window, if there is one
+        self._kept: list[SegmentEntry] = []  # those that have left it and are needed to resume
+        self._named: tuple[PeriodEntry, ...] = ()  # the last manifest's periods
         self._leaving: dict[str, float] = {}  # files that no manifest names, and since when; oldest first
         self._published: deque[float] = deque(maxlen=_RECENT_FRAMES + 1)
         self._header_bytes = self._largest = 0
@@ -128,13 +132,25 @@ class SegmentsSink:
                 "another name."
             )
         sequence = self._remove(there)
-        data = prefix() + packed(RecordType.INIT, pack_header(header))
-        sha256 = sha256_of(data)
-        period = PeriodEntry(0, init_name(0, sha256), len(data), sha256, first_frame=0, first_segment=0)
+        data = init_file(header, 0)
+        period = period_entry(data, 0, first_frame=0, first_segment=0)
         self._put([(period.file, data)])
         self._header_bytes = len(data)
         self._draft = Draft(empty_manifest(header, period, sequence=sequence))
         return len(data)
+
+    def begin(self, header: StreamHeader) -> int:
+        """Begin another period with the next packet; its init record is written and named at once.
+
+        Raises:
+            StorageError: it cannot be written; earlier packets stay.
+        """
+        draft = with_period(self._opened(), header)
+        size = draft.manifest.periods[-1].bytes
+        self._header_bytes = max(self._header_bytes, size)
+        self._check_room(draft, self._largest)
+        self._publish(draft, [])
+        return size
 
     def write(self, packet: Packet) -> int:
         """Write one packet; returns the bytes of its record.
@@ -144,9 +160,12 @@ class SegmentsSink:
         """
         draft = self._opened()
         assert packet.index == draft.manifest.edge.frame + 1, "frames have no gaps"
-        record = packed(_TYPES[packet.kind], packet.payload)
+        period = draft.manifest.periods[-1]
+        begins = packet.index == period.first_frame
+        assert packet.kind is PacketKind.KEY or not begins, "a period begins with a key packet"
+        record = packed(_TYPES[packet.kind], packet.payload, period=period.period)
         self._check_room(draft, len(record))
-        part = part_of(record, period=draft.manifest.periods[-1].period)
+        part = part_of(record)
         self._put([(part.file, record)])
         leaving: list[str] = []
         if packet.kind is PacketKind.KEY:
@@ -172,7 +191,8 @@ class SegmentsSink:
             return
         leaving = [part.file for part in draft.manifest.parts]
         draft = with_segment(draft)
-        self._publish(replace(draft, manifest=replace(draft.manifest, live=False)), leaving)
+        manifest = without_empty_period(draft.manifest)
+        self._publish(replace(draft, manifest=replace(manifest, live=False)), leaving)
         self._draft = None
 
     def _opened(self) -> Draft:
@@ -186,8 +206,12 @@ class SegmentsSink:
         self._largest = max(map(len, found.records), default=0)
         self._put(found.files)
         if self._options.window_seconds is not None:
-            first = manifest.window.first_segment
-            self._present = [*segments_from(self._store, manifest.history, manifest.segments, first=first)]
+            first, needed = manifest.window.first_segment, running_period(manifest).first_segment
+            found_from = min(first, needed)
+            there_are = segments_from(self._store, manifest.history, manifest.segments, first=found_from)
+            entries = [entry for entry in there_are if entry.segment >= first or entry.segment == needed]
+            self._present = [entry for entry in entries if entry.segment >= first]
+            self._kept = [entry for entry in entries if entry.segment < first]
         now = self._clocks.elapsed()
         self._leaving = dict.fromkeys(sorted(stale_files(manifest, there)), now)
         self._publish(replace(found, manifest=replace(manifest, live=True)), [])
@@ -216,8 +240,12 @@ class SegmentsSink:
         self._put([(MANIFEST, manifest_to_json(manifest))])
         self._draft = Draft(manifest, draft.records)
         self._present = present[gone:]
-        kept = manifest.periods[-1].first_segment  # Its first frame is needed to resume.
-        self._forget([*leaving, *(entry.file for entry in present[:gone] if entry.segment != kept)])
+        needed = running_period(manifest).first_segment  # Its first frame is needed to resume.
+        left = [*self._kept, *present[:gone]]
+        self._kept = [entry for entry in left if entry.segment == needed]
+        ended = {period.file for period in self._named} - {period.file for period in manifest.periods}
+        self._named = manifest.periods
+        self._forget([*leaving, *sorted(ended), *(entry.file for entry in left if entry.segment != needed)])
 
     def _present_with(self, manifest: Manifest) -> list[SegmentEntry]:
         """The segments that are there, if there is a window, as of this manifest."""

@@ -4,11 +4,12 @@
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from structgstream.codec.container.index import pack_index
-from structgstream.codec.container.records import RecordType
+from structgstream.codec.container.periods import Period
+from structgstream.codec.container.records import PREFIX, RecordType
 from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.history import segments_from, verified
 from structgstream.codec.segments.manifest import MANIFEST, Manifest, PartEntry, SegmentEntry, StoredFile
@@ -21,10 +22,11 @@ _KEPT_FILES = 2
 
 @dataclass(frozen=True)
 class _Piece:
-    """A file, or an own sequence of bytes, and where it begins."""
+    """A file without its first ``skipped`` bytes, or an own sequence of bytes, and where it begins."""
 
     start: int
     content: StoredFile | bytes
+    skipped: int = 0
 
 
 class StoredBytes:
@@ -43,6 +45,7 @@ class StoredBytes:
         gone: frames that are no longer there, in order.
         sizes: of every frame from 0 on, in bytes, gone ones included.
         kinds: of every frame.
+        periods: those of all frames; of one that is no longer there, offset and length are 0.
 
     Raises:
         StreamError: a file is missing or not what the manifest states; also on slicing.
@@ -60,7 +63,9 @@ class StoredBytes:
         self.gone: list[range] = []
         self.sizes: list[int] = []
         self.kinds: list[PacketKind] = []
-        self._add(manifest.periods[0])
+        self.periods: list[Period] = []
+        self._periods = {period.period: period for period in manifest.periods}
+        self._period: int | None = None  # whose init record has been added
         entries: list[tuple[int, int, int]] = []
         there = store.names() | self._held.keys()
         for entry in self._listed(manifest):
@@ -78,7 +83,7 @@ class StoredBytes:
         while len(found) < stop - start:
             piece = self._pieces[place]
             at = start + len(found) - piece.start
-            found += self._content(piece.content)[at : stop - piece.start]
+            found += self._content(piece)[at : stop - piece.start]
             place += 1
         return bytes(found)
 
@@ -95,15 +100,30 @@ class StoredBytes:
     def files(self) -> Iterator[bytes]:
         """The contents of all files in order, each read once."""
         for piece in self._pieces:
-            yield self._content(piece.content)
+            yield self._content(piece)
 
     def _listed(self, manifest: Manifest) -> Iterator[SegmentEntry | PartEntry]:
         yield from segments_from(self._store, manifest.history, manifest.segments, held=self._held)
         yield from manifest.parts
 
-    def _add(self, content: StoredFile | bytes) -> None:
-        self._pieces.append(_Piece(self._size, content))
-        self._size += len(content) if isinstance(content, bytes) else content.bytes
+    def _add(self, content: StoredFile | bytes, *, skipped: int = 0) -> None:
+        self._pieces.append(_Piece(self._size, content, skipped))
+        self._size += (len(content) if isinstance(content, bytes) else content.bytes) - skipped
+
+    def _add_period(self, number: int, frame: int, entries: list[tuple[int, int, int]]) -> None:
+        """Add the init record of a period, whose first frame that is there follows, if it is another than before."""
+        if number == self._period:
+            return
+        if number not in self._periods:
+            raise StreamError(f"{self._store.name} has frame {frame}, and no init record of its period {number}.")
+        first = self._period is None
+        self._period = number
+        if not first:
+            entries.append((frame, RecordType.INIT, self._size))
+        # Every file of a period begins with a prefix, and a stream has one.
+        offset, size = self._size + (PREFIX.size if first else 0), self._periods[number].bytes - PREFIX.size
+        self.periods[-1] = replace(self.periods[-1], offset=offset, bytes=size)
+        self._add(self._periods[number], skipped=0 if first else PREFIX.size)
 
     def _add_frames(
         self,
@@ -118,6 +138,8 @@ class StoredBytes:
         else:
             first, sizes = entry.first_frame, entry.frame_bytes
             kinds = [PacketKind.KEY, *[PacketKind.DELTA] * (entry.frames - 1)]
+        if not self.periods or self.periods[-1].number != entry.period:
+            self.periods.append(Period(entry.period, first, 0, 0))
         self.sizes += sizes
         self.kinds += kinds
         if entry.file not in there:
@@ -126,15 +148,20 @@ class StoredBytes:
             last = self.gone.pop() if self.gone and self.gone[-1].stop == first else range(first, first)
             self.gone.append(range(last.start, first + len(sizes)))
             return
+        self._add_period(entry.period, first, entries)
         offset = self._size
         for index, (size, kind) in enumerate(zip(sizes, kinds, strict=True), start=first):
             entries.append((index, RecordType.KEY if kind is PacketKind.KEY else RecordType.DELTA, offset))
             offset += size
         self._add(entry)
 
-    def _content(self, content: StoredFile | bytes) -> bytes:
+    def _content(self, piece: _Piece) -> bytes:
+        content = piece.content
         if isinstance(content, bytes):
             return content
+        return self._file(content)[piece.skipped :]
+
+    def _file(self, content: StoredFile) -> bytes:
         name = content.file
         if name not in self._cache:
             data = self._held[name] if name in self._held else self._read(content)

@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.codec.container.byte_source import ByteSource
+from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import (
     PREFIX,
     RecordType,
@@ -33,8 +34,8 @@ from structgstream.codec.container.records import (
 )
 from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import pack_header, unpack_header
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.reader import PacketInfo
 from structgstream.errors import StorageError, StreamError
 from structgstream.pipeline import State
 from structgstream_studies.peers.method import Arrays, PeerMethod
@@ -179,6 +180,14 @@ class PeerReader(Generic[State]):
         """
         return arrays_of(self.packet(index), where=f"Frame {index} of {self._name}")
 
+    def header_of(self, index: int) -> StreamHeader:
+        """The header, which holds for all frames."""
+        return self.header
+
+    def period(self, index: int) -> Period:
+        """The only period."""
+        return Period(0, 0, PREFIX.size, self.header_bytes - PREFIX.size)
+
     def group(self, index: int) -> Iterator[Packet]:
         """The packets needed to decode frame ``index``, from the key packet to its own."""
         keys = [info.index for info in self.packets[: index + 1] if info.kind is PacketKind.KEY]
@@ -252,6 +261,14 @@ class PeerSink:
         self._count, self._end = len(self._resumed), self._resumed.end
         self._file.truncate(self._end)
         return 0
+
+    def begin(self, header: StreamHeader) -> int:
+        """Not possible: a peer's file has one header.
+
+        Raises:
+            StorageError: always.
+        """
+        raise StorageError(f"{self._path} is a peer's file, which has one header; a new period needs a stream file.")
 
     def write(self, packet: Packet) -> int:
         """Append one frame; returns the bytes that it takes.
