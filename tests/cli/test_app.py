@@ -76,6 +76,37 @@ def test_exhausted_memory_is_one_sentence(command, error: MemoryError, capsys: p
     assert "--scale" in text
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            PermissionError(13, "Permission denied", "room/cam05"),
+            "no permission for room/cam05; change its",
+        ),
+        (
+            OSError(28, "No space left on device", "out.sgs"),
+            "the disk of out.sgs is full (No space left on device)",
+        ),
+        (OSError(28, "No space left on device"), "the disk is full (No space left on device); make room"),
+        (
+            OSError(5, "Input/output error", "x"),
+            "unexpected error, OSError: [Errno 5] Input/output error: 'x'.",
+        ),
+        (PermissionError("a message"), "unexpected error, PermissionError: a message."),
+    ],
+)
+def test_what_the_system_refuses_is_told(
+    command, error: OSError, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command(raising(error))
+    assert main(["demo"]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith(f"structgstream: {said}")
+    assert told.count("\n") == 1
+    assert main(["demo", "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
 def test_a_bug_says_that_it_is_one(command, capsys: pytest.CaptureFixture[str]) -> None:
     command(raising(IndexError("7")))
     assert main(["inspect"]) == 1

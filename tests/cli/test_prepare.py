@@ -2,13 +2,17 @@
 """The command prepare, as a user types it."""
 
 import json
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from quick_streams import error_of
 from rooms import write_room
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
+from structgstream.preparation.claiming import alone, claim
 from structgstream.preparation.options import Distance, PrepareOptions
 
 
@@ -61,3 +65,59 @@ def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             size=(64, 48), held_out=("a", "b"), fps=25, without=("c",), link="copy",
         )
     ]  # fmt: skip
+
+
+def hidden(path: Path) -> None:
+    path.chmod(0)
+
+
+def read_only(path: Path) -> None:
+    path.chmod(0o555)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read and write everything")
+@pytest.mark.parametrize(
+    ("place", "change", "said"),
+    [
+        ("videos/cam02.mp4", hidden, "The video {place} cannot be opened (Permission denied); let yourself read it."),
+        (
+            "videos/cameras.json",
+            hidden,
+            "{place} cannot be read (Permission denied); expected width, height and cameras",
+        ),
+        ("videos", hidden, "no permission for {place}; change its permissions"),
+        ("videos/masks", hidden, "no permission for {place}; change its permissions"),
+        ("out", hidden, "no permission for {place}"),
+        ("out", read_only, "The folder {place} cannot be written (Permission denied)."),
+        ("out/work", read_only, "The folder {folder}/out cannot be written (Permission denied)."),
+    ],
+)
+def test_what_may_not_be_read_or_written(
+    tmp_path: Path, place: str, change: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One sentence that names it, and nothing of the input is changed."""
+    write_room(tmp_path / "videos")
+    for folder in ("videos/masks", "out"):
+        (tmp_path / folder).mkdir()
+    if place == "out/work":
+        claim(tmp_path / "out", tmp_path / "videos")
+    before = {path: path.read_bytes() for path in (tmp_path / "videos").iterdir() if path.is_file()}
+    path = tmp_path / place
+    mode = path.stat().st_mode
+    change(path)
+    try:
+        command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
+        error = error_of(command, capsys, status=1)
+    finally:
+        path.chmod(mode)
+    assert error.removeprefix("structgstream: ").startswith(said.format(place=path, folder=tmp_path))
+    assert error.count("\n") == 1
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_room(tmp_path / "videos")
+    command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
+    claim(tmp_path / "out", tmp_path / "videos")
+    with alone(tmp_path / "out"):
+        assert f"Another process prepares {tmp_path / 'out'} now; wait" in error_of(command, capsys, status=1)

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table
+from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 from structgstream.cli.tables import SHOWN_FRAMES
 from structgstream.evaluation.byte_count import Row
 
@@ -27,12 +27,14 @@ HEADER: dict[str, Any] = {
     "damage": [],
     "complete": True,
     "cut_reason": None,
+    "period": 0,
+    "periods": [{}],
 }
 
 
 def rows(count: int, *, bytes: int = 100) -> list[Row]:
     sizes = {"free": bytes - 10}
-    return [Row(i, "delta" if i else "key", i / 25, 1000 + i * bytes, bytes, sizes) for i in range(count)]
+    return [Row(i, "delta" if i else "key", i / 25, 1000 + i * bytes, bytes, sizes, first=i == 0) for i in range(count)]
 
 
 def shown(table: Table) -> list[str]:
@@ -97,3 +99,18 @@ def test_large_packets_are_told_in_kilobytes() -> None:
     large = shown(packet_table(rows(2, bytes=250_000), every=True))
     assert "packets, kB" in large[0]
     assert any(line.startswith("1 delta 250.0") for line in large)
+
+
+def test_periods_have_a_row_each_where_there_are_several() -> None:
+    fields = {"anchor_positions": {"bytes": 9, "shape": [4321, 3]}}
+    one = {"period": 0, "first_frame": 0, "frames": 8, "seconds": 0.32, "header_bytes": 1200, "packet_bytes": 500}
+    first = one | {"begins": None, "fields": fields}
+    later = one | {"period": 1, "first_frame": 8, "begins": "residual 1.71 times the first frame's", "fields": {}}
+    assert period_table([first]) is None
+    table = period_table([first, later])
+    assert table is not None
+    lines = shown(table)
+    assert "0 0 8 0.32 4,321 1.2 kB 500 B -" in lines
+    assert "1 8 8 0.32 - 1.2 kB 500 B residual 1.71 times the first frame's" in lines
+    header = HEADER | {"periods": [first, later]}
+    assert "size 5.0 kB, 2 headers 1.0 kB" in shown(facts_table(header, rows(2), packets=[]))

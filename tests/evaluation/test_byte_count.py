@@ -58,7 +58,10 @@ def test_a_first_packet_without_news_is_no_part() -> None:
 
 def test_means_by_kind_leave_the_first_packet_apart() -> None:
     sizes = [("key", 1), ("delta", 10), ("delta", 20), ("key", 300), ("delta", 60)]
-    rows = [Row(i, kind, i / 30, 0, size + 24, {"free": size, REST: 24}) for i, (kind, size) in enumerate(sizes)]
+    rows = [
+        Row(i, kind, i / 30, 0, size + 24, {"free": size, REST: 24}, first=i == 0)
+        for i, (kind, size) in enumerate(sizes)
+    ]
     rows[2] = replace(rows[2], bytes=64, sizes={"free": 20, "appearance": 20, REST: 24})
     groups = groups_of(rows)
     assert {name: (group.count, group.bytes) for name, group in groups.items()} == {

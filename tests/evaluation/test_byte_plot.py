@@ -22,7 +22,7 @@ def packets(count: int, *, key_times: float = 2.0) -> list[Row]:
     for i in range(count):
         size = round(10_000 * (key_times if i % 5 == 0 else 1.0))
         sizes = {"anchor_positions": size, "free": size // 2, "free_births": 20, REST: 24}
-        rows.append(Row(i, "delta" if i % 5 else "key", i / 30, 0, sum(sizes.values()), sizes))
+        rows.append(Row(i, "delta" if i % 5 else "key", i / 30, 0, sum(sizes.values()), sizes, first=i == 0))
     return rows
 
 

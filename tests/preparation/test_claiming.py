@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Whose folder a capture is, and who works on it."""
+
+import errno
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from structgstream.errors import CaptureError, StorageError
-from structgstream.preparation.claiming import SOURCE, claim
+from structgstream.preparation.claiming import LOCK, SOURCE, alone, claim
 from structgstream.preparation.steps import FOLDER
 
 
@@ -66,3 +71,54 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, videos: Path) -> N
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
         claim(tmp_path / "file" / "capture", videos)
+
+
+def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
+    tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Path, text: str) -> int:
+        self.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
+            claim(tmp_path / "capture", videos)
+    claim(tmp_path / "capture", videos)
+
+
+def test_one_process_at_a_time(tmp_path: Path, videos: Path) -> None:
+    claim(tmp_path / "capture", videos)
+    claim(tmp_path / "other", videos)
+    with alone(tmp_path / "capture"), alone(tmp_path / "other"):
+        with pytest.raises(StorageError, match="Another process prepares .*capture now; wait for its end"):
+            alone(tmp_path / "capture").__enter__()
+        code = "import sys, pathlib; from structgstream.preparation.claiming import alone\n"
+        code += "with alone(pathlib.Path(sys.argv[1])): pass"
+        command = [sys.executable, "-c", code, str(tmp_path / "capture")]
+        assert "Another process prepares" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    with alone(tmp_path / "capture"):
+        pass
+
+
+def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None:
+    claim(tmp_path / "capture", videos)
+    with pytest.raises(KeyError), alone(tmp_path / "capture"):
+        raise KeyError
+    with alone(tmp_path / "capture"):
+        assert (tmp_path / "capture" / FOLDER / LOCK).exists()
+
+
+def test_a_file_system_without_locks_has_none(tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(file: object, how: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    claim(tmp_path / "capture", videos)
+    monkeypatch.setattr("fcntl.flock", unknown)
+    with alone(tmp_path / "capture"), alone(tmp_path / "capture"):
+        pass
+
+
+def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot be written"):
+        alone(tmp_path / "capture").__enter__()

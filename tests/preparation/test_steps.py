@@ -46,12 +46,21 @@ def test_a_change_does_what_depends_on_it_again(tmp_path: Path) -> None:
     assert done == ["a", "b", "c", "a", "b"]
 
 
+def flip(file: Path) -> None:
+    """Another bit in what is stored."""
+    data = bytearray(file.read_bytes())
+    data[60] ^= 1
+    file.write_bytes(data)
+
+
 @pytest.mark.parametrize(
     "damage",
     [
         lambda folder: (folder / "a.json").write_text("{"),
         lambda folder: (folder / "a.npz").write_bytes(b"PK"),
         lambda folder: (folder / "a.npz").unlink(),
+        lambda folder: (folder / "a.npz").write_bytes((folder / "a.npz").read_bytes()[:-30]),
+        lambda folder: flip(folder / "a.npz"),
         lambda folder: (folder / "a.json").unlink(),
     ],
 )

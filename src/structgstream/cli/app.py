@@ -5,6 +5,7 @@ Only the standard library is imported here, so that ``structgstream --help`` is 
 """
 
 import difflib
+import errno
 import importlib
 import os
 import sys
@@ -97,6 +98,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         _say(f"structgstream: {error}")
         return PROBLEM
+    except OSError as error:
+        if debug:
+            traceback.print_exc()
+        _say(f"structgstream: {_trouble_with_files(error)}")
+        return PROBLEM
     except MemoryError as error:
         if debug:
             traceback.print_exc()
@@ -106,12 +112,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        _say(
-            f"structgstream: unexpected error, {type(error).__name__}: {error}. "
-            "Run the command again with --debug and report the output."
-        )
+        _say(f"structgstream: {_unexpected(error)}")
         return PROBLEM
     return DONE
+
+
+def _unexpected(error: Exception) -> str:
+    return (
+        f"unexpected error, {type(error).__name__}: {error}. Run the command again with --debug and report the output."
+    )
+
+
+def _trouble_with_files(error: OSError) -> str:
+    """What the system refuses anywhere: a folder that may not be entered, a disk without room."""
+    if isinstance(error, PermissionError) and error.filename is not None:
+        return f"no permission for {error.filename}; change its permissions or its owner, or use another place."
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = "" if error.filename is None else f" of {error.filename}"
+        return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
+    return _unexpected(error)
 
 
 def overview() -> str:

@@ -12,13 +12,15 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import JsonPath, StreamFile, parse_options
-from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table
+from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
     from structgstream.evaluation.byte_count import Row
 
 CHANGES = ("grown", "removed", "spawned", "pruned")
+MOST_PERIODS = 3
+"""Tables of the fields of headers are printed for so many periods; ``--json`` has all."""
 PICTURES = (".png", ".svg", ".pdf")
 
 
@@ -68,9 +70,12 @@ def main(arguments: list[str]) -> None:
     packets = packet_table(rows, every=options.all_packets)
     for part in (
         facts_table(content["header"], rows, packets=content["packets"]),
-        header_table(content["header"]),
+        period_table(content["header"]["periods"]),
+        *(header_table(period) for period in content["header"]["periods"][:MOST_PERIODS]),
         packets,
     ):
+        if part is None:
+            continue
         console.print(part)
         console.print()
     if plot is not None:
@@ -116,11 +121,7 @@ def describe_stream(
         }
         for name, camera in header.rig.cameras.items()
     }
-    fields = {
-        name: {"shape": list(tensor.shape), "bytes": reader.header_field_bytes[name]}
-        for part in (header.static, header.reference)
-        for name, tensor in part.items()
-    }
+    periods = [describe_period(reader, place, rows, log=log) for place in range(len(reader.periods))]
     packets = [
         {
             "kind": row.kind,
@@ -145,14 +146,41 @@ def describe_stream(
                 {"offset": one.offset, "first": one.frames.start, "end": one.frames.stop} for one in reader.damage
             ],
             "header_bytes": reader.header_bytes,
+            "periods": periods,
             "total_bytes": reader.total_bytes,
             "similarity": {"center": list(header.similarity.center), "scale": header.similarity.scale},
             "dynamic": sorted(header.dynamic),
-            "fields": fields,
+            "fields": periods[0]["fields"],
             "distance_input": header.distance_input,
             "cameras": cameras,
             "config": dict(header.config),
             "metadata": dict(header.metadata),
         },
         "packets": packets,
+    }
+
+
+def describe_period(
+    reader: "StreamReader", place: int, rows: "Sequence[Row]", *, log: Mapping[int, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """A period as plain values: its frames, its header's fields, and why it begins, if the run's ``log`` says so."""
+    begun = reader.periods
+    period = begun[place]
+    end = begun[place + 1].first_frame if place + 1 < len(begun) else len(reader.packets.offsets)
+    header, sizes = reader.header_of(period.first_frame), reader.field_bytes_of(place)
+    before = reader.header_bytes - sum(one.bytes for one in begun) if place == 0 else 0  # the file's prefix
+    within = [row for row in rows if period.first_frame <= row.index < end]
+    return {
+        "period": period.number,
+        "first_frame": period.first_frame,
+        "frames": end - period.first_frame,
+        "seconds": within[-1].pts_seconds - within[0].pts_seconds + 1.0 / header.fps if within else 0.0,
+        "header_bytes": before + period.bytes,
+        "packet_bytes": sum(row.bytes for row in within),
+        "begins": log.get(period.first_frame, {}).get("begins"),
+        "fields": {
+            name: {"shape": list(tensor.shape), "bytes": sizes[name]}
+            for part in (header.static, header.reference)
+            for name, tensor in part.items()
+        },
     }

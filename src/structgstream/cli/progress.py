@@ -53,6 +53,7 @@ def summary(report: "FrameReport", frames: int | None) -> str:
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
         f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}{absences(report.absent)}"
+        f"{new_period(report.begins)}"
     )
 
 
@@ -71,6 +72,11 @@ def remarks(counts: Mapping[str, int]) -> str:
     if counts.get("births refused"):
         found.append("no births: too many pixels are missing at once")
     return "".join(f"  [{remark}]" for remark in found)
+
+
+def new_period(why: str | None) -> str:
+    """A remark on a frame that begins another period; empty without one."""
+    return "" if why is None else f"  [new period: {why}]"
 
 
 def absences(cameras: Sequence[str]) -> str:

@@ -31,7 +31,8 @@ def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Se
     table.add_row(
         *literal_cells("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}")
     )
-    table.add_row("size", f"{human_bytes(header['total_bytes'])}, header {human_bytes(header['header_bytes'])}")
+    headers = "header" if len(header["periods"]) < 2 else f"{len(header['periods'])} headers"
+    table.add_row("size", f"{human_bytes(header['total_bytes'])}, {headers} {human_bytes(header['header_bytes'])}")
     if rows:
         table.add_row("rate", bit_rate_text(rows, header["fps"]))
     table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
@@ -58,10 +59,34 @@ def bit_rate_text(rows: "Sequence[Row]", fps: float) -> str:
     return f"{8e-6 * mean * fps:.2f} Mbit/s without the header"
 
 
-def header_table(header: Mapping[str, Any]) -> Table:
-    """The fields of the init record, largest first."""
+def period_table(periods: Sequence[Mapping[str, Any]]) -> Table | None:
+    """A row per period; None for a stream of one."""
+    if len(periods) < 2:
+        return None
     table = compact_table()
-    table.title = "header"
+    table.title = "periods"
+    for name in ("period", "frame", "frames", "seconds", "anchors", "header", "packets"):
+        table.add_column(name, justify="right")
+    table.add_column("begins")
+    for one in periods:
+        anchors = one["fields"]["anchor_positions"]["shape"][0] if "anchor_positions" in one["fields"] else ""
+        table.add_row(
+            str(one["period"]),
+            str(one["first_frame"]),
+            str(one["frames"]),
+            f"{one['seconds']:.2f}",
+            f"{anchors:,}" if anchors != "" else "-",
+            human_bytes(one["header_bytes"]),
+            human_bytes(one["packet_bytes"]),
+            *literal_cells(one["begins"] or "-"),
+        )
+    return table
+
+
+def header_table(header: Mapping[str, Any]) -> Table:
+    """The fields of an init record, largest first."""
+    table = compact_table()
+    table.title = f"header of period {header['period']}" if header["period"] else "header"
     table.add_column("field")
     for name in ("shape", "bytes", "share", "bits a value"):
         table.add_column(name, justify="right")

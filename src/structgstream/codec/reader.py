@@ -8,6 +8,7 @@ else is read on demand: the facts of a packet from the heads of its record and f
 checksum is verified then. With the ``raw`` codec packets are independent, so random access costs one packet.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -54,7 +55,6 @@ class StreamReader:
         header: content of the first init record. What all periods share (cameras, similarity, frame rate, codec) holds
             for the stream; :meth:`header_of` has the rest.
         periods: where periods begin; at least one.
-        header_bytes: of prefix and init records.
         packets: every whole packet before the first lost one, in order.
         runs: the frames that can be decoded, as ranges of consecutive frames.
         damage: the damaged records that whole records follow, with the frames lost to each.
@@ -127,8 +127,15 @@ class StreamReader:
 
     @property
     def header_field_bytes(self) -> dict[str, int]:
-        """Bytes of each field in the first init record."""
-        return self._table.field_bytes(0)
+        """Bytes of each field in all init records together."""
+        sums = Counter[str]()
+        for place in range(len(self._table.periods)):
+            sums.update(self._table.field_bytes(place))
+        return dict(sums)
+
+    def field_bytes_of(self, place: int) -> dict[str, int]:
+        """Bytes of each field in the init record of the period at ``place`` in :attr:`periods`."""
+        return self._table.field_bytes(place)
 
     def _reason(self, end: int) -> str:
         """Why the stream, read up to byte ``end``, is not complete."""

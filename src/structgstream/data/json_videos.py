@@ -18,6 +18,7 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
+from structgstream.data.calibration_files.reading import reason
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
@@ -64,7 +65,7 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
         return rig, float(content["fps"]) if "fps" in content else None, int(content.get("frames", 1))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CaptureError(
-            f"{file} cannot be read ({type(error).__name__}: {error}); expected width, height and cameras "
+            f"{file} cannot be read ({reason(error)}); expected width, height and cameras "
             "with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
         ) from None
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
+from structgstream.data.calibration_files.reading import reason
 from structgstream.data.images import ImageSource, common_pictures
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError, CaptureError
@@ -65,7 +66,7 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CaptureError(
-            f"{meta} cannot be read as PanopticSports metadata ({type(error).__name__}: {error}); "
+            f"{meta} cannot be read as PanopticSports metadata ({reason(error)}); "
             "expected the keys w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras."
         ) from None
     first: dict[str, tuple[Any, Any]] = {}

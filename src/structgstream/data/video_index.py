@@ -89,6 +89,8 @@ def open_video(path: Path) -> "InputContainer":
         container = av.open(str(path))
     except FileNotFoundError:
         raise CaptureError(f"The video {path} is missing; restore the file.") from None
+    except PermissionError:
+        raise CaptureError(f"The video {path} cannot be opened (Permission denied); let yourself read it.") from None
     except (av.error.FFmpegError, OSError) as error:
         raise CaptureError(
             f"The video {path} cannot be opened ({error.strerror}): it is truncated, damaged or not a video; "

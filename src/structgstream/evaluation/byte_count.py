@@ -17,7 +17,10 @@ Parts = dict[str, dict[str, float]]
 
 @dataclass(frozen=True)
 class Row:
-    """One packet: ``kind`` is ``key`` or ``delta``; ``sizes`` are bytes by field and add up, with the rest, to all."""
+    """One packet: ``kind`` is ``key`` or ``delta``; ``sizes`` are bytes by field and add up, with the rest, to all.
+
+    ``first``: it begins a period.
+    """
 
     index: int
     kind: str
@@ -25,6 +28,7 @@ class Row:
     offset: int
     bytes: int
     sizes: Mapping[str, int]
+    first: bool = False
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class Group:
 
 def packet_rows(reader: StreamReader) -> list[Row]:
     """The packet of every frame that can be decoded."""
+    firsts = {period.first_frame for period in reader.periods}
     infos = (reader.packets.at(index) for run in reader.runs for index in run)
     return [
         Row(
@@ -47,6 +52,7 @@ def packet_rows(reader: StreamReader) -> list[Row]:
             info.offset,
             info.bytes,
             with_rest(info.field_bytes, info.bytes),
+            first=info.index in firsts,
         )
         for info in infos
     ]
@@ -67,13 +73,13 @@ def occurring_fields(sizes: Iterable[Mapping[str, float]]) -> list[str]:
 
 
 def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
-    """The first packet, and the means of each kind of the later packets.
+    """The first packet of each period, and the means of each kind of the others.
 
-    The first packet is listed apart: with the codec ``compact`` it is nearly empty, because the header holds frame 0.
+    First packets are listed apart: with the codec ``compact`` they are nearly empty, because headers hold their frames.
     """
     chosen = {
-        FIRST: [row for row in rows if row.index == 0],
-        "key packets": [row for row in rows if row.kind == "key" and row.index > 0],
+        FIRST: [row for row in rows if row.first],
+        "key packets": [row for row in rows if row.kind == "key" and not row.first],
         "delta packets": [row for row in rows if row.kind == "delta"],
     }
     return {name: mean_of(some) for name, some in chosen.items() if some}
@@ -87,7 +93,7 @@ def mean_of(rows: Sequence[Row]) -> Group:
 
 
 def parts_of(reader: StreamReader, rows: Sequence[Row]) -> Parts:
-    """Bytes by field of the header, and mean bytes of each kind of packet; a nearly empty first packet is left out."""
+    """Bytes by field of the headers, and mean bytes of each kind of packet; a nearly empty first packet is left out."""
     parts: Parts = {"header": dict(with_rest(reader.header_field_bytes, reader.header_bytes))}
     for name, group in groups_of(rows).items():
         if name != FIRST or group.bytes > NOTHING * reader.header_bytes:

@@ -49,6 +49,8 @@ def log_entry(report: "FrameReport") -> dict[str, Any]:
     del entry["peak_device_bytes"]
     if not report.absent:
         del entry["absent"]
+    if report.begins is None:
+        del entry["begins"]
     return entry | {
         "kind": report.kind.name.lower(),
         "train_psnr": report.train_psnr if math.isfinite(report.train_psnr) else None,

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whose folder a capture is: one that was made from other videos, or by hand, is never written into."""
+"""Whose folder a capture is: one of other videos, made by hand, or in another process's hands is not written into."""
 
+import fcntl
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.steps import FOLDER
 
 SOURCE = "source.json"
+LOCK = ".preparing"
 
 
 def claim(capture: Path, videos: Path) -> None:
@@ -34,11 +39,42 @@ def claim(capture: Path, videos: Path) -> None:
         raise CaptureError(
             f"The folder {capture} is not empty and was not made by prepare; choose another with -o, or empty it."
         )
+    part = marker.with_suffix(".part")
     try:
         marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.write_text(json.dumps({"videos": origin}) + "\n")
+        part.write_text(json.dumps({"videos": origin}) + "\n")
+        os.replace(part, marker)
+    except OSError as error:
+        with suppress(OSError):  # so that the folder is empty as before, when there is room again
+            part.unlink(missing_ok=True)
+            marker.parent.rmdir()
+        raise StorageError(f"The folder {capture} cannot be written ({error.strerror}).") from None
+
+
+@contextmanager
+def alone(capture: Path) -> Iterator[None]:
+    """No other process prepares the same capture within the block.
+
+    Args:
+        capture: its folder, which was claimed.
+
+    Raises:
+        StorageError: another one does, or the folder cannot be written.
+    """
+    try:
+        file = (capture / FOLDER / LOCK).open("wb")
     except OSError as error:
         raise StorageError(f"The folder {capture} cannot be written ({error.strerror}).") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StorageError(
+                f"Another process prepares {capture} now; wait for its end, or choose another folder with -o."
+            ) from None
+        except OSError:
+            pass  # A file system without locks, as some networks' are.
+        yield
 
 
 def _origin(marker: Path) -> str | None:

@@ -5,11 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from structgstream.data.posed import Calibration
 from structgstream.preparation.calibrating import check_tone, chosen_method
 from structgstream.preparation.camera_steps import CameraSteps
 from structgstream.preparation.capture_steps import REPORT, CaptureSteps, assembled, with_tones
 from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.job import new_job
+from structgstream.preparation.claiming import alone
+from structgstream.preparation.footage import Footage
+from structgstream.preparation.job import Job, new_job
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.steps import Listener, Silent
 
@@ -56,6 +59,13 @@ def prepare_capture(
     footage = find.find()
     method = chosen_method(footage, options)
     check_tone(method, options)
+    with alone(capture):
+        return _made(job, find, footage, method)
+
+
+def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibration) -> Preparation:
+    """The steps from the clocks on."""
+    options = job.options
     first = find.synchronize(footage, method)
     solved = find.calibrate(footage, first, method)
     clocks = find.synchronize_again(footage, first, method, solved)
@@ -66,4 +76,4 @@ def prepare_capture(
     make.bring(footage, content)
     content = make.points(make.near(content))
     findings = make.check(content)
-    return Preparation(capture, findings, job.told, tuple(job.steps.skipped), capture / REPORT / "index.html")
+    return Preparation(job.capture, findings, job.told, tuple(job.steps.skipped), job.capture / REPORT / "index.html")

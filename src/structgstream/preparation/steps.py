@@ -8,6 +8,8 @@ inputs and of the keys of the steps before it; the JSON is written last, so what
 import hashlib
 import json
 import os
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,10 +126,11 @@ class Steps:
             content = json.loads((self._folder / f"{step}.json").read_text())
             if content["key"] != key:
                 return None
-            with np.load(self._folder / f"{step}.npz", allow_pickle=False) as file:
-                return Stored(content["values"], {name: file[name] for name in file.files})
-        except (OSError, ValueError, KeyError, TypeError, EOFError):
-            return None  # missing or cut: the step is done again
+            # Opened here, because numpy leaves a damaged file open.
+            with (self._folder / f"{step}.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return Stored(content["values"], {name: arrays[name] for name in arrays.files})
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
+            return None  # missing, cut or damaged: the step is done again
 
     def _write(self, step: str, key: str, stored: Stored) -> None:
         numbers, arrays = self._folder / f"{step}.json", self._folder / f"{step}.npz"
@@ -142,8 +145,8 @@ class Steps:
             os.replace(part, numbers)
         except OSError as error:
             raise StorageError(
-                f"The result of step {step!r} cannot be written to {self._folder} ({error.strerror}); make room, and "
-                "run the command again: it goes on from there."
+                f"The result of step {step!r} cannot be written to {self._folder} ({error.strerror}); make room, or "
+                "let yourself write there, and run the command again: it goes on from there."
             ) from None
 
 

@@ -28,7 +28,7 @@ def warm_start(scene: Scene, *, cell: float) -> Scene:
 
 
 def _anchors_of(free: FreeGaussians, anchors: AnchorCloud, cell: float) -> AnchorCloud:
-    """An anchor for each cell that free Gaussians are in and no anchors: at the mean of its Gaussians, as large as they."""
+    """An anchor for each cell that free Gaussians are in and no anchors: at their mean, as large as they are."""
     both = torch.cat([free.means, anchors.positions])
     places = (both / cell).round().to(torch.int64)
     origin = places.amin(0)

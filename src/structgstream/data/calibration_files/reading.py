@@ -34,7 +34,7 @@ def readable(file: Path, expected: str) -> Iterator[None]:
     except CalibrationError:
         raise
     except BROKEN as error:
-        raise CalibrationError(f"{file} cannot be read ({_reason(error)}); expected {expected}.") from None
+        raise CalibrationError(f"{file} cannot be read ({reason(error)}); expected {expected}.") from None
 
 
 def each_camera(
@@ -53,12 +53,15 @@ def each_camera(
             raise
         except BROKEN as error:
             raise CalibrationError(
-                f"Camera {name!r} of {file} cannot be read ({_reason(error)}); expected {expected}."
+                f"Camera {name!r} of {file} cannot be read ({reason(error)}); expected {expected}."
             ) from None
     if not cameras:
         raise CalibrationError(f"{file} holds no cameras; expected {expected}.")
     return tuple(cameras)
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
+    """What was wrong with a file, as a clause of a message."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"

@@ -46,20 +46,23 @@ export function packetOf(payload: Uint8Array, isKey: boolean): Packet {
  * Refuses a packet that cannot come next.
  *
  * @param expected the frame that it must be
+ * @param begins whether it is the first after an init record
  * @param afterSeconds when the last one is presented
  * @param name what messages call the stream
  */
 export function checkFollows(
   facts: Omit<Packet, "payload">,
   expected: number,
+  begins: boolean,
   afterSeconds: number,
   name: string,
 ): void {
   if (facts.index !== expected) {
     throw new StreamError(`${name} has packet ${facts.index} where packet ${expected} belongs.`);
   }
-  if (!expected && !facts.isKey) {
-    throw new StreamError(`${name} begins with a delta packet; the first must be a key packet.`);
+  if (begins && !facts.isKey) {
+    const what = expected ? `A period of ${name}` : name;
+    throw new StreamError(`${what} begins with a delta packet; the first must be a key packet.`);
   }
   if (facts.ptsSeconds <= afterSeconds) {
     throw new StreamError(`In ${name} packet ${facts.index} is not presented after the one before it.`);

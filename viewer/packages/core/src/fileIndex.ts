@@ -7,10 +7,11 @@ export const FOOTER_BYTES = 16;
 const ENTRY_BYTES = 13;
 const FOOTER_MAGIC = "SGSINDEX";
 
-/** Where one packet is. */
+/** Where one packet is, or the init record before packet `index`. */
 export interface IndexEntry {
   readonly index: number;
   readonly isKey: boolean;
+  readonly isInit: boolean;
   readonly offset: number;
 }
 
@@ -22,7 +23,7 @@ export function indexOffset(footer: Uint8Array, fileBytes: number): number | und
 }
 
 /**
- * The packets of a file by its index; undefined when it must be scanned. The records they lead to have to be verified
+ * The packets of a file, and the init records after the first, by its index; undefined when it must be scanned. The records they lead to have to be verified
  * when they are read.
  *
  * @param bytes the index record: from its offset to the footer
@@ -32,18 +33,21 @@ export function indexEntries(bytes: Uint8Array, offset: number): IndexEntry[] | 
   if (record?.type !== RecordType.index || record.payload.length % ENTRY_BYTES) return undefined;
   const view = viewOf(record.payload);
   const entries: IndexEntry[] = [];
-  for (let at = 0, before = 0; at < record.payload.length; at += ENTRY_BYTES) {
+  let begins = true;
+  for (let at = 0, before = 0, packets = 0; at < record.payload.length; at += ENTRY_BYTES) {
     const type = view.getUint8(at + 4);
     const entry = {
       index: view.getUint32(at, true),
       isKey: type === RecordType.key,
+      isInit: type === RecordType.init,
       offset: Number(view.getBigUint64(at + 5, true)),
     };
-    const isPacket = entry.isKey || (type === RecordType.delta && entries.length > 0);
-    if (!isPacket || entry.index !== entries.length || entry.offset <= before || entry.offset >= offset)
-      return undefined;
+    const canBe = entry.isKey || (!begins && (entry.isInit || type === RecordType.delta));
+    if (!canBe || entry.index !== packets || entry.offset <= before || entry.offset >= offset) return undefined;
+    begins = entry.isInit;
+    if (!begins) packets++;
     before = entry.offset;
     entries.push(entry);
   }
-  return entries;
+  return begins && entries.length ? undefined : entries;
 }

@@ -37,6 +37,23 @@ export interface StreamHeader {
   readonly metadata: Readonly<Record<string, unknown>>;
 }
 
+/** A part of a stream that has an init record of its own, at byte `offset`; `first` is its first frame. */
+export interface Period {
+  readonly number: number;
+  readonly first: number;
+  readonly offset: number;
+  readonly bytes: number;
+}
+
+/** What all periods of a stream have in common differs in these two headers: one sentence, or undefined. */
+export function difference(first: StreamHeader, later: StreamHeader): string | undefined {
+  const shared = ({ cameras, similarity, fps, codec }: StreamHeader) =>
+    JSON.stringify([cameras, similarity, fps, codec]);
+  return shared(first) === shared(later)
+    ? undefined
+    : "its cameras, similarity, fps or codec are not those of the first";
+}
+
 export function trainingCameras(header: StreamHeader): number {
   return header.cameras.filter((camera) => !camera.heldOut).length;
 }

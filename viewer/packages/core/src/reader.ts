@@ -7,10 +7,10 @@
  */
 
 import { ByteQueue } from "./byteQueue.js";
-import { type Damage, Search, type Standing } from "./damage.js";
+import { type Damage, lastFrame, Search, type Standing } from "./damage.js";
 import { checkFollows, type Frame, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 import { StreamError } from "./errors.js";
-import type { StreamHeader } from "./header.js";
+import { difference, type Period, type StreamHeader } from "./header.js";
 import { unpackedHeader } from "./initRecord.js";
 import {
   CHECKSUM_BYTES,
@@ -39,6 +39,11 @@ export interface PacketInfo {
  */
 export type ReaderState = "reading" | "complete" | "damaged";
 
+/** A period whose header is there unless it was let go of. */
+interface Begun extends Period {
+  header: StreamHeader | undefined;
+}
+
 export class StreamReader {
   private readonly queue = new ByteQueue();
   private readonly search = new Search();
@@ -49,11 +54,15 @@ export class StreamReader {
   private readonly whole: PacketInfo[] = [];
   private readonly damaged: Standing[] = [];
   private searching: Standing | undefined;
+  /** Damage since the last whole packet: how many frames it costs is not known before the next one. */
+  private open: Standing | undefined;
+  private readonly begun: Begun[] = [];
+  /** The next packet is the first of its period. */
+  private begins = true;
   private afterSeconds = Number.NEGATIVE_INFINITY;
   private kept = 0;
   private offset = 0;
-  private found: StreamHeader | undefined;
-  private decoder: SceneDecoder | undefined;
+  private decoder: { readonly of: StreamHeader; readonly scenes: SceneDecoder } | undefined;
   private failure: StreamError | undefined;
   private standing: ReaderState = "reading";
   private decoded: number | undefined;
@@ -61,9 +70,24 @@ export class StreamReader {
   /** @param name what messages call the stream */
   constructor(readonly name = "The stream") {}
 
-  /** What the init record says, as soon as it is there. */
+  /** What the first init record says, as soon as it is there. */
   get header(): StreamHeader | undefined {
-    return this.found;
+    return this.begun[0]?.header;
+  }
+
+  /** Where periods begin; one without a packet yet begins with the next one. */
+  get periods(): readonly Period[] {
+    return this.begun;
+  }
+
+  /** The header of a period, by its place in {@link periods}; undefined when it was let go of. */
+  headerOf(place: number): StreamHeader | undefined {
+    return this.begun[place]?.header;
+  }
+
+  /** Lets go of the headers of all periods but the first and the last. */
+  forgetHeaders(): void {
+    for (const period of this.begun.slice(1, -1)) period.header = undefined;
   }
 
   /** Every whole packet so far, in order; where others are lost, their indices have gaps. */
@@ -109,7 +133,7 @@ export class StreamReader {
    */
   finish(): void {
     if (this.failure) throw this.failure;
-    if (this.found) {
+    if (this.header) {
       try {
         this.goOn();
       } catch (error) {
@@ -131,12 +155,12 @@ export class StreamReader {
    * @throws StreamError there is no such frame, it was forgotten, or it is lost or damaged
    */
   frame(index: number): Frame {
-    if (!this.found || !this.shown[index]) throw this.missing(index);
-    this.decoder ??= new SceneDecoder(this.found);
+    if (!this.shown[index]) throw this.missing(index);
+    const scenes = this.decoderOf(index);
     const first = this.decoded === index - 1 ? index : this.groupStart(index);
     this.decoded = undefined; // until a packet has been decoded
-    for (let i = first; i < index; i++) this.decoder.decode(this.packet(i));
-    const frame = this.decoder.decode(this.packet(index));
+    for (let i = first; i < index; i++) scenes.decode(this.packet(i));
+    const frame = scenes.decode(this.packet(index));
     this.decoded = index;
     return frame;
   }
@@ -144,7 +168,7 @@ export class StreamReader {
   /** The first packet that frame `index` needs: a key packet; with codec `raw` its own. */
   groupStart(index: number): number {
     let first = index;
-    while (this.found?.codec !== "raw" && first > 0 && !this.infos[first]?.isKey) first--;
+    while (this.header?.codec !== "raw" && first > 0 && !this.infos[first]?.isKey) first--;
     return first;
   }
 
@@ -164,6 +188,13 @@ export class StreamReader {
     const packet = this.packet(index);
     this.payloads[index] = undefined;
     return packet;
+  }
+
+  private decoderOf(index: number): SceneDecoder {
+    const header = this.begun.filter(({ first }) => first <= index).at(-1)?.header;
+    if (!header) throw new StreamError(`The header of frame ${index} of ${this.name} has been let go of.`);
+    if (this.decoder?.of !== header) this.decoder = { of: header, scenes: new SceneDecoder(header) };
+    return this.decoder.scenes;
   }
 
   private missing(index: number): StreamError {
@@ -230,13 +261,18 @@ export class StreamReader {
     if (typeof found !== "object") return false;
     this.skip(found.at);
     this.damaged.push(damaged);
-    while (this.infos.length < found.next) {
+    this.open = damaged;
+    this.loseUpTo(found.next ?? 0);
+    this.searching = undefined;
+    return true;
+  }
+
+  private loseUpTo(next: number): void {
+    while (this.infos.length < next) {
       this.infos.push(undefined);
       this.payloads.push(undefined);
       this.shown.push(false);
     }
-    this.searching = undefined;
-    return true;
   }
 
   private skip(count: number): void {
@@ -246,36 +282,62 @@ export class StreamReader {
 
   /** The record that begins here is not whole. */
   private stop(): void {
-    if (!this.found) {
+    const { begun, offset, afterSeconds } = this;
+    if (!begun.length) {
       throw new StreamError(`Nothing of ${this.name} can be shown: its init record is damaged.`);
     }
-    this.searching = { offset: this.offset, expected: this.infos.length, afterSeconds: this.afterSeconds };
+    const period = begun.at(-1)!.number;
+    const since = this.open?.since ?? offset;
+    this.searching = { offset, expected: this.infos.length, afterSeconds, period, since };
     this.skip(1);
   }
 
   private add(record: StreamRecord, bytes: number): void {
-    if (!this.found) {
-      if (record.type !== RecordType.init) {
-        throw new StreamError(`${this.name} begins with a record of type ${record.type}; expected an init record.`);
-      }
-      this.found = unpackedHeader(record.payload);
-    } else if (record.type === RecordType.init) {
-      throw new StreamError(`${this.name} has a second init record, at byte ${record.offset}.`);
+    if (record.type === RecordType.init) this.addInit(record, bytes);
+    else if (!this.begun.length) {
+      throw new StreamError(`${this.name} begins with a record of type ${record.type}; expected an init record.`);
     } else if (record.type === RecordType.index) {
       this.standing = "complete";
     } else if (record.type === RecordType.key || record.type === RecordType.delta) {
+      const last = this.begun.at(-1)!.number;
+      if (record.period !== last) {
+        throw new StreamError(
+          `${this.name} has a packet of period ${record.period}, at byte ${record.offset}, after the init record of period ${last}.`,
+        );
+      }
       this.addPacket(packetOf(record.payload, record.type === RecordType.key), record.offset, bytes);
     }
   }
 
+  private addInit({ period, payload, offset }: StreamRecord, bytes: number): void {
+    const { begun, header: first } = this;
+    const expected = (begun.at(-1)?.number ?? period - 1) + 1;
+    if (first && !this.open && (this.begins || period !== expected)) {
+      throw new StreamError(
+        `${this.name} has an init record of period ${period}, at byte ${offset}, where a packet${this.begins ? "" : ` or one of period ${expected}`} belongs.`,
+      );
+    }
+    const header = unpackedHeader(payload);
+    const differing = first && difference(first, header);
+    if (differing) throw new StreamError(`Period ${period} of ${this.name} does not belong to it: ${differing}.`);
+    if (this.begins && first) begun.pop(); // a period without a whole packet
+    begun.push({ number: period, first: this.infos.length, offset, bytes, header });
+    this.begins = true;
+  }
+
   private addPacket({ payload, ...facts }: Packet, offset: number, bytes: number): void {
     const { index, isKey } = facts;
-    checkFollows(facts, this.infos.length, this.afterSeconds, this.name);
+    const { open, begins } = this;
+    if (open && index <= lastFrame(open, offset)) this.loseUpTo(index);
+    checkFollows(facts, this.infos.length, begins && !open, this.afterSeconds, this.name);
+    if (begins) this.begun.push({ ...this.begun.pop()!, first: this.begun.length ? index : 0 });
+    this.open = undefined;
+    this.begins = false;
     const info = { ...facts, offset, bytes };
     this.infos.push(info);
     this.whole.push(info);
     this.payloads.push(payload);
-    this.shown.push(isKey || this.found?.codec === "raw" || this.shown[index - 1] === true);
+    this.shown.push(isKey || this.header?.codec === "raw" || (!begins && this.shown[index - 1] === true));
     this.afterSeconds = facts.ptsSeconds;
   }
 }

@@ -10,9 +10,10 @@ export const HEAD_BYTES = 8;
 export const CHECKSUM_BYTES = 4;
 const MAGIC = [0x89, 0x53, 0x47, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 
-/** One record; `offset` is where its first byte is in the stream. */
+/** One record; `offset` is where its first byte is in the stream, `period` the number of its period. */
 export interface StreamRecord {
   readonly type: number;
+  readonly period: number;
   readonly payload: Uint8Array;
   readonly offset: number;
 }
@@ -69,6 +70,11 @@ export function checkPrefix(bytes: Uint8Array, name: string): void {
   }
 }
 
+/** The period that the record states whose head begins at `at`. */
+export function periodAt(bytes: Uint8Array, at: number): number {
+  return bytes[at + 2]! + 256 * bytes[at + 3]!;
+}
+
 /** Bytes of the whole record that `head` (8 bytes) begins: nothing is allocated for it. */
 export function recordBytes(head: Uint8Array): number {
   return HEAD_BYTES + viewOf(head).getUint32(4, true) + CHECKSUM_BYTES;
@@ -83,5 +89,5 @@ export function recordIn(bytes: Uint8Array, offset: number): StreamRecord | unde
   if (bytes.length < HEAD_BYTES + CHECKSUM_BYTES || recordBytes(bytes) !== bytes.length) return undefined;
   const end = bytes.length - CHECKSUM_BYTES;
   if (viewOf(bytes).getUint32(end, true) !== crc32(bytes.subarray(0, end))) return undefined;
-  return { type: bytes[0]!, payload: bytes.subarray(HEAD_BYTES, end), offset };
+  return { type: bytes[0]!, period: periodAt(bytes, 0), payload: bytes.subarray(HEAD_BYTES, end), offset };
 }

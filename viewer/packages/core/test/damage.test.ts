@@ -149,7 +149,7 @@ test("a stream full of heads does not keep a reader busy", () => {
   const reader = readStream(joined(stream.subarray(0, offset + bytes), heads));
   expect([reader.state, reader.packets.length]).toEqual(["damaged", 1]);
   const search = new Search();
-  expect(search.next(heads, 1, { offset: 0, expected: 1, afterSeconds: 0 }, true)).toBeUndefined();
+  expect(search.next(heads, 1, { offset: 0, expected: 1, afterSeconds: 0, period: 0, since: 0 }, true)).toBeUndefined();
 });
 
 test("after damage, records that contradict each other are refused when the end has come", () => {

@@ -65,7 +65,7 @@ describe.each([
       (...records: Uint8Array[]) =>
       () =>
         readStream(joined(prefix, init, ...records));
-    expect(stream_(init)).toThrow("has a second init record, at byte");
+    expect(stream_(init)).toThrow("has an init record of period 0, at byte");
     expect(stream_(first, first)).toThrow("has packet 0 where packet 1 belongs");
     expect(stream_(second)).toThrow("has packet 1 where packet 0 belongs");
     expect(stream_(record(RecordType.delta, first.slice(8, -4)))).toThrow("begins with a delta packet");
@@ -79,7 +79,7 @@ describe.each([
   test("the index says what scanning finds", () => {
     const offset = indexOffset(stream.slice(-16), stream.length)!;
     const entries = indexEntries(stream.slice(offset, -16), offset)!;
-    expect(entries).toEqual(whole.packets.map(({ index, isKey, offset }) => ({ index, isKey, offset })));
+    expect(entries).toEqual(whole.packets.map(({ index, isKey, offset }) => ({ index, isKey, isInit: false, offset })));
     expect(indexOffset(stream.slice(-17, -1), stream.length)).toBeUndefined();
     expect(indexOffset(stream.slice(-16), offset)).toBeUndefined();
     expect(indexEntries(stream.slice(offset, -15), offset)).toBeUndefined();

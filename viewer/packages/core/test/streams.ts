@@ -24,8 +24,9 @@ export function joined(...parts: Uint8Array[]): Uint8Array {
 }
 
 /** A whole record. */
-export function record(type: number, payload: Uint8Array): Uint8Array {
+export function record(type: number, payload: Uint8Array, period = 0): Uint8Array {
   const bytes = joined(new Uint8Array([type, 0, 0, 0, 0, 0, 0, 0]), payload, new Uint8Array(CHECKSUM_BYTES));
+  viewOf(bytes).setUint16(2, period, true);
   viewOf(bytes).setUint32(4, payload.length, true);
   viewOf(bytes).setUint32(HEAD_BYTES + payload.length, crc32(bytes.subarray(0, -CHECKSUM_BYTES)), true);
   return bytes;

@@ -29,19 +29,20 @@ export interface RunOptions {
 }
 
 /** Packets and init record of a stored stream. */
-function partsOf(stream: Uint8Array) {
+/** The init record of a period, with the prefix, and the packets of a stream. */
+export function partsOf(stream: Uint8Array, period: number) {
   const [prefix, init, ...rest] = piecesOf(stream);
   const packets = rest.filter((piece) => piece[0] === RecordType.key || piece[0] === RecordType.delta);
-  return { init: joined(prefix!, init!), packets };
+  return { init: joined(prefix!, record(RecordType.init, init!.slice(HEAD_BYTES, -4), period)), packets };
 }
 
-/** A packet with another number and time. */
-function renumbered(piece: Uint8Array, frame: number, seconds: number): Uint8Array {
+/** A packet with another number, time and period. */
+export function renumbered(piece: Uint8Array, frame: number, seconds: number, period: number): Uint8Array {
   const payload = piece.slice(HEAD_BYTES, -4);
   const view = new DataView(payload.buffer);
   view.setUint32(0, frame, true);
   view.setFloat64(4, seconds, true);
-  return record(piece[0]!, payload);
+  return record(piece[0]!, payload, period);
 }
 
 export class LiveRun {
@@ -84,8 +85,8 @@ export class LiveRun {
   /** Goes on with the packets of another stream, as a period of its own. */
   begin(stream: Uint8Array): void {
     this.close();
-    const { init, packets } = partsOf(stream);
     const period = this.periods.length;
+    const { init, packets } = partsOf(stream, period);
     const name = `init-${String(period).padStart(4, "0")}`;
     this.periods.push({ ...this.put(name, init), period, first_frame: this.frame, first_segment: this.segment });
     this.packets = packets;
@@ -99,7 +100,7 @@ export class LiveRun {
       const isKey = piece[0] === RecordType.key;
       if (isKey) this.close();
       const seconds = this.frame / this.fps;
-      const bytes = renumbered(piece, this.frame, seconds);
+      const bytes = renumbered(piece, this.frame, seconds, this.periods.length - 1);
       this.group ??= { period: this.periods.length - 1, first: this.frame, times: [], records: [] };
       this.group = { ...this.group, times: [...this.group.times, seconds], records: [...this.group.records, bytes] };
       const kind = isKey ? "key" : "delta";

@@ -31,6 +31,8 @@ export class Decoding {
   private next = 0;
   private seeking = false;
   private decoded: number | undefined;
+  /** What the packet decoded last belongs to. */
+  private chapter: Chapter | undefined;
   /** What the frame given last belongs to. */
   private told: Chapter | undefined;
   private packets: PacketFacts[] = [];
@@ -81,7 +83,7 @@ export class Decoding {
       opening: (loadedBytes, totalBytes, ended) => this.tell({ type: "opening", loadedBytes, totalBytes, ended }),
       begun: (stream, header, ranged) => {
         this.begin(stream);
-        this.told = stream.chapter();
+        this.told = stream.chapter(0, 0);
         this.tell({ type: "header", header, ranged });
       },
       changed: () => this.catalogChanged(),
@@ -129,11 +131,12 @@ export class Decoding {
       }
       return false;
     }
+    if (!this.seeking && stream.catalog.isLost(target)) return this.passLost(stream, demand);
     const chapter = stream.chapter(target, demand.ahead);
     if (!chapter) return false;
-    if (!this.seeking && stream.catalog.isLost(target)) return this.passLost(stream, demand);
     const key = stream.catalog.groupStart(target);
-    const goesOn = this.decoded !== undefined && this.decoded >= key && this.decoded < target;
+    const isSame = chapter === this.chapter;
+    const goesOn = isSame && this.decoded !== undefined && this.decoded >= key && this.decoded < target;
     const first = goesOn ? this.decoded! + 1 : key;
     stream.loader.want(first, target + 1, Math.max(demand.ahead, target + 1));
     const packet = stream.store.get(first);
@@ -150,6 +153,7 @@ export class Decoding {
     const start = performance.now();
     let frame: Frame | undefined;
     this.decoded = undefined;
+    this.chapter = chapter;
     try {
       if (given) frame = chapter.decoder.decode(packet);
       else chapter.decoder.advance(packet);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The packets of one file, by its index or as they are found by reading it. */
 
-import type { IndexEntry, PacketInfo } from "@structgstream/core";
+import type { IndexEntry, PacketInfo, Period } from "@structgstream/core";
 import { Catalog, type Place } from "./catalog.js";
 import type { CatalogFacts } from "./messages.js";
 
@@ -13,7 +13,15 @@ interface Entry {
   ptsSeconds: number | undefined;
 }
 
+/** Where an init record after the first is, and the first frame of its period. */
+interface Init {
+  readonly first: number;
+  readonly start: number;
+  readonly end: number;
+}
+
 export class FileCatalog extends Catalog {
+  private readonly inits: Init[] = [];
   // By frame; undefined where a packet was lost before anything was known of it.
   private readonly entries: (Entry | undefined)[] = [];
 
@@ -34,10 +42,32 @@ export class FileCatalog extends Catalog {
 
   /** Takes everything from an index; `end` is where the index record begins. */
   fill(index: readonly IndexEntry[], end: number): void {
-    for (const [i, { isKey, offset }] of index.entries()) {
-      this.entries.push({ isKey, offset, end: index[i + 1]?.offset ?? end, ptsSeconds: undefined });
+    for (const [i, { isKey, isInit, index: first, offset }] of index.entries()) {
+      const next = index[i + 1]?.offset ?? end;
+      if (isInit) this.inits.push({ first, start: offset, end: next });
+      else this.entries.push({ isKey, offset, end: next, ptsSeconds: undefined });
     }
     this.complete = true;
+  }
+
+  /** Takes an init record that was found by reading. */
+  begin({ first, offset, bytes }: Period): void {
+    this.inits.push({ first, start: offset, end: offset + bytes });
+  }
+
+  /** Which period a frame belongs to, counted from 0. */
+  period(index: number): number {
+    return this.inits.filter(({ first }) => first <= index).length;
+  }
+
+  /** The init record of a period after the first. */
+  init(period: number): Init {
+    return this.inits[period - 1]!;
+  }
+
+  /** The frame after the last of a period. */
+  periodEnd(period: number): number {
+    return this.inits[period]?.first ?? this.count;
   }
 
   /** Takes a packet that was found by reading; frames that it leaves out are lost. */

@@ -1,14 +1,25 @@
 // SPDX-License-Identifier: Apache-2.0
 /** A stream that is one file: opened, then read where it is needed. */
 
-import type { StreamHeader, StreamReader } from "@structgstream/core";
+import {
+  ByteQueue,
+  difference,
+  HEAD_BYTES,
+  RecordType,
+  recordBytes,
+  recordIn,
+  StreamError,
+  type StreamHeader,
+  type StreamReader,
+  unpackedHeader,
+} from "@structgstream/core";
 import type { ByteClient } from "./byteClient.js";
 import type { Place } from "./catalog.js";
 import { FileCatalog } from "./fileCatalog.js";
 import { Opening } from "./opening.js";
 import { PacketLoader } from "./packetLoader.js";
 import { PacketStore } from "./packetStore.js";
-import { Chapter, type Stream } from "./stream.js";
+import { type Chapter, Chapters, type Stream } from "./stream.js";
 
 export interface FileEvents {
   opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
@@ -31,19 +42,24 @@ export class FileStream implements Stream {
   readonly catalog: FileCatalog;
   readonly store: PacketStore;
   readonly loader: PacketLoader;
-  private readonly only: Chapter;
+  /** By how many periods are before theirs. */
+  private readonly chapters = new Chapters();
+  private readonly coming = new Set<number>();
+  /** The period that frames are wanted of. */
+  private current = 0;
   private taken = 0;
+  private begun = 1;
 
   private constructor(
-    client: ByteClient,
-    header: StreamHeader,
+    private readonly client: ByteClient,
+    private readonly header: StreamHeader,
     private readonly indexed: boolean,
     budgetBytes: number,
     private readonly events: FileEvents,
   ) {
     this.catalog = new FileCatalog(header.fps, header.codec === "raw");
     this.store = new PacketStore(budgetBytes);
-    this.only = new Chapter(header);
+    this.chapters.put(0, header);
     this.loader = new PacketLoader(client, this.catalog, this.store, {
       changed: () => events.stored(),
       damaged: (frame: number, { start }: Place) =>
@@ -76,8 +92,55 @@ export class FileStream implements Stream {
     opening.begin();
   }
 
-  chapter(): Chapter {
-    return this.only;
+  chapter(index: number, ahead: number): Chapter | undefined {
+    const { catalog } = this;
+    this.current = catalog.period(index);
+    // What comes next is fetched before it is needed.
+    if (catalog.period(Math.min(ahead, catalog.count) - 1) > this.current) this.opened(this.current + 1);
+    return this.opened(this.current);
+  }
+
+  private opened(period: number): Chapter | undefined {
+    if (!period) this.chapters.put(0, this.header);
+    const found = this.chapters.get(period);
+    if (!found && !this.catalog.isDamaged(this.catalog.init(period).first)) this.fetch(period);
+    return found;
+  }
+
+  private fetch(period: number): void {
+    const { events, coming, catalog } = this;
+    if (coming.has(period)) return;
+    coming.add(period);
+    const { first, start, end } = catalog.init(period);
+    const queue = new ByteQueue();
+    this.client.read(start, end, false, {
+      bytes: (bytes) => queue.append(bytes),
+      end: () => {
+        try {
+          this.chapters.put(period, this.headerIn(queue, start));
+        } catch (error) {
+          if (!(error instanceof StreamError)) throw error;
+          events.lost(first, catalog.periodEnd(period), error.message.replace(/\.$/, ""));
+        }
+        coming.delete(period);
+        events.stored();
+      },
+      failed: (problem) => {
+        coming.delete(period);
+        events.failed(problem, false);
+      },
+      waiting: (seconds, problem) => events.waiting(seconds, problem),
+    });
+  }
+
+  private headerIn(queue: ByteQueue, start: number): StreamHeader {
+    const head = queue.peek(HEAD_BYTES);
+    const record = head.length === HEAD_BYTES ? recordIn(queue.peek(recordBytes(head)), start) : undefined;
+    if (record?.type !== RecordType.init) throw new StreamError(`the init record at byte ${start} is damaged`);
+    const header = unpackedHeader(record.payload);
+    const differing = difference(this.header, header);
+    if (differing) throw new StreamError(`the init record at byte ${start} is another stream's: ${differing}`);
+    return header;
   }
 
   /** Takes the packets that the reader has found since the last time. */
@@ -88,11 +151,18 @@ export class FileStream implements Stream {
     this.taken = reader.packets.length;
     for (const info of found) {
       const before = catalog.count;
+      for (; !indexed && (reader.periods[this.begun]?.first ?? Number.POSITIVE_INFINITY) <= info.index; this.begun++) {
+        catalog.begin(reader.periods[this.begun]!);
+        const header = reader.headerOf(this.begun);
+        // Otherwise it is fetched when it is needed.
+        if (header && this.begun <= this.current + 1) this.chapters.put(this.begun, header);
+      }
       if (indexed) catalog.learn(info.index, info.ptsSeconds);
       else catalog.append(info);
       if (!indexed && info.index > before) events.lost(before, info.index, "the record there is damaged");
       store.put(reader.take(info.index), keepFrom);
     }
+    reader.forgetHeaders();
     if (ended && !indexed) catalog.complete = true;
     if (!indexed) events.changed();
     events.stored();

@@ -109,8 +109,12 @@ export class PacketLoader {
     room = Math.min(room, MOST_RUN_BYTES);
     const file = this.catalog.place(from)?.entry?.file;
     let next = from;
+    let at = this.catalog.place(from)?.start;
     while (next < Math.min(end, this.catalog.count) && this.wanted(next) && (next === first || room > 0)) {
-      if (this.catalog.place(next)?.entry?.file !== file || this.comes(next)) break;
+      const place = this.catalog.place(next)!;
+      // Init records lie between periods.
+      if (place.entry?.file !== file || place.start !== at || this.comes(next)) break;
+      at = place.end;
       room -= this.bytesOf(next++);
     }
     return next;

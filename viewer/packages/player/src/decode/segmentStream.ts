@@ -8,13 +8,12 @@ import type { Place } from "./catalog.js";
 import { PacketLoader } from "./packetLoader.js";
 import { PacketStore } from "./packetStore.js";
 import { SegmentCatalog } from "./segmentCatalog.js";
-import { Chapter, type Stream } from "./stream.js";
+import { type Chapter, Chapters, type Stream } from "./stream.js";
 
 /** After a file could not be fetched. */
 const AGAIN_MILLISECONDS = 1000;
 /** A file that the host does not have, or another in its place, is asked for so often. */
 const ATTEMPTS = 3;
-const MOST_CHAPTERS = 3;
 
 export interface SegmentEvents {
   /** There is another manifest, or another page of it. */
@@ -33,8 +32,8 @@ export class SegmentStream implements Stream {
   readonly catalog = new SegmentCatalog();
   readonly store: PacketStore;
   readonly loader: PacketLoader;
-  /** By the number of the period; the one used last is the last. */
-  private readonly chapters = new Map<number, Chapter>();
+  /** By the number of the period. */
+  private readonly chapters = new Chapters();
   /** Files that are being fetched, besides those with packets. */
   private readonly coming = new Set<string>();
   private readonly failures = new Map<string, number>();
@@ -123,10 +122,7 @@ export class SegmentStream implements Stream {
 
   private openedPeriod(period: number): Chapter | undefined {
     const found = this.chapters.get(period);
-    if (found) {
-      this.chapters.delete(period);
-      this.chapters.set(period, found);
-    } else this.fetchInit(period);
+    if (!found) this.fetchInit(period);
     return found;
   }
 
@@ -151,8 +147,7 @@ export class SegmentStream implements Stream {
         try {
           reader.push(part);
           if (!reader.header) reader.finish();
-          this.chapters.set(period, new Chapter(reader.header!));
-          if (this.chapters.size > MOST_CHAPTERS) this.chapters.delete(this.chapters.keys().next().value as number);
+          this.chapters.put(period, reader.header!);
         } catch (error) {
           this.events.failed(error instanceof Error ? error.message : String(error));
         }

@@ -18,6 +18,29 @@ export class Chapter {
   }
 }
 
+/** Headers of periods that are kept are no more than these. */
+const MOST_CHAPTERS = 3;
+
+/** The chapters that were used last, by what names their period. */
+export class Chapters {
+  private readonly kept = new Map<number, Chapter>();
+
+  get(period: number): Chapter | undefined {
+    const found = this.kept.get(period);
+    if (found) {
+      // The one used last is at the end.
+      this.kept.delete(period);
+      this.kept.set(period, found);
+    }
+    return found;
+  }
+
+  put(period: number, header: StreamHeader): void {
+    if (!this.kept.has(period)) this.kept.set(period, new Chapter(header));
+    if (this.kept.size > MOST_CHAPTERS) this.kept.delete(this.kept.keys().next().value as number);
+  }
+}
+
 export interface Stream {
   readonly catalog: Catalog;
   readonly store: PacketStore;

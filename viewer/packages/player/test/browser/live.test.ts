@@ -6,9 +6,10 @@ import type { Page } from "playwright-core";
 import { afterAll, afterEach, beforeAll, describe, expect, test, vi } from "vitest";
 import { chromiumPath } from "../../../gl/test/support/chromium.ts";
 import { LiveRun, type RunOptions } from "../liveRun.ts";
+import { periodFile } from "../periodFile.ts";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
-import { ask, type Opened, Stage, shows } from "./stage.ts";
+import { ask, darkest, type Opened, Stage, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 
@@ -143,26 +144,28 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     stage.server.publish("/live/", live.files);
     const page = await open('src="live/manifest.json" controls="off"');
     await shows(page, 0);
-    await ask(page, (player) => {
-      const least = { light: 1000, pictures: 0 };
-      Object.assign(globalThis, { least });
-      const small = document.createElement("canvas").getContext("2d", { willReadFrequently: true })!;
-      // Right after it was drawn: a browser clears what it has shown.
-      player.on("drawn", ({ stats }) => {
-        if (stats.frameIndex! < 10 || stats.frameIndex! > 14) return;
-        small.drawImage(player.shadowRoot!.querySelector("canvas")!, 0, 0, 16, 16);
-        const { data } = small.getImageData(0, 0, 16, 16);
-        const light = data.reduce((sum, value, i) => sum + (i % 4 === 3 ? 0 : value), 0) / 768;
-        least.light = Math.min(least.light, light);
-        least.pictures++;
-      });
-      player.play();
-    });
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
-    const { light, pictures } = (await page.evaluate("least")) as { light: number; pictures: number };
+    const { light, pictures } = await darkest(page, 10, 14);
     expect(pictures).toBeGreaterThan(3);
     expect(light).toBeGreaterThan(5);
     expect(stage.server.requests.filter(({ path }) => path.includes("init-")).length).toBe(2);
+    expect(await errors(page)).toEqual([]);
+    expectQuiet();
+  });
+
+  test("no frame between two periods of a file is blank either, and frames are drawn in their order", async () => {
+    const { bytes, inits } = periodFile([FEW, FEW, FEW], 8, 5);
+    stage.server.put("/periods.sgs", bytes);
+    const page = await open('src="periods.sgs" controls="off"');
+    await shows(page, 0);
+    const { light, pictures } = await darkest(page, 6, 18);
+    expect(pictures).toBeGreaterThan(8);
+    expect(light).toBeGreaterThan(5);
+    const drawn = await ask(page, (_, __, frames) => frames);
+    expect(drawn).toEqual([...drawn].sort((a, b) => a - b));
+    expect(drawn.at(-1)).toBe(23);
+    await ask(page, (player) => player.seek(9 / 5));
+    await shows(page, 9);
+    expect(inits.length).toBe(2);
     expect(await errors(page)).toEqual([]);
     expectQuiet();
   });

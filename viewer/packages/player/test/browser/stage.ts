@@ -89,6 +89,31 @@ export function ask<Result>(
   return page.evaluate(text) as Promise<Result>;
 }
 
+/** Plays to the end; gives back how dark the darkest picture of these frames was, of 255, and how many there were. */
+export async function darkest(page: Page, first: number, last: number): Promise<{ light: number; pictures: number }> {
+  await page.evaluate(
+    ([from, to]) => {
+      const least = { light: 1000, pictures: 0 };
+      Object.assign(globalThis, { least });
+      const player = document.querySelector("structgstream-player") as StructgstreamPlayer;
+      const small = document.createElement("canvas").getContext("2d", { willReadFrequently: true })!;
+      // Right after it was drawn: a browser clears what it has shown.
+      player.on("drawn", ({ stats }) => {
+        if (stats.frameIndex! < from || stats.frameIndex! > to) return;
+        small.drawImage(player.shadowRoot!.querySelector("canvas")!, 0, 0, 16, 16);
+        const { data } = small.getImageData(0, 0, 16, 16);
+        const light = data.reduce((sum, value, i) => sum + (i % 4 === 3 ? 0 : value), 0) / 768;
+        least.light = Math.min(least.light, light);
+        least.pictures++;
+      });
+      player.play();
+    },
+    [first, last] as const,
+  );
+  await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
+  return (await page.evaluate("least")) as { light: number; pictures: number };
+}
+
 /** Waits until the picture shows this frame, of this moment's camera. */
 export async function shows(page: Page, frame: number): Promise<void> {
   await page.waitForFunction(
