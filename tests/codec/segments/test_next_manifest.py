@@ -38,7 +38,7 @@ def grown(draft: Draft, *, key: bool = False) -> Draft:
     frame = draft.manifest.edge.frame + 1
     data = packed(RecordType.KEY if key else RecordType.DELTA, FRAME.pack(frame, frame / 30.0) + bytes([frame % 256]))
     edge = Edge(frame, frame / 30.0, None, 1.7e9 + frame)
-    return with_frame(with_segment(draft) if key else draft, part_of(data, period=0), data, edge)
+    return with_frame(with_segment(draft) if key else draft, part_of(data), data, edge)
 
 
 def written(path: Path, draft: Draft) -> None:
