@@ -169,7 +169,7 @@ def camera_faults(fault: str, sent: Sent, *, moments: int, seed: int, folder: Pa
 
 def camera_row(film: Film, seen: Sequence[Seen], *, begun: float, lost: int) -> CameraRow:
     """What became of the moments of a film, all of which have one kind of fault."""
-    row = CameraRow(film.moments[0].fault, len(film.moments), len(seen), lost)
+    row = CameraRow(film.moments[0].fault, moments=len(film.moments), frames=len(seen), reported_frames_lost=lost)
     row.longest_gap_seconds = max(later.at - one.at for one, later in pairwise(seen))
     wrong: dict[str, list[tuple[float, float]]] = {name: [] for name in film.cameras}
     for moment in film.moments:

@@ -24,10 +24,10 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 
 WIDTH, HEIGHT, PICTURES = 128, 96, 12
-BEGIN_SECONDS, PERIOD_SECONDS = 6.0, 6.0
+BEGIN_SECONDS, PERIOD_SECONDS = 6.0, 8.0
 LENGTHS_SECONDS = (1.0, 2.4)
-LOOPED = ("stuck", "size", "shape")  # begin and end with the next key frame, up to 1.2 s later
-LOOPED_SECONDS = (1.4, 2.4)
+LOOPED = ("stuck", "size", "shape")  # another video, which begins with its next key frame or the one after
+LOOPED_SECONDS = (2.6, 3.6)
 SPREAD_SECONDS = 1.5
 RIG_SETTINGS = {"deadline_seconds": 0.3, "silent_seconds": 1.0, "stuck_seconds": 0.5, "queue_frames": 64}
 

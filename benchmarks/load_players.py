@@ -199,7 +199,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     options = parser.parse_args()
     found = asyncio.run(play(options.address, fast=options.fast, slow=options.slow, seconds=options.seconds))
-    print(json.dumps({kind: [asdict(one) for one in players] for kind, players in found.items()}))
+    got = {kind: [asdict(one) for one in players] for kind, players in found.items()}
+    print(json.dumps({**got, "processor_seconds": time.process_time()}))
 
 
 if __name__ == "__main__":
