@@ -19,6 +19,7 @@ from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
 from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of
 from structgstream.kernels.backend import Backend
+from structgstream.key_frames import KeyFrames
 from structgstream.lookahead import Lookahead
 from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
 from structgstream.rate_control import RateController
@@ -72,8 +73,9 @@ class Session(Generic[State, Memory]):
             config=pipeline.config,
             metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
         )
-        self._key_interval = pipeline.codec.key_interval(source.fps)
-        self._controller = RateController(pipeline.rate, source.fps, key_interval=self._key_interval)
+        key_interval = pipeline.codec.key_interval(source.fps)
+        self._keys = KeyFrames(key_interval, source.fps)
+        self._controller = RateController(pipeline.rate, source.fps, key_interval=key_interval)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
         if resumed is not None:
@@ -159,9 +161,9 @@ class Session(Generic[State, Memory]):
         if self._coder is None:
             fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
             self._coder = self._open(header)
-        index = task.frame.index
-        kind = PacketKind.KEY if index % self._key_interval == 0 else PacketKind.DELTA
-        return self._coder.encode(fitted, index=index, pts_seconds=task.frame.pts_seconds, kind=kind)
+        index, pts_seconds = task.frame.index, task.frame.pts_seconds
+        kind = self._keys.kind(index, pts_seconds)
+        return self._coder.encode(fitted, index=index, pts_seconds=pts_seconds, kind=kind)
 
     def _write(self, packet: Packet) -> int:
         size = self._sink.write(packet)
@@ -186,6 +188,8 @@ class Session(Generic[State, Memory]):
         self._coder = self._open(resumed.header)
         for info in resumed.packets:
             self._controller.add(info.bytes, info.kind)
+            if info.kind is PacketKind.KEY:
+                self._keys.resume(info.index, info.pts_seconds)
 
     def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
         """The state from which the next frame is fitted, decoded from the existing stream."""
