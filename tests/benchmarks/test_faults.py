@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmark of faults: what it counts is what happened, and in small it runs."""
 
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from benchmarks.fault_cameras import FILMED, Seen, State, Viewer, camera_row
 from benchmarks.fault_film import PERIOD_SECONDS, Film, Moment, film_of, pictures, read_film, write_film
 from benchmarks.fault_report import table
-from benchmarks.fault_viewers import killed_servers, killed_trainers
+from benchmarks.fault_viewers import ViewerRow, killed_servers, killed_trainers
 from benchmarks.faults import parsed
 from benchmarks.stream_writers import Sent, repeated
 
@@ -86,11 +88,9 @@ def test_what_was_not_counted_or_did_not_come_back_or_hit_another_is_seen() -> N
     assert (row.never_normal, row.seconds_until_normal) == (1, [])
 
 
-@pytest.mark.parametrize("killed", [killed_servers, killed_trainers])
-def test_players_go_on_after_kills(tmp_path: Path, killed: object) -> None:
-    more = {"down_seconds": 0.1} if killed is killed_servers else {}
-    assert callable(killed)
-    row = killed(sent(), kills=2, seed=0, folder=tmp_path, players=2, page=False, **more)
+@pytest.mark.parametrize("killed", [partial(killed_servers, down_seconds=0.1), killed_trainers])
+def test_players_go_on_after_kills(tmp_path: Path, killed: Callable[..., ViewerRow]) -> None:
+    row = killed(sent(), kills=2, seed=0, folder=tmp_path, players=2, page=False)
     assert (row.kills, row.equal, row.exact, row.reported_frames_lost) == (2, True, 2, 0)
     assert len(row.seconds_until_normal) == 2
     assert "| 2 of 2 |" in table({"cameras": [], "viewers": [asdict(row)]})
