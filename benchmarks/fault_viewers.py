@@ -37,10 +37,11 @@ NUMBER = struct.Struct("<I")
 LISTEN = """(() => {
   const player = document.querySelector("structgstream-player");
   if (!player?.on) return false;
-  window.heard = { shown: -1, back: [], errors: [], notices: {} };
+  window.heard = { shown: -1, last: -1, back: [], errors: [], notices: {} };
   player.on("drawn", ({ stats }) => {
-    if (player.live && stats.frameIndex < heard.shown) heard.back.push([heard.shown, stats.frameIndex]);
-    heard.shown = stats.frameIndex ?? heard.shown;
+    if (player.live && stats.frameIndex < heard.last) heard.back.push([heard.last, stats.frameIndex]);
+    heard.last = stats.frameIndex ?? heard.last;
+    heard.shown = Math.max(heard.shown, heard.last); // the page plays a stream that has ended again from its beginning
   });
   player.on("error", ({ message }) => heard.errors.push(message));
   player.on("notice", ({ message }) => { heard.notices[message] = (heard.notices[message] ?? 0) + 1; });
@@ -185,7 +186,7 @@ class Page:
 
     @property
     def shown(self) -> int:
-        """The frame that was drawn last."""
+        """The newest frame that was drawn."""
         return self._tab.evaluate("heard.shown")
 
     def note(self, row: ViewerRow) -> None:
