@@ -106,17 +106,19 @@ def live(stream: Path, work: Path, options: argparse.Namespace) -> dict[str, Any
         with serving(folder.parent, nice=SERVER_NICE) as (address, server), Watched(server) as memory:
             time.sleep(2.0)
             for _ in range(options.rounds):
-                began = time.monotonic()
+                began, busy = time.monotonic(), processor_seconds(server)
                 time.sleep(options.alone_seconds)
-                spans.append({"players": 0, "span": (began, time.monotonic())})
-                began = time.monotonic()
+                busy = processor_seconds(server) - busy
+                spans.append({"players": 0, "span": (began, time.monotonic()), "server_busy": busy})
+                began, busy = time.monotonic(), processor_seconds(server)
                 counts = ("--fast", str(options.players - options.players // 2), "--slow", str(options.players // 2))
                 command = ("benchmarks.load_players", f"{address}streams/{NAME}/", *counts)
                 seconds = ("--seconds", str(options.seconds))
                 with process(*command, *seconds, output=subprocess.PIPE, nice=PLAYERS_NICE) as players:
                     assert players.stdout is not None
                     found = json.loads(players.stdout.read())
-                spans.append({"players": options.players, "span": (began, time.monotonic()), "found": found})
+                busy, span = processor_seconds(server) - busy, (began, time.monotonic())
+                spans.append({"players": options.players, "span": span, "found": found, "server_busy": busy})
             trainer.send_signal(signal.SIGTERM)
             trainer.wait(PATIENCE_SECONDS)
             busy = processor_seconds(server)
@@ -146,7 +148,7 @@ def wait_for(file: Path, running: "subprocess.Popen[str]") -> None:
 def judged(span: dict[str, Any], frames: list[dict[str, float]], folder: Path) -> dict[str, Any]:
     """A span of time: the trainer's frames in it, and what the players got. Frames while players join are left out."""
     began, ended = span["span"]
-    players = span.get("found", {"fast": [], "slow": []})
+    players = span.get("found", {"fast": [], "slow": [], "processor_seconds": 0.0})
     joined = [one["joined_seconds"] for one in players["fast"]]
     joined_by = began + max((one for one in joined if one is not None), default=0.0)
     inside = [one for one in frames if one["began"] >= joined_by and one["began"] + one["fit_seconds"] < ended]
@@ -158,6 +160,8 @@ def judged(span: dict[str, Any], frames: list[dict[str, float]], folder: Path) -
         "fit_seconds": [one["fit_seconds"] for one in inside],
         "busy_seconds": [one["busy_seconds"] for one in inside],
         "write_seconds": [one["write_seconds"] for one in inside],
+        "waited_seconds": [one["waited_seconds"] for one in inside],
+        "processor_seconds": {"server": span["server_busy"], "players": players["processor_seconds"]},
     }
     if span["players"]:
         right = digests(folder)

@@ -41,6 +41,10 @@ class Got:
     broken: int = 0
 
 
+class Refused(ConnectionError):
+    """The server answered, and did not give what was asked for."""
+
+
 class Connection:
     """A connection that is kept for one request after the other.
 
@@ -60,7 +64,8 @@ class Connection:
         """The body of an answer, from byte ``first`` on.
 
         Raises:
-            ConnectionError: the server closed the connection, or refused.
+            ConnectionError: the server closed the connection, or cannot be reached.
+            Refused: it answered with another status.
         """
         if self._streams is None:
             self._streams = await self._opened()
@@ -74,7 +79,7 @@ class Connection:
         except asyncio.IncompleteReadError as error:
             raise ConnectionResetError("closed in the middle") from error
         if head.split(b" ", 2)[1] not in (b"200", b"206", b"304"):
-            raise ConnectionRefusedError(f"{name}: {head[:40].decode()}")
+            raise Refused(f"{name}: {head[:40].decode()}")
         return body
 
     async def _body(self, reader: asyncio.StreamReader, length: int) -> bytes:
@@ -122,7 +127,7 @@ async def follow(address: str, got: Got, *, slow: bool) -> None:
                 await _catch_up(connection, manifest, got, total)
             except ConnectionError as error:
                 got.broken += isinstance(error, ConnectionResetError)
-                got.wrong += [str(error)] if isinstance(error, ConnectionRefusedError) else []
+                got.wrong += [str(error)] if isinstance(error, Refused) else []
                 connection.close()
                 await asyncio.sleep(0.5)
                 continue
@@ -194,7 +199,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     options = parser.parse_args()
     found = asyncio.run(play(options.address, fast=options.fast, slow=options.slow, seconds=options.seconds))
-    print(json.dumps({kind: [asdict(one) for one in players] for kind, players in found.items()}))
+    got = {kind: [asdict(one) for one in players] for kind, players in found.items()}
+    print(json.dumps({**got, "processor_seconds": time.process_time()}))
 
 
 if __name__ == "__main__":

@@ -10,8 +10,9 @@ def table(result: dict[str, Any]) -> str:
     live, spans = result["live"], result["live"]["spans"]
     load = result["load_average"]
     lines = [
-        "| players | trainer: seconds a frame, median (frames) | busy seconds | write, ms | server's memory, MB |",
-        "|---|---|---|---|---|",
+        "| players | trainer: seconds a frame, median (frames) | busy seconds | seconds without a core | write, ms | "
+        "server's memory, MB | processor seconds of server, players |",
+        "|---|---|---|---|---|---|---|",
         *(_span(one) for one in spans),
         "",
         *_ratio(spans),
@@ -30,10 +31,12 @@ def table(result: dict[str, Any]) -> str:
 
 def _span(one: dict[str, Any]) -> str:
     fit, busy = _median(one["fit_seconds"]), _median(one["busy_seconds"])
-    write = _median(one["write_seconds"])
+    write, waited = _median(one["write_seconds"]), _median(one["waited_seconds"])
+    busy_of = one["processor_seconds"]
     return (
-        f"| {one['players']} | {_shown(fit)} ({len(one['fit_seconds'])}) | {_shown(busy)} | "
-        f"{_shown(None if write is None else 1000 * write)} | {one['server_bytes'] / 1e6:.0f} |"
+        f"| {one['players']} | {_shown(fit)} ({len(one['fit_seconds'])}) | {_shown(busy)} | {_shown(waited)} | "
+        f"{_shown(None if write is None else 1000 * write)} | {one['server_bytes'] / 1e6:.0f} | "
+        f"{busy_of['server']:.1f}, {busy_of['players']:.1f} |"
     )
 
 

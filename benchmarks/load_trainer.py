@@ -14,7 +14,9 @@ from itertools import count, cycle
 from pathlib import Path
 from typing import Any
 
-from structgstream.codec.container.payload import FRAME
+import torch
+
+from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.sink import SegmentsSink
@@ -32,6 +34,11 @@ def renumbered(packet: Packet, index: int, *, fps: float) -> Packet:
     """The packet as that of another frame."""
     payload = FRAME.pack(index, index / fps) + packet.payload[FRAME.size :]
     return replace(packet, index=index, pts_seconds=index / fps, payload=payload)
+
+
+def waited_seconds() -> float:
+    """How long this thread was ready and had no core, since it began (Linux)."""
+    return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) / 1e9
 
 
 def main() -> None:
@@ -52,6 +59,7 @@ def main() -> None:
     store = FolderStore(options.folder)
     store.prepare()
     backend, sink = cpu_backend(), SegmentsSink(store, overwrite=True)
+    torch.set_num_threads(1)
     with open_stream(options.stream) as reader, options.log.open("w") as log:
         scene, header = reader.scene(len(reader) - 1), reader.header
         cameras = [header.camera(name) for name in header.rig.training]
@@ -59,13 +67,14 @@ def main() -> None:
         for index, packet in zip(count(), cycle(packets(reader)), strict=False):
             if ended:
                 break
-            began, worked = time.monotonic(), time.process_time()
+            began, worked, waited = time.monotonic(), time.process_time(), waited_seconds()
             for step in range(options.renderings):
                 render(scene, cameras[step % len(cameras)], backend)
             fitted = time.monotonic()
             sink.write(renumbered(packet, index, fps=header.fps))
             line = {"began": began, "fit_seconds": fitted - began, "write_seconds": time.monotonic() - fitted}
-            log.write(json.dumps({**line, "busy_seconds": time.process_time() - worked}) + "\n")
+            line["busy_seconds"], line["waited_seconds"] = time.process_time() - worked, waited_seconds() - waited
+            log.write(json.dumps(line) + "\n")
             log.flush()
         sink.close()
 

@@ -3,26 +3,38 @@
 
 import pytest
 
+from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
+from structgstream.key_frames import KeyFrames
 from structgstream.periods import PeriodConfig, PeriodPlan
 
 FPS, KEY_EVERY = 25.0, 5
 
 
-def begun(config: PeriodConfig, residuals: list[float], *, start: int = 0, most: int = 100) -> list[int]:
+def begun(
+    config: PeriodConfig,
+    residuals: list[float],
+    *,
+    start: int = 0,
+    most: int = 100,
+    times: list[float] | None = None,
+) -> list[int]:
     """The frames that begin periods; a run that is resumed at ``start`` measures again what its plan asks for."""
-    plan, found = PeriodPlan(config, key_interval=KEY_EVERY, most=most), [0]
+    plan, keys, found = PeriodPlan(config, most=most), KeyFrames(KEY_EVERY, FPS), [0]
     plan.begin(0, 0.0)
+    seconds = [index / FPS for index in range(len(residuals))] if times is None else times
     for index, residual in enumerate(residuals):
         if index == start > 0:
-            plan = PeriodPlan(config, key_interval=KEY_EVERY, most=most)
-            plan.begin(found[-1], found[-1] / FPS, number=len(found) - 1)
-            for again in plan.needed(index):
+            plan = PeriodPlan(config, most=most)
+            plan.begin(found[-1], seconds[found[-1]], number=len(found) - 1)
+            for again in plan.needed(seconds[:index], keys):
                 plan.add(again, residuals[again])
-        if index and plan.due(index, index / FPS) is not None:
-            plan.begin(index, index / FPS)
-            found.append(index)
-        if plan.measures(index):
+        if keys.kind(index, seconds[index]) is PacketKind.KEY:
+            if index and plan.due(index, seconds[index]) is not None:
+                plan.begin(index, seconds[index])
+                found.append(index)
+            keys.begin(index, seconds[index])
+        if plan.measures(index, seconds[index], keys):
             plan.add(index, residual)
     return found
 
@@ -70,12 +82,24 @@ def test_a_resumed_run_decides_the_same(config: PeriodConfig) -> None:
     assert len(whole) > 1
     for start in range(1, 40):
         assert begun(config, residuals, start=start) == whole, start
+    apart = [0.04, 0.04, 0.3, 0.05, 1.0, 0.04, 0.04]
+    times = [sum(apart[i % 7] for i in range(index)) for index in range(40)]
+    whole = begun(config, residuals, times=times)
+    assert len(whole) > 1
+    for start in range(1, 40):
+        assert begun(config, residuals, start=start, times=times) == whole, start
 
 
 def test_only_what_is_needed_is_measured() -> None:
-    plan = PeriodPlan(PeriodConfig(residual=1.5, frames=2), key_interval=KEY_EVERY, most=9)
+    plan, keys = PeriodPlan(PeriodConfig(residual=1.5, frames=2), most=9), KeyFrames(KEY_EVERY, FPS)
     plan.begin(0, 0.0)
-    assert [index for index in range(11) if plan.measures(index)] == [0, 3, 4, 8, 9]
+    found = []
+    for index in range(11):
+        if keys.kind(index, index / FPS) is PacketKind.KEY:
+            keys.begin(index, index / FPS)
+        if plan.measures(index, index / FPS, keys):
+            found.append(index)
+    assert found == [0, 3, 4, 8, 9]
 
 
 def test_the_last_period_goes_on() -> None:
@@ -93,4 +117,4 @@ def test_the_last_period_goes_on() -> None:
 )
 def test_values_that_mean_nothing_are_refused(config: PeriodConfig, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        PeriodPlan(config, key_interval=KEY_EVERY, most=9)
+        PeriodPlan(config, most=9)

@@ -11,10 +11,12 @@ measured on decoded scenes, so that a resumed run, which has the stream and the 
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from structgstream.errors import ConfigError
+from structgstream.key_frames import LEAST_FRAMES, KeyFrames
 
 
 @dataclass(frozen=True)
@@ -44,14 +46,13 @@ class PeriodPlan:
 
     Args:
         config: when.
-        key_interval: frames from one key packet to the next.
         most: number of periods that a stream may have; the last one goes on.
 
     Raises:
         ConfigError: a value is out of range.
     """
 
-    def __init__(self, config: PeriodConfig, *, key_interval: int, most: int) -> None:
+    def __init__(self, config: PeriodConfig, *, most: int) -> None:
         for name, value, least in (("seconds", config.seconds, 0.0), ("residual", config.residual, 1.0)):
             if value is not None and not least < value < math.inf:
                 raise ConfigError(f"--period.{name} {value:g} is not above {least:g}; leave it out for none.")
@@ -60,23 +61,25 @@ class PeriodPlan:
                 f"--period.frames {config.frames} and --period.share {config.share:g}: frames must be at least 1, and "
                 "the share above 0 and at most 1."
             )
-        self._config, self._interval, self._most = config, key_interval, most
+        self._config, self._most = config, most
         self._number = 0
         self._first: tuple[int, float] | None = None  # frame and time of the period's first frame
         self._floor = math.inf
-        self._last: deque[float] = deque(maxlen=config.frames)
+        self._last: deque[tuple[int, float]] = deque(maxlen=config.frames)  # frames and residuals
 
     def due(self, index: int, pts_seconds: float) -> str | None:
-        """Why frame ``index`` begins another period, in a few words; None if it does not."""
-        if self._first is None or index % self._interval or self._number + 1 >= self._most:
+        """Why key frame ``index`` begins another period, in a few words; None if it does not."""
+        if self._first is None or self._number + 1 >= self._most:
             return None
         config, seconds = self._config, pts_seconds - self._first[1]
         # Times are sums of rounded numbers.
         if config.seconds is not None and seconds >= config.seconds - 1e-6:
             return f"after {seconds:.3g} s"
-        whole = len(self._last) == config.frames and index - self._first[0] >= config.frames
-        if config.residual is not None and whole and min(self._last) > config.residual * self._floor:
-            return f"residual {min(self._last) / self._floor:.2f} times the first frame's"
+        measured = dict(self._last)
+        last = [measured[frame] for frame in range(index - config.frames, index) if frame in measured]
+        whole = len(last) == config.frames and index - self._first[0] >= config.frames
+        if config.residual is not None and whole and min(last) > config.residual * self._floor:
+            return f"residual {min(last) / self._floor:.2f} times the first frame's"
         return None
 
     def begin(self, index: int, pts_seconds: float, *, number: int | None = None) -> None:
@@ -88,21 +91,32 @@ class PeriodPlan:
         self._first = index, pts_seconds
         self._last.clear()
 
-    def measures(self, index: int) -> bool:
-        """Whether :meth:`add` needs the residual of frame ``index``."""
+    def measures(self, index: int, pts_seconds: float, keys: KeyFrames) -> bool:
+        """Whether :meth:`add` needs the residual of frame ``index``: it is the first, or soon a key frame follows.
+
+        Where more frames than the shortest group are asked for, that is every frame: of a frame before the last key
+        frame a resumed run could not tell otherwise what the first one had expected.
+        """
         if self._config.residual is None or self._first is None:
             return False
-        return index == self._first[0] or self._interval - index % self._interval <= self._config.frames
+        if index == self._first[0] or self._config.frames >= LEAST_FRAMES:
+            return True
+        return keys.near(index, pts_seconds, within=self._config.frames)
 
     def add(self, index: int, residual: float) -> None:
         """Take the residual of a decoded frame that :meth:`measures` asks for, in order."""
         if self._first is not None and index == self._first[0]:
             self._floor = residual
-        self._last.append(residual)
+        self._last.append((index, residual))
 
-    def needed(self, count: int) -> list[int]:
-        """The frames whose residuals a run that goes on with frame ``count`` has to measure again."""
+    @property
+    def remembered(self) -> int:
+        """How many of the last frames :meth:`needed` may name."""
+        return 0 if self._config.residual is None else self._config.frames
+
+    def needed(self, pts_seconds: Sequence[float], keys: KeyFrames) -> list[int]:
+        """The frames whose residuals a run that goes on after the frames with these times has to measure again."""
         assert self._first is not None, "a period has begun"
-        first = self._first[0]
+        first, count = self._first[0], len(pts_seconds)
         last = range(max(count - self._config.frames, first + 1), count)
-        return [index for index in (first, *last) if self.measures(index)]
+        return [index for index in (first, *last) if self.measures(index, pts_seconds[index], keys)]

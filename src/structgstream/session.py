@@ -20,6 +20,7 @@ from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
 from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of
 from structgstream.kernels.backend import Backend
+from structgstream.key_frames import KeyFrames
 from structgstream.lookahead import Lookahead
 from structgstream.periods import PeriodPlan
 from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
@@ -74,9 +75,10 @@ class Session(Generic[State, Memory]):
             config=pipeline.config,
             metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
         )
-        self._key_interval = pipeline.codec.key_interval(source.fps)
-        self._plan = PeriodPlan(pipeline.period, key_interval=self._key_interval, most=MAX_PERIODS)
-        self._controller = RateController(pipeline.rate, source.fps, key_interval=self._key_interval)
+        key_interval = pipeline.codec.key_interval(source.fps)
+        self._keys = KeyFrames(key_interval, source.fps)
+        self._plan = PeriodPlan(pipeline.period, most=MAX_PERIODS)
+        self._controller = RateController(pipeline.rate, source.fps, key_interval=key_interval)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
         if resumed is not None:
@@ -133,7 +135,9 @@ class Session(Generic[State, Memory]):
     def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
         """The tasks of frames; each is made after the previous frame is written, on which its pressure depends."""
         for frame, pictures in observed:
-            yield self._task(frame, pictures, begins=self._plan.due(frame.index, frame.pts_seconds))
+            key = self._keys.kind(frame.index, frame.pts_seconds) is PacketKind.KEY
+            begins = self._plan.due(frame.index, frame.pts_seconds) if key else None
+            yield self._task(frame, pictures, begins=begins)
 
     def _task(self, frame: MultiViewFrame, pictures: FramePictures, *, begins: str | None = None) -> FrameTask:
         pipeline = self._pipeline
@@ -163,13 +167,15 @@ class Session(Generic[State, Memory]):
         if self._coder is None or task.begins is not None:
             fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
             self._coder = self._open(header)
-        index = task.frame.index
-        kind = PacketKind.KEY if index % self._key_interval == 0 else PacketKind.DELTA
-        return self._coder.encode(fitted, index=index, pts_seconds=task.frame.pts_seconds, kind=kind)
+        index, pts_seconds = task.frame.index, task.frame.pts_seconds
+        kind = self._keys.kind(index, pts_seconds)
+        return self._coder.encode(fitted, index=index, pts_seconds=pts_seconds, kind=kind)
 
     def _write(self, packet: Packet, task: FrameTask) -> int:
         size = self._sink.write(packet)
         self._controller.add(size, packet.kind, begins=task.begins is not None)
+        if packet.kind is PacketKind.KEY:
+            self._keys.begin(packet.index, packet.pts_seconds)
         return size
 
     def _open(self, header: StreamHeader) -> FrameCoder[State]:
@@ -194,8 +200,9 @@ class Session(Generic[State, Memory]):
 
     def _measure(self, state: State, task: FrameTask) -> None:
         """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
-        if self._pipeline.residual is not None and self._plan.measures(task.frame.index):
-            self._plan.add(task.frame.index, self._pipeline.residual(state, task))
+        index = task.frame.index
+        if self._pipeline.residual is not None and self._plan.measures(index, task.frame.pts_seconds, self._keys):
+            self._plan.add(index, self._pipeline.residual(state, task))
 
     def _reopen(self, resumed: StoredStream[State]) -> None:
         """Continue an existing stream."""
@@ -203,6 +210,8 @@ class Session(Generic[State, Memory]):
         for info in resumed.packets:
             begins = info.index > 0 and resumed.period(info.index).first_frame == info.index
             self._controller.add(info.bytes, info.kind, begins=begins)
+            if info.kind is PacketKind.KEY:
+                self._keys.begin(info.index, info.pts_seconds)
 
     def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
         """The state from which the next frame is fitted, decoded from the existing stream."""
@@ -213,7 +222,7 @@ class Session(Generic[State, Memory]):
         first = period.first_frame
         older = resumed.scene(count - 2) if method.needs_older and count - 1 > first else None
         self._plan.begin(first, resumed.packets[first].pts_seconds, number=period.number)
-        for index in self._plan.needed(count):
+        for index in self._plan.needed([info.pts_seconds for info in resumed.packets], self._keys):
             self._measure(resumed.scene(index), self._task_again(index))
         return Past(state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older)
 

@@ -2,6 +2,7 @@
 """Cameras and queues on a terminal, and in lines."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -73,4 +74,29 @@ def test_the_dashboard_names_each_camera_with_its_faults(tmp_path: Path) -> None
         "frame 5",
     ):
         assert part in drawn
-    assert "total 3.00 s  fit 2.00 s" in drawn
+    assert "fit 2.00 s" in drawn
+
+
+def test_on_a_narrow_terminal_no_value_is_broken(tmp_path: Path) -> None:
+    out = Console(file=io.StringIO(), force_terminal=True, width=48, height=40, color_system=None)
+    with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
+        shown.frame(REPORT)
+    lines = text(out).splitlines()
+    for part in ("skipped 880", "waiting 4 (5.0 MB)", "pictures 0.25 s old", "train 31.20 dB", "10 anchors", "stuck 3"):
+        assert any(part in line for line in lines), part
+
+
+def test_of_many_cameras_on_few_lines_the_last_are_cut_off(tmp_path: Path) -> None:
+    many = replace(STATUS, cameras={f"cam{number:02d}": CameraStatus(True, number) for number in range(60)})
+    out = Console(file=io.StringIO(), force_terminal=True, width=100, height=20, color_system=None)
+    made = RunMetrics(tmp_path / "x.sgs", fps=30.0, live=lambda: many)
+    made.frame(REPORT)
+    with live_display(made.values, frames=None, console=out) as shown:
+        shown.frame(REPORT)
+        out.file.truncate(0)
+        shown._live.refresh()  # type: ignore[union-attr]
+        drawn = text(out)
+    assert "60/60 cameras" in drawn
+    assert "frame 5" in drawn
+    assert "cam00" in drawn
+    assert "cam59" not in drawn

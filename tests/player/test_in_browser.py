@@ -5,8 +5,15 @@ The player itself is tested in ``viewer/packages``.
 """
 
 import base64
+import getpass
+import os
+import shutil
+import socket
+import subprocess
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -21,16 +28,21 @@ from rigs import random_scene
 from serving import served
 from streams import compact_header, moved, write_stream
 from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import FileSink
+from structgstream.codec.stored_segments import resume_segments
 from structgstream.data.clip import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered
 from structgstream.kernels.backend import reference_backend
 from structgstream.notebook import Player
+from structgstream.player.bundle import bundle_path
+from structgstream.player.page import linked_page
 from structgstream.player.stream_file import StreamFile
 from structgstream.player.truth import Truth
 from structgstream.player.write import write_page, write_site
 
+DOCS = Path(__file__).parents[2] / "docs"
 FRAMES = 6
 WIDTH, HEIGHT = 240, 160  # The cameras' own shape, larger.
 PLAYER = 'document.querySelector("structgstream-player")'
@@ -129,6 +141,83 @@ def test_a_site_plays_from_a_server_that_knows_nothing(tab: Tab, stream: Path, t
         looked_through_first(tab)
         assert decibels(canvas_of(tab), stream, 3) > 40
         server.shutdown()
+    assert not tab.complaints
+
+
+@contextmanager
+def python_host(root: Path) -> Iterator[str]:
+    """The standard library's server of files."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(root))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+
+
+@contextmanager
+def nginx_host(root: Path) -> Iterator[str]:
+    """nginx with the configuration of docs/segments.md."""
+    program = shutil.which("nginx")
+    if program is None:
+        pytest.skip("there is no nginx on this machine")
+    work = root.parent / "nginx"
+    work.mkdir()
+    documented = (DOCS / "segments.md").read_text().split("```nginx\n")[1].split("```")[0]
+    site = documented.replace("root /srv;", f"root {root};")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    user = f"user {getpass.getuser()};" if os.geteuid() == 0 else ""
+    places = "".join(
+        f"{kind}_temp_path {work}/{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    page = f"location / {{ root {root}; types {{ text/html html; text/javascript js; }} }}"
+    (work / "nginx.conf").write_text(
+        f"{user} daemon off; pid {work}/pid; events {{}} http {{ access_log off; {places} "
+        f"server {{ listen 127.0.0.1:{port}; {page}\n{site} }} }}"
+    )
+    running = subprocess.Popen([program, "-c", str(work / "nginx.conf"), "-e", str(work / "errors")])
+    try:
+        while running.poll() is None:
+            with suppress(OSError):
+                socket.create_connection(("127.0.0.1", port), 1).close()
+                break
+            time.sleep(0.05)
+        yield f"http://127.0.0.1:{port}/"
+    finally:
+        running.terminate()
+        running.wait(20)
+
+
+@pytest.mark.parametrize("host", [python_host, nginx_host])
+def test_segments_play_from_a_host_of_files_while_they_are_written(
+    tab: Tab, stream: Path, tmp_path: Path, host: Callable[[Path], AbstractContextManager[str]]
+) -> None:
+    root, reader = tmp_path / "root", open_stream(stream)
+    store = FolderStore(root / "streams" / "live")
+    store.prepare()
+    sink, _ = resume_segments(store)
+    sink.open(reader.header)
+    packets = [[*reader.group(index)][-1] for index in range(FRAMES)]
+    for packet in packets[:2]:
+        sink.write(packet)
+    page = linked_page("live", stream="streams/live/manifest.json", attributes={"autoplay": ""})
+    (root / "index.html").write_text(page)
+    (root / "player.js").write_bytes(bundle_path().read_bytes())
+    with host(root) as address:
+        tab.open(f"{address}index.html", width=WIDTH, height=HEIGHT)
+        tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 1 && {PLAYER}.live")
+        for packet in packets[2:4]:  # the first of them is a key, so that a segment is closed
+            sink.write(packet)
+            tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === {packet.index}")
+        sink.close()
+        tab.wait_for(f"{PLAYER}.live === false")
+        again, _ = resume_segments(store)
+        again.open(reader.header)
+        for packet in packets[4:]:
+            again.write(packet)
+        tab.wait_for(f"{SHOWN} && {PLAYER}.live && {PLAYER}.stats.frameIndex === {FRAMES - 1}")
+        again.close()
+        looked_through_first(tab)
+        assert decibels(canvas_of(tab), stream, FRAMES - 1) > 40
     assert not tab.complaints
 
 

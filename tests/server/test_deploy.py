@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import time
+import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -185,6 +186,24 @@ def test_the_compose_file_and_the_image() -> None:
     assert "ports" not in serve  # only the proxy is reached from outside
     assert serve["command"][serve["command"].index("--proxy") + 1] in str(compose["networks"])
     assert "--secret-file" in serve["command"]
+
+
+def test_the_image_copies_what_is_there_and_installs_what_the_server_needs() -> None:
+    lines = (DEPLOY / "Dockerfile").read_text().splitlines()
+    kept = [
+        line[1:].removesuffix("/**")
+        for line in (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
+        if line.startswith("!")
+    ]
+    copied = [source for line in lines if line.startswith("COPY ") for source in line.split()[1:-1]]
+    assert sorted(copied) == sorted(kept)
+    assert all((DEPLOY.parent / source).exists() for source in copied)
+    project = tomllib.loads((DEPLOY.parent / "pyproject.toml").read_text())["project"]
+    wanted = {*project["dependencies"], *project["optional-dependencies"]["serve"]}
+    (install,) = (line for line in lines if line.startswith("RUN pip install"))
+    installed = re.findall(r'"([^"]+)"', install)
+    assert {"starlette", "uvicorn"} <= {re.split("[>=]", one)[0] for one in installed}
+    assert all(one in wanted for one in installed)
 
 
 def test_the_image_is_built() -> None:

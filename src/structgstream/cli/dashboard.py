@@ -2,11 +2,12 @@
 """What the user sees of a live run: a table of cameras and queues on a terminal, plain lines elsewhere."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, Group, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from structgstream.training.result import Step
 
 REFRESH = 4  # a second
+GAP = "  "
 Values = Callable[[], Mapping[str, Any]]
 
 
@@ -79,16 +81,40 @@ class Dashboard:
 
     def _drawn(self) -> Panel:
         values = self._values()
-        parts: list[RenderableType] = [Text(state_line(values)), Text(stages_line(values), style="dim")]
+        # What is cut off on a terminal of few lines is the end: cameras, of which the first line counts those present.
+        parts: list[RenderableType] = [Flow(state_parts(values)), Flow(stage_parts(values), style="dim"), Text()]
+        parts += [Flow(self._last.split("  "))] if self._last else []
+        parts += [Text(self._step or "waits for the next pictures", style="dim")]
         if values.get("live") is not None:
-            parts.append(cameras_table(values["live"]["cameras"]))
-        parts += [Text(self._last), Text(self._step, style="dim")]
+            parts += [Text(), cameras_table(values["live"]["cameras"])]
         title = f"{values['stream']}  {values['state']}  {_duration(values['running_seconds'])}"
         return Panel(Group(*parts), title=title, title_align="left")
 
 
+class Flow:
+    """Short texts one after the other, as many in a line as fit; none is broken that fits into one."""
+
+    def __init__(self, texts: Iterable[str], *, style: str = "") -> None:
+        self._texts, self._style = [text.strip() for text in texts if text.strip()], style
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        lines: list[str] = []
+        for text in self._texts:
+            longer = f"{lines[-1]}{GAP}{text}" if lines else ""
+            if longer and cell_len(longer) <= options.max_width:
+                lines[-1] = longer
+            else:
+                lines.append(text)
+        yield Text("\n".join(lines), style=self._style)
+
+
 def state_line(values: Mapping[str, Any]) -> str:
     """Rates, queues, room and delay in one line."""
+    return GAP.join(state_parts(values))
+
+
+def state_parts(values: Mapping[str, Any]) -> list[str]:
+    """Rates, queues, room and delay."""
     live = values.get("live")
     parts = []
     if live is not None:
@@ -108,13 +134,13 @@ def state_line(values: Mapping[str, Any]) -> str:
         parts.append(f"disk {human_bytes(values['disk_free_bytes'])} free")
     if values["resident_bytes"] is not None:
         parts.append(f"memory {human_bytes(values['resident_bytes'])}")
-    return "  ".join(parts)
+    return parts
 
 
-def stages_line(values: Mapping[str, Any]) -> str:
+def stage_parts(values: Mapping[str, Any]) -> list[str]:
     """Seconds by stage of the last frames' mean, the longest first."""
     stages = sorted(values["seconds_by_stage"].items(), key=lambda item: -item[1])
-    return "  ".join(f"{name} {seconds:.2f} s" for name, seconds in stages[:8])
+    return [f"{name} {seconds:.2f} s" for name, seconds in stages if name != "total"][:8]
 
 
 def cameras_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -123,9 +149,9 @@ def cameras_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
     for title in ("camera", "", "pictures", "queue", "faults"):
         table.add_column(title, justify="right" if title in ("pictures", "queue") else "left")
     for name, camera in cameras.items():
-        faults = "  ".join(f"{kind} {count:,}" for kind, count in camera["faults"].items())
+        faults = Flow(f"{kind} {count:,}" for kind, count in camera["faults"].items())
         state = Text("sends", style="green") if camera["present"] else Text("absent", style="red")
-        table.add_row(Text(name), state, f"{camera['decoded']:,}", str(camera["queued"]), Text(faults))
+        table.add_row(Text(name), state, f"{camera['decoded']:,}", str(camera["queued"]), faults)
     return table
 
 

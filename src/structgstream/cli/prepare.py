@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.interruption import interruptible
 from structgstream.cli.options import Folder, parse_options
 from structgstream.cli.step_display import step_display
 
@@ -110,7 +111,7 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
     with usage_errors():
         chosen = _chosen(options)
     try:
-        with step_display(console) as display:
+        with interruptible(), step_display(console) as display:
             made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
     except KeyboardInterrupt:
         raise Interrupted("Steps that are done are kept; continue with the same command.") from None

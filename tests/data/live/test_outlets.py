@@ -17,7 +17,7 @@ WAIT = 10.0
 
 
 def one_set(number: int) -> PictureSet:
-    return PictureSet(float(number), {"a": LivePicture(float(number), float(number), number)})
+    return PictureSet(float(number), {"a": LivePicture(float(number), float(number), number)}, float(number))
 
 
 def convert(found: PictureSet) -> MultiViewFrame:

@@ -3,8 +3,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from structgstream.data.live.picture_file import read_pictures, write_pictures
+from structgstream.data.live import picture_file
+from structgstream.data.live.picture_file import (
+    FORMAT,
+    WITHOUT_RESIDUALS,
+    read_pictures,
+    residuals,
+    restored,
+    write_pictures,
+)
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
 
@@ -27,6 +38,30 @@ def test_pictures_masks_times_and_facts_come_back(tmp_path: Path) -> None:
     assert read.masks["b"].dtype == bool
 
 
+@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))), st.booleans())
+def test_residuals_give_back_every_picture(image: np.ndarray, mirrored: bool) -> None:
+    view = image[:, ::-1] if mirrored else image
+    before = view.copy()
+    found = residuals(view)
+    assert np.array_equal(view, before), "the picture is left as it was"
+    assert np.array_equal(restored(found.reshape(view.shape)), view)
+
+
+def test_a_plane_leaves_nothing_but_its_edges() -> None:
+    down, across = np.mgrid[:40, :60]
+    image = np.stack([2 * down + across + offset for offset in (3, 50, 200)], axis=2).astype(np.uint8)
+    assert not residuals(image)[:, 1:, 1:].any()
+
+
+def test_files_of_an_earlier_version_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, frame = tmp_path / "x", some_frame()
+    monkeypatch.setattr(picture_file, "residuals", lambda image: image)
+    write_pictures(path, frame, sync=False)
+    path.write_bytes(path.read_bytes().replace(FORMAT.encode(), WITHOUT_RESIDUALS.encode()))
+    read, _ = read_pictures(path)
+    assert all((read.images[name] == frame.images[name]).all() for name in "ab")
+
+
 def test_a_file_that_is_cut_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x"
     write_pictures(path, some_frame(), sync=False)
@@ -43,7 +78,7 @@ def test_a_file_that_is_cut_or_changed_anywhere_is_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("old", "new"), [(b"[12, 16, 3]", b"[99999999, 16, 3]"), (b"[12, 16, 3]", b"[12, 16, 4]"), (b"pictures-1", b"x")]
+    ("old", "new"), [(b"[12, 16, 3]", b"[99999999, 16, 3]"), (b"[12, 16, 3]", b"[12, 16, 4]"), (b"pictures-2", b"x")]
 )
 def test_a_header_of_other_numbers_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
     path = tmp_path / "x"

@@ -27,7 +27,7 @@ FIRST_WAIT_SECONDS, MOST_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_STAMPS = 2**33
 MOST_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
-PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000"}  # half of FFmpeg's, so that pictures come sooner
+PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
 class Receiver(Protocol):
@@ -107,6 +107,7 @@ class CameraFeed:
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
         self._checksum: int | None = None
         self._damaged, self._shown = True, False
+        self._before: Packet | None = None
         self._gone_since: float | None = None
         self._paced: float | None = None
         self._without_stamp = 0
@@ -163,9 +164,12 @@ class CameraFeed:
         self._stamps.reconnect()
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
         self._damaged, self._shown = True, False  # until the first key frame, before which it is none that counts
+        self._before = None
         for packet in container.demux(stream):
             if self._stop.is_set():
                 return
+            if self._repeats(packet):
+                continue
             shift = None
             for frame in self._frames(packet):
                 wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
@@ -173,6 +177,20 @@ class CameraFeed:
             usable = self._proper and not self._damaged and not packet.is_corrupt
             if self._keeper is not None and packet.size and usable:
                 self._keeper.keep(packet, shift_seconds=self._stamps.shift if shift is None else shift)
+
+    def _repeats(self, packet: "Packet") -> bool:
+        """Whether the packet is the one before once more: decoded twice, its differences would be added twice."""
+        before, self._before = self._before, packet
+        if before is None or packet.pts is None or (packet.pts, packet.size) != (before.pts, before.size):
+            return False
+        if not packet.size or bytes(packet) != bytes(before):
+            return False
+        self._repeated()
+        return True
+
+    def _repeated(self) -> None:
+        text = "sends two pictures with one time stamp; the first is taken"
+        self._faults.tell(self.name, Fault.DUPLICATE, text)
 
     def _frames(self, packet: "Packet") -> "Iterable[VideoFrame]":
         """The pictures of a packet; none from a damage on until the next key frame."""
@@ -233,7 +251,7 @@ class CameraFeed:
             text = f"has set its clock by {placed.jump_seconds:+.3f} s; its pictures go on in step with their arrival"
             self._faults.tell(self.name, Fault.JUMP, text)
         elif placed.fault is Fault.DUPLICATE:
-            self._faults.tell(self.name, placed.fault, "sends two pictures with one time stamp; the first is taken")
+            self._repeated()
         elif placed.fault is Fault.REORDERED:
             self._faults.tell(self.name, placed.fault, "sends pictures whose time stamps go back; they are left out")
         return placed.seconds

@@ -38,10 +38,30 @@ class LivePicture:
 
 @dataclass(frozen=True)
 class PictureSet:
-    """Pictures of one instant, by camera, in the rig's order; cameras without one are missing."""
+    """Pictures of one instant.
+
+    Args:
+        seconds: the instant, on the common clock.
+        pictures: by camera, in the rig's order; cameras without one are missing.
+        matched: when the set was ready, monotonic seconds.
+    """
 
     seconds: float
     pictures: Mapping[str, LivePicture]
+    matched: float
+
+    @property
+    def times(self) -> "SetTimes":
+        """When its pictures were there, and when they were a set."""
+        return SetTimes(max(picture.arrived for picture in self.pictures.values()), self.matched)
+
+
+@dataclass(frozen=True)
+class SetTimes:
+    """When the last picture of a set came, and when the set was ready; monotonic seconds."""
+
+    arrived: float
+    matched: float
 
 
 @dataclass
@@ -122,7 +142,7 @@ class SetMatcher:
         self._last = lead.seconds
         for name in present:
             self._queues[name].misses = 0 if name in taken else self._queues[name].misses + 1
-        return PictureSet(lead.seconds, taken)
+        return PictureSet(lead.seconds, taken, now)
 
     def _instant(self, present: list[str]) -> LivePicture | None:
         """The leader's first picture that is far enough from the last set."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from structgstream.data.live.matching import PictureSet
+from structgstream.data.live.matching import PictureSet, SetTimes
 from structgstream.data.live.picture_file import read_pictures, write_pictures
 from structgstream.errors import StorageError
 from structgstream.frames import MultiViewFrame
@@ -52,6 +52,11 @@ class Outlet(Protocol):
         ...
 
     @property
+    def taken(self) -> SetTimes | None:
+        """Times of the set that was taken last; None before the first, and for those of an earlier run."""
+        ...
+
+    @property
     def status(self) -> QueueStatus: ...
 
     def close(self) -> None:
@@ -68,6 +73,7 @@ class Latest:
         self._convert = convert
         self._held: PictureSet | None = None
         self._skipped = 0
+        self.taken: SetTimes | None = None
         self._ready = threading.Condition()
 
     def put(self, found: PictureSet) -> None:
@@ -81,7 +87,10 @@ class Latest:
             if self._held is None:
                 self._ready.wait(timeout_seconds)
             found, self._held = self._held, None
-        return None if found is None else self._convert(found)
+        if found is None:
+            return None
+        self.taken = found.times
+        return self._convert(found)
 
     @property
     def status(self) -> QueueStatus:
@@ -112,7 +121,8 @@ class DiskQueue:
     def __init__(self, folder: Path, *, most_bytes: int, convert: Convert, resume: bool = False) -> None:
         self._folder, self._most, self._convert = folder, most_bytes, convert
         self._sets: deque[PictureSet] = deque()
-        self._files: deque[tuple[Path, int]] = deque()
+        self._files: deque[tuple[Path, int, SetTimes | None]] = deque()
+        self.taken: SetTimes | None = None
         self._bytes = self._skipped = 0
         self._full = self._slow = self._writing = self._closed = False
         self._failed: BaseException | None = None
@@ -121,12 +131,12 @@ class DiskQueue:
             folder.mkdir(parents=True, exist_ok=True)
             for file in sorted(folder.glob("set-*")):
                 if resume and file.suffix != ".part":
-                    self._files.append((file, file.stat().st_size))
+                    self._files.append((file, file.stat().st_size, None))
                 else:
                     file.unlink()
         except OSError as error:
             raise StorageError(f"The queue {folder} cannot be used ({error.strerror}).") from None
-        self._bytes = sum(size for _, size in self._files)
+        self._bytes = sum(size for _, size, _ in self._files)
         self._number = int(self._files[-1][0].name.removeprefix("set-")) + 1 if self._files else 0
         self._writer = threading.Thread(target=self._write, name="queue", daemon=True)
         self._writer.start()
@@ -161,7 +171,7 @@ class DiskQueue:
                 if self._failed is not None:
                     raise self._failed
                 return None
-            path, size = self._files.popleft()
+            path, size, self.taken = self._files.popleft()
         frame, _ = read_pictures(path)
         path.unlink(missing_ok=True)
         with self._changed:
@@ -197,7 +207,7 @@ class DiskQueue:
                 path = self._folder / f"set-{self._number:08d}"
                 self._number += 1
                 size = write_pictures(path, self._convert(found), sync=False)
-                self._add(path, size)
+                self._add(path, size, found.times)
             except BaseException as error:  # raised where the trainer asks for the next set
                 with self._changed:
                     self._failed = error
@@ -206,9 +216,9 @@ class DiskQueue:
                 with self._changed:
                     self._writing = False
 
-    def _add(self, path: Path, size: int) -> None:
+    def _add(self, path: Path, size: int, times: SetTimes) -> None:
         with self._changed:
-            self._files.append((path, size))
+            self._files.append((path, size, times))
             self._bytes += size
             if self._bytes >= self._most and not self._full:
                 self._full = True

@@ -27,11 +27,11 @@ from structgstream.data.live.calibration import (
 )
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.live.kept import KeptFrames, kept_folder
-from structgstream.data.live.matching import PictureSet
+from structgstream.data.live.matching import PictureSet, SetTimes
 from structgstream.data.live.outlets import GIGABYTE, DiskQueue, Latest, Outlet
 from structgstream.data.live.recording import Recording
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
-from structgstream.data.live.status import LiveStatus
+from structgstream.data.live.status import LiveStatus, SetAges
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import LEAST_CAMERAS
 from structgstream.data.video_index import load_av
@@ -119,7 +119,7 @@ class LiveSource:
         self._outlet: Outlet | None = None
         self._arrivals: Arrivals | None = None
         self._handed: deque[float] = deque(maxlen=64)
-        self._delay_seconds: float | None = None
+        self._ages: SetAges | None = None
         self._captured: dict[int, float] = {}
 
     @property
@@ -166,7 +166,7 @@ class LiveSource:
             faults=self.faults.counts,
             cameras=tuple(self._live.cameras),
             handed_per_second=rate,
-            delay_seconds=self._delay_seconds,
+            ages=self._ages,
         )
 
     def __enter__(self) -> "LiveSource":
@@ -190,7 +190,7 @@ class LiveSource:
                 self._kept.keep(frame, origin_seconds=origin)
                 if recording is not None:
                     self._note(recording, frame, seconds)
-                self._hand(frame)
+                self._hand(frame, outlet.taken)
                 yield frame
                 if self._options.frames is not None and index + 1 >= self._options.frames:
                     return
@@ -210,11 +210,13 @@ class LiveSource:
             return seconds - before - 1 / self.fps
         return origin
 
-    def _hand(self, frame: MultiViewFrame) -> None:
+    def _hand(self, frame: MultiViewFrame, times: SetTimes | None) -> None:
         now = self._now()
         self._handed.append(now)
         if frame.captured_unix_seconds is not None:
-            self._delay_seconds = now + self._unix_offset - frame.captured_unix_seconds
+            filmed = frame.captured_unix_seconds - self._unix_offset
+            arrived, matched = (None, None) if times is None else (times.arrived - filmed, times.matched - filmed)
+            self._ages = SetAges(arrived, matched, now - filmed)
             self._captured[frame.index] = frame.captured_unix_seconds
             self._captured.pop(frame.index - LATEST_KNOWN, None)
 

@@ -26,6 +26,21 @@ class CameraStatus:
 
 
 @dataclass(frozen=True)
+class SetAges:
+    """How old the pictures of a frame were, in seconds from when they were filmed; None where that is not known.
+
+    Args:
+        arrived_seconds: when the last of them came.
+        matched_seconds: when their set was ready.
+        handed_seconds: when the frame was handed to the trainer.
+    """
+
+    arrived_seconds: float | None
+    matched_seconds: float | None
+    handed_seconds: float
+
+
+@dataclass(frozen=True)
 class LiveStatus:
     """All of them.
 
@@ -37,7 +52,9 @@ class LiveStatus:
         waiting_sets: of them, wait for the trainer.
         waiting_bytes: of the files they wait in.
         handed_per_second: frames handed to the trainer.
-        delay_seconds: from filming to handing out, of the last frame; None before the first.
+        arrived_seconds: from filming until the last picture came, of the frame handed out last; None before the first.
+        matched_seconds: of that frame, from filming until its set was ready.
+        delay_seconds: of that frame, from filming to handing out.
     """
 
     cameras: Mapping[str, CameraStatus]
@@ -47,6 +64,8 @@ class LiveStatus:
     waiting_sets: int = 0
     waiting_bytes: int = 0
     handed_per_second: float = 0.0
+    arrived_seconds: float | None = None
+    matched_seconds: float | None = None
     delay_seconds: float | None = None
 
     @classmethod
@@ -58,7 +77,7 @@ class LiveStatus:
         faults: Mapping[str, Mapping[str, int]],
         cameras: tuple[str, ...],
         handed_per_second: float,
-        delay_seconds: float | None,
+        ages: SetAges | None,
     ) -> "LiveStatus":
         """The status of a source, whose cameras may not have been opened yet."""
         if arrivals is None or queue is None:
@@ -75,5 +94,7 @@ class LiveStatus:
             queue.waiting,
             queue.waiting_bytes,
             handed_per_second,
-            delay_seconds,
+            None if ages is None else ages.arrived_seconds,
+            None if ages is None else ages.matched_seconds,
+            None if ages is None else ages.handed_seconds,
         )

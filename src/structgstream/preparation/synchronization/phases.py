@@ -59,8 +59,11 @@ def phase_window(one: Recording, other: Recording, middle: float, lag: float) ->
     cross = np.conj(_whitened(first[:bins])) * _whitened(second[:bins])
     cross[(hertz < LOW_HERTZ) | (hertz > HIGH_HERTZ)] = 0
     curve = np.asarray(irfft(cross, 2 * WINDOW_SECONDS * GRID_HERTZ))
+    level = float(np.sqrt(np.mean(curve**2)))
+    if not level > 0:  # a microphone that was silent
+        return None
     reach = round(REACH_SECONDS * GRID_HERTZ)
-    near = np.concatenate([curve[-reach:], curve[: reach + 1]]) / float(np.sqrt(np.mean(curve**2)))
+    near = np.concatenate([curve[-reach:], curve[: reach + 1]]) / level
     best = int(near.argmax())
     if not 0 < best < len(near) - 1 or near[best] < LEAST_STANDING_OUT:
         return None

@@ -132,6 +132,11 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.behindSeconds ?? 0;
   }
 
+  /** Seconds since what is shown was filmed, by the clocks of this machine and the trainer's; NaN where that is not known. */
+  get ageSeconds(): number {
+    return this.running?.player.ageSeconds ?? Number.NaN;
+  }
+
   get paused(): boolean {
     return this.engine?.paused ?? true;
   }

@@ -187,6 +187,13 @@ export class Player extends Emitter<PlayerEvents> {
     if (this.stats.drawn) this.measure(time, this.stats);
   }
 
+  /** Seconds since the picture that is shown was filmed; undefined where that is not known. */
+  get ageSeconds(): number | undefined {
+    const filmed = this.engine?.frames.live?.filmedAtZero;
+    const shown = this.drawnStats?.ptsSeconds;
+    return filmed === undefined || shown === undefined ? undefined : Date.now() / 1000 - filmed - shown;
+  }
+
   get resources(): ResourceCounts {
     return this.options.renderer.resources;
   }

@@ -113,6 +113,19 @@ test("nothing new, older manifests of a cache, and trouble", async () => {
   ]);
 });
 
+test("after its end a run is asked for now and then for half an hour, as it may be resumed", async () => {
+  const live = new LiveRun(CLIP).write(3);
+  const answers = [() => new Response(bodyOf(live)), () => new Response(bodyOf(live.finish()))];
+  const gone = () => new Response("", { status: 503 });
+  const { asked, told } = await followed(3600, true, () => (answers.shift() ?? gone)());
+  expect(told).toEqual(["manifest 3", "manifest 4"]);
+  expect(asked.at(-1)!.at).toBeGreaterThan(1780);
+  expect(asked.at(-1)!.at).toBeLessThan(1820);
+  expect(asked.length).toBeLessThan(190);
+  const recording = await followed(60, true, () => new Response(bodyOf(live)));
+  expect(recording.asked.length).toBe(1);
+});
+
 test("a host that never answers is given up for this time", async () => {
   const live = new LiveRun(CLIP).write(3);
   const { told } = await followed(50, true, ({ after }, signal) => {

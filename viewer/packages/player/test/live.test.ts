@@ -113,6 +113,24 @@ test("a stream slower than its media: each frame when it comes, and when the nex
   expect(play.errors).toEqual([]);
 });
 
+test("frames that are seconds apart are shown as soon as they are there", async () => {
+  const live = run(8, { fps: 0.5, frameSeconds: 2, targetSeconds: 6 });
+  const play = opened(new Host({ "": live }));
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1) === 7, "newest frame");
+  for (const frame of [8, 9, 10]) {
+    await play.until(() => on() && play.engine.stalled, "stall");
+    const before = play.seconds;
+    live.write(1);
+    await play.until(() => on() && play.shown.at(-1) === frame, `frame ${frame}`);
+    // Its turn by the media would have been two seconds after the one before.
+    expect(play.seconds - before).toBeLessThan(1.5);
+  }
+  expect(play.notices).toEqual([]);
+  expect(play.errors).toEqual([]);
+});
+
 test("who is far behind jumps to a key frame, who is a little behind goes a little faster", async () => {
   const live = run(60);
   const play = opened(new Host({ "": live }));
@@ -218,6 +236,30 @@ test("the end of the run makes it a recording", async () => {
   expect(play.engine.edge.live).toBe(false);
   play.engine.play();
   await play.until(() => play.shown.at(-1) === 0, "first frame");
+});
+
+test("a run that is resumed after its end is gone on with", async () => {
+  const live = run(21);
+  const play = opened(new Host({ "": live }));
+  play.engine.play();
+  const on = goingOn(play);
+  await play.until(() => on() && play.shown.at(-1) === 20, "edge");
+  live.finish();
+  await play.until(() => on() && play.engine.ended, "end");
+  live.resume().write(3);
+  await play.until(() => on() && play.shown.at(-1) === 23, "newest frame");
+  expect(play.notices).toEqual(["The stream has ended; it is a recording now.", "The stream goes on."]);
+  expect(play.engine.edge.following).toBe(true);
+  expect(play.errors).toEqual([]);
+});
+
+test("how long ago a picture was filmed is known by the newest frame", async () => {
+  const live = run(4);
+  live.changed = { edge: { frame: 4, pts_seconds: 4 / 30, captured_unix_seconds: 1000, published_unix_seconds: 1001 } };
+  live.write(1);
+  const play = opened(new Host({ "": live }));
+  await play.settled();
+  expect(play.engine.frames.live?.filmedAtZero).toBeCloseTo(1000 - 4 / 30, 9);
 });
 
 describe("a host in trouble", () => {

@@ -119,6 +119,12 @@ export class LiveRun {
     return this;
   }
 
+  /** Goes on with what was finished, where the next packet is a key. */
+  resume(): this {
+    this.live = true;
+    return this;
+  }
+
   /** Writes the manifest as it is now. */
   tell(): void {
     const kept = this.options.windowSegments;

@@ -54,6 +54,8 @@ export interface LiveFacts {
   /** Time of the media from frame to frame of late. */
   readonly mediaSeconds: number;
   readonly fps: number;
+  /** Unix time at which frames of presentation time 0 would have been filmed, by the pace of the newest. */
+  readonly filmedAtZero: number | undefined;
 }
 
 /** All packets that are known of. */

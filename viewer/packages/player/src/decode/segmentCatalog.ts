@@ -191,13 +191,14 @@ function covering<Entry extends PageEntry | SegmentEntry>(
 }
 
 function liveFacts(manifest: Manifest): LiveFacts {
-  const { live, target_latency_seconds, frame_seconds, fps } = manifest;
+  const { live, target_latency_seconds, frame_seconds, fps, edge } = manifest;
   return {
     live,
     targetSeconds: target_latency_seconds,
     frameSeconds: frame_seconds ?? undefined,
     mediaSeconds: mediaPace(manifest) ?? 1 / fps,
     fps,
+    filmedAtZero: edge.captured_unix_seconds === null ? undefined : edge.captured_unix_seconds - edge.pts_seconds,
   };
 }
 

@@ -22,11 +22,14 @@ const FASTEST = 1.1;
 const JUMP_SECONDS = 5;
 const LEAST_GAIN_SECONDS = 1;
 
+/** Frames that are so far apart in the media are shown as soon as they are there: no motion has to be kept even. */
+const SPARSE_SECONDS = 0.8;
+
 /** What is shown may leave the window: from its beginning it is gone on so much of it later. */
 const LEFT_SHARE = 0.1;
 
 /** How the clock is to go on: so many times as fast as the media, or from another frame, and why. */
-export type Pace = { readonly rate: number; readonly to?: undefined } | { readonly to: number; readonly why: string };
+export type Pace = { readonly rate: number; readonly to?: undefined } | { readonly to: number; readonly why?: string };
 
 export class Edge {
   /** Whether the clock is to keep to the edge of a live stream; otherwise it plays what the viewer has chosen. */
@@ -66,12 +69,16 @@ export class Edge {
 
   /** Whether they come about as fast as they play, so that a distance to the edge can be kept. */
   get flows(): boolean {
-    return this.live && !this.slow;
+    return this.live && !this.slow && !this.sparse;
   }
 
   /** Whether the clock keeps to the edge. */
   get following(): boolean {
     return this.live && this.follow;
+  }
+
+  private get sparse(): boolean {
+    return this.timeline.live!.mediaSeconds > SPARSE_SECONDS;
   }
 
   /** When the newest frame begins, in seconds. */
@@ -102,6 +109,7 @@ export class Edge {
       return { to, why: "The host no longer has this part of the stream: went on after it." };
     }
     if (!this.following || rate !== 1) return { rate };
+    if (this.sparse && this.seconds > seconds) return { to: timeline.count - 1 };
     const behind = this.seconds - this.distance - seconds;
     if (behind > JUMP_SECONDS && timeline.ptsOf(this.start) > seconds + LEAST_GAIN_SECONDS)
       return { to: this.start, why: "This was too slow to keep up: went on with the newest frames." };

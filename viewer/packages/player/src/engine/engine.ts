@@ -232,7 +232,8 @@ export class Engine extends Emitter<EngineEvents> {
     const { clock, frames: timeline } = this;
     const pace = this.edge.pace(clock.at(now), this.rate);
     if (pace.to !== undefined) {
-      this.emit("notice", { message: pace.why });
+      if (pace.why) this.emit("notice", { message: pace.why });
+      this.setStalled(false);
       this.begin(pace.to, timeline.ptsOf(pace.to));
       return;
     }
@@ -320,6 +321,10 @@ export class Engine extends Emitter<EngineEvents> {
     timeline.take(facts);
     edge.changed(this.now());
     if (wasLive && !edge.live) this.emit("notice", { message: "The stream has ended; it is a recording now." });
+    if (!wasLive && edge.live && this.opened) {
+      this.emit("notice", { message: "The stream goes on." });
+      if (this.hasEnded) this.goLive();
+    }
     this.startIfThere();
     this.tellProgress();
     if (facts.complete && !timeline.count) this.fail(`${this.name} has a header and no whole frame to show.`, true);

@@ -47,7 +47,8 @@ export class ManifestFeed {
   ) {}
 
   /**
-   * Gives manifests until one is of a finished stream, or the address leads to a list of qualities.
+   * Gives manifests until one is of a finished stream, or the address leads to a list of qualities. A run that ends
+   * meanwhile may be resumed, so its host is asked a while longer.
    *
    * @throws SourceError the first one cannot be had, or the host has not answered for long
    */
@@ -55,6 +56,7 @@ export class ManifestFeed {
     const { firstPoll, longestPoll, backOff, stillAfter } = this.patience;
     let [wait, troubled, fresh] = [firstPoll, 0, performance.now()];
     while (!signal.aborted) {
+      if (this.isOver && performance.now() - fresh > stillAfter * 1000) return;
       const began = performance.now();
       try {
         const asked = this.last;
@@ -64,7 +66,7 @@ export class ManifestFeed {
         troubled = 0;
         if (found && !("sequence" in found)) return events.qualities(found);
         if (found) events.manifest(found);
-        if (found && !found.live) return;
+        if (found && !found.live && !asked?.live) return;
         const took = (performance.now() - began) / 1000;
         if (found) fresh = performance.now();
         wait = found ? firstPoll : Math.min(wait * backOff, this.longest((performance.now() - fresh) / 1000));
@@ -72,6 +74,10 @@ export class ManifestFeed {
         if (!asked || took < (found ? HELD_SECONDS : WAITED_SECONDS)) await pause(wait, signal);
       } catch (error) {
         if (signal.aborted) return;
+        if (this.isOver && !(error instanceof SourceError && error.final)) {
+          await pause(longestPoll, signal); // what there is plays without the host
+          continue;
+        }
         if (!this.last || (error instanceof SourceError && error.final) || troubled > stillAfter) throw error;
         wait = troubled ? Math.min(wait * 2, longestPoll) : firstPoll;
         troubled += wait;
@@ -79,6 +85,11 @@ export class ManifestFeed {
         await pause(wait, signal);
       }
     }
+  }
+
+  /** Whether the run has ended. */
+  private get isOver(): boolean {
+    return this.last?.live === false;
   }
 
   /** The longest wait for a frame that is expected soon; one that is overdue for long is asked for less often. */

@@ -33,6 +33,8 @@ export class Statistics {
     const index = stats?.frameIndex ?? engine.frameIndex;
     this.set("Frame", `${index} of ${engine.frames.count}`);
     this.set("Pictures a second", pictureSeconds ? (1 / pictureSeconds).toFixed(0) : "–");
+    const { ageSeconds } = this.player;
+    if (ageSeconds !== undefined) this.set("Filmed", `${ageSeconds.toFixed(1)} s ago`);
     this.set("Bit rate, last second", this.rateText(index));
     this.set("Fetched", bytesText(engine.stored.fetchedBytes));
     this.set("Splats drawn", stats ? countText(stats.splats) : "–");

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ctrl-C arrives, also where something on the way loses it."""
+
+import os
+import signal
+import threading
+import time
+from contextlib import suppress
+
+import pytest
+
+from structgstream.cli.interruption import interruptible
+
+LONG = 60.0
+
+
+def press() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.fixture(autouse=True)
+def as_before() -> None:
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def untouched() -> bool:
+    left = signal.getitimer(signal.ITIMER_REAL)
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGALRM)
+    return (left, *handlers) == ((0.0, 0.0), signal.default_int_handler, signal.SIG_DFL)
+
+
+def test_ctrl_c_leaves_the_block() -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        press()
+    assert untouched()
+
+
+def test_an_error_that_is_made_of_it_is_ctrl_c() -> None:
+    def library() -> None:
+        try:
+            press()
+        except KeyboardInterrupt:
+            raise RuntimeError("Cannot import the backend") from None
+
+    with pytest.raises(KeyboardInterrupt) as found, interruptible():
+        library()
+    assert isinstance(found.value.__cause__, RuntimeError)
+    assert untouched()
+
+
+def test_what_swallows_it_gets_it_again() -> None:
+    def library() -> None:
+        for _ in range(3):
+            with suppress(KeyboardInterrupt):
+                press()
+        time.sleep(LONG)
+
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), interruptible(again_seconds=0.05):
+        library()
+    assert time.monotonic() - begun < LONG
+    assert untouched()
+
+
+def test_a_block_that_ends_meanwhile_was_interrupted_all_the_same() -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible(), suppress(KeyboardInterrupt):
+        press()
+    assert untouched()
+
+
+def test_without_ctrl_c_nothing_is_changed() -> None:
+    with interruptible():
+        pass
+    with pytest.raises(RuntimeError, match="of its own"), interruptible():
+        raise RuntimeError("of its own")
+    assert untouched()
+
+
+def test_ignored_as_under_nohup_it_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interruptible():
+            press()
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_another_thread_has_no_signals() -> None:
+    seen = []
+
+    def run() -> None:
+        with interruptible():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert seen == [signal.default_int_handler]

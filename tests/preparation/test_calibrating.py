@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The step that finds the cameras: which way, what is refused, and what is kept of it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from captures import write_video
+from filmed import ring
+from rooms import write_room
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.data.posed import Calibration
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.preparation.calibrating import (
+    check_complete,
+    check_enough,
+    check_tone,
+    chosen_method,
+    from_other_tool,
+    packed,
+    scaled,
+    summary,
+    unpacked,
+)
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.footage import Footage
+from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.steps import Stored
+
+NONE = np.empty(0, np.intp)
+
+
+def footage(where: Path, *names: str) -> Footage:
+    return Footage(where, {name: where / f"{name}.mp4" for name in names}, {}, {})
+
+
+def solved(rig: dict[str, LensCamera], *, off: tuple[float, float] | None = (3.0, 4.0)) -> SolvedCalibration:
+    """A rig with one point in its middle, which is seen so many pixels away from where it is; None: no points."""
+    if off is None:
+        return SolvedCalibration(rig, np.empty((0, 3)), Observations(NONE, NONE, np.empty((0, 2)), NONE))
+    cameras = np.arange(len(rig), dtype=np.intp)
+    pixels = np.concatenate([filmed.pixels(np.zeros((1, 3))) + off for filmed in rig.values()])
+    return SolvedCalibration(rig, np.zeros((1, 3)), Observations(0 * cameras, cameras, pixels, 0 * cameras))
+
+
+def test_what_is_asked_for_is_taken(tmp_path: Path) -> None:
+    there = footage(tmp_path, "a", "b", "c")
+    for method in ("sfm", "board"):
+        assert chosen_method(there, PrepareOptions(calibration=method)) == method
+    assert chosen_method(there, PrepareOptions(board_videos=tmp_path)) == "board"
+    assert chosen_method(there, PrepareOptions()) == "sfm"
+
+
+def test_a_calibration_beside_the_videos_is_found_and_another_can_be_named(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos", cameras=3)
+    there = footage(tmp_path / "videos", "cam00", "cam01", "cam02")
+    found = chosen_method(there, PrepareOptions())
+    assert isinstance(found, Calibration)
+    assert found.where.name == "cameras.json"
+    assert chosen_method(there, PrepareOptions(board_videos=tmp_path)) == "board"
+    assert chosen_method(there, PrepareOptions(calibration="sfm")) == "sfm"
+    other = chosen_method(footage(tmp_path, "a"), PrepareOptions(calibration=tmp_path / "videos"))
+    assert isinstance(other, Calibration)
+    with pytest.raises(CalibrationError, match="nowhere"):
+        chosen_method(there, PrepareOptions(calibration=tmp_path / "nowhere"))
+
+
+def test_tone_curves_need_points(tmp_path: Path) -> None:
+    write_room(tmp_path, cameras=3)
+    given = chosen_method(footage(tmp_path, "cam00"), PrepareOptions())
+    toned = PrepareOptions(tone=True)
+    for method in ("board", given):
+        with pytest.raises(ConfigError, match="a board has none" if method == "board" else "cameras.json has none"):
+            check_tone(method, toned)
+        check_tone(method, replace(toned, refine=True))
+        check_tone(method, PrepareOptions())
+    check_tone("sfm", toned)
+
+
+def test_three_cameras_are_enough(tmp_path: Path) -> None:
+    check_enough(footage(tmp_path, "a", "b", "c"))
+    for names in (("a", "b"), ("a",)):
+        with pytest.raises(CalibrationError, match="needs 3 or more, as two cameras cannot confirm"):
+            check_enough(footage(tmp_path, *names))
+
+
+def test_every_camera_is_placed_or_named(tmp_path: Path) -> None:
+    found = solved(ring(3, radius=2.6, arc_degrees=40))
+    assert check_complete(found, footage(tmp_path, "cam00", "cam02")) is found
+    with pytest.raises(CalibrationError, match="'x', 'y'.* among the other 3: .* --without x y"):
+        check_complete(found, footage(tmp_path, "cam00", "x", "cam01", "y"))
+
+
+def test_the_calibration_of_another_tool_is_for_these_pictures(tmp_path: Path) -> None:
+    rig = write_room(tmp_path, cameras=3)
+    (tmp_path / "cameras.json").rename(tmp_path / "moved.json")
+    (tmp_path / "calibration").mkdir()
+    (tmp_path / "moved.json").rename(tmp_path / "calibration" / "cameras.json")
+    there = find(tmp_path)
+    calibration = chosen_method(there, PrepareOptions(calibration=tmp_path / "calibration"))
+    assert isinstance(calibration, Calibration)
+    found = from_other_tool(calibration, there)
+    assert list(found.cameras) == ["cam00", "cam01", "cam02"]
+    for name, filmed in found.cameras.items():
+        np.testing.assert_allclose(filmed.camera.viewmat.numpy(), rig[name].viewmat.numpy(), atol=1e-6)
+    assert (len(found.points), len(found.observations)) == (0, 0)
+    write_video(tmp_path / "cam03.mp4", [np.zeros((120, 160, 3), np.uint8)])
+    with pytest.raises(CalibrationError, match="cam03"):
+        from_other_tool(calibration, find(tmp_path))
+
+
+def find(where: Path) -> Footage:
+    from structgstream.preparation.footage import find_footage
+
+    return find_footage(where)
+
+
+@pytest.mark.parametrize(
+    "lens", [Pinhole(), RadialTangential(k1=-0.1, p2=0.001, k6=0.01), Fisheye(0.02, -0.005, 0.001)]
+)
+def test_what_is_kept_comes_back(lens: Lens) -> None:
+    """Through JSON, as steps keep it."""
+    rig = ring(3, radius=2.6, arc_degrees=40, lens=lens)
+    given = replace(solved(rig), missing=("x",), metres=True)
+    stored = packed(given)
+    found = unpacked(Stored(json.loads(json.dumps(stored.values)), stored.arrays))
+    assert (found.missing, found.metres, list(found.cameras)) == (("x",), True, list(rig))
+    for name, filmed in found.cameras.items():
+        assert filmed.lens == lens
+        assert (filmed.camera.viewmat == rig[name].camera.viewmat).all()
+        assert (filmed.camera.K == rig[name].camera.K).all()
+        assert (filmed.camera.width, filmed.camera.height) == (rig[name].camera.width, rig[name].camera.height)
+    np.testing.assert_array_equal(found.errors(), given.errors())
+
+
+def test_a_calibration_in_a_line() -> None:
+    rig = ring(3, radius=2.6, arc_degrees=40)
+    assert summary(solved(rig)) == "3 cameras, 1 points, median reprojection error 5.00 px"
+    assert summary(solved(rig, off=None)) == "3 cameras"
+
+
+def test_a_measured_distance_gives_metres() -> None:
+    found = solved(ring(3, radius=2.6, arc_degrees=40))
+    assert scaled(found, PrepareOptions()) is found
+    metric = scaled(found, PrepareOptions(distance=Distance("cam00", "cam02", 7.0)))
+    centers = [filmed.camera.center for filmed in metric.cameras.values()]
+    assert metric.metres
+    assert float((centers[0] - centers[2]).norm()) == pytest.approx(7.0)
+    with pytest.raises(CalibrationError):
+        scaled(found, PrepareOptions(distance=Distance("cam00", "nobody", 7.0)))

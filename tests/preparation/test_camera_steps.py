@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps up to a calibration: what each depends on, and what is done again."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rooms import write_room
+from structgstream.data.posed import Calibration
+from structgstream.data.timeline import Clock
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.preparation.calibrating import chosen_method
+from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.camera_steps import CameraSteps
+from structgstream.preparation.claiming import SOURCE
+from structgstream.preparation.job import Job, new_job
+from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.solvers import TIMESTAMPS, Clocks
+from structgstream.preparation.steps import FOLDER, Silent
+
+NONE = PrepareOptions(synchronize="none")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    where = tmp_path_factory.mktemp("room")
+    write_room(where, cameras=4)
+    return where
+
+
+def job(room: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
+    return new_job(room, capture, options=options, listener=Silent())
+
+
+def run(job: Job) -> tuple[Clocks, SolvedCalibration]:
+    """All steps with the calibration that lies beside the videos."""
+    steps = CameraSteps(job)
+    footage = steps.find()
+    method = chosen_method(footage, job.options)
+    clocks = steps.synchronize(footage, method)
+    solved = steps.calibrate(footage, clocks, method)
+    assert steps.synchronize_again(footage, clocks, method, solved) is clocks
+    return clocks, solved
+
+
+def test_what_was_found_is_described_and_claimed(room: Path, tmp_path: Path) -> None:
+    one = job(room, tmp_path / "out")
+    footage = CameraSteps(one).find()
+    assert footage.cameras == ("cam00", "cam01", "cam02", "cam03")
+    assert one.told["find"] == "4 videos, 160x120, 2 frames, 30 a second"
+    assert (tmp_path / "out" / FOLDER / SOURCE).is_file()
+    assert CameraSteps(job(room, tmp_path / "o", replace(NONE, without=("cam01",)))).find().cameras == (
+        "cam00", "cam02", "cam03",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "purpose"),
+    [
+        (replace(NONE, without=("nobody",)), "leave out"),
+        (replace(NONE, held_out=("nobody",)), "hold out"),
+        (replace(NONE, held_out=("cam00",), without=("cam00",)), "hold out"),
+        (replace(NONE, distance=Distance("cam00", "nobody", 1.0)), "measure from"),
+    ],
+)
+def test_cameras_that_are_not_there_cost_no_time(
+    room: Path, tmp_path: Path, options: PrepareOptions, purpose: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"has no camera .* to {purpose}; its cameras are cam0"):
+        CameraSteps(job(room, tmp_path / "out", options)).find()
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_cameras_claim_nothing(room: Path, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="needs 3 or more"):
+        CameraSteps(job(room, tmp_path / "out", replace(NONE, without=("cam00", "cam01")))).find()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_second_time_everything_is_there(room: Path, tmp_path: Path) -> None:
+    first = run(job(room, tmp_path / "out"))
+    again = job(room, tmp_path / "out")
+    clocks, solved = run(again)
+    assert again.steps.skipped == ["synchronize", "calibrate", "scale"]
+    assert clocks == first[0]
+    assert list(solved.cameras) == list(first[1].cameras)
+    for name, filmed in solved.cameras.items():
+        assert (filmed.camera.viewmat == first[1].cameras[name].camera.viewmat).all()
+    assert again.told["scale"].startswith("arbitrary units; --distance")
+
+
+@pytest.mark.parametrize(
+    ("options", "done"),
+    [
+        (replace(NONE, distance=Distance("cam00", "cam02", 3.0)), ["scale"]),
+        (replace(NONE, near=0.2, held_out=("cam01",)), []),
+        (replace(NONE, instants=5), ["calibrate", "scale"]),
+        (replace(NONE, without=("cam03",)), ["synchronize", "calibrate", "scale"]),
+    ],
+)
+def test_a_change_does_what_depends_on_it(room: Path, tmp_path: Path, options: PrepareOptions, done: list[str]) -> None:
+    run(job(room, tmp_path / "out"))
+    changed = job(room, tmp_path / "out", options)
+    _, solved = run(changed)
+    assert [step for step in ("synchronize", "calibrate", "scale") if step not in changed.steps.skipped] == done
+    assert solved.metres == (options.distance is not None)
+
+
+def test_a_table_of_times_that_comes_later_is_looked_at(tmp_path: Path) -> None:
+    write_room(tmp_path / "room", cameras=3)
+    run(job(tmp_path / "room", tmp_path / "out"))
+    lines = ["camera,frame,seconds", *(f"cam0{c},{i},{i / 30}" for c in range(3) for i in range(2))]
+    (tmp_path / "room" / TIMESTAMPS).write_text("\n".join(lines) + "\n")
+    again = job(tmp_path / "room", tmp_path / "out", PrepareOptions(synchronize="csv"))
+    clocks, _ = run(again)
+    assert "synchronize" not in again.steps.skipped
+    assert clocks.method == "csv"
+
+
+def test_clocks_come_back_as_they_were(room: Path, tmp_path: Path) -> None:
+    found = Clocks({"a": Clock(0.25, 1.00001), "b": Clock()}, "motion", "told", {"a": 0.001}, {"a": 0.002}, sure=False)
+    assert CameraSteps(job(room, tmp_path))._clocks("clocks", {}, lambda: found) == found
+    other = CameraSteps(job(room, tmp_path))._clocks("clocks", {}, lambda: pytest.fail("it is there"))
+    assert other == found
+
+
+def test_another_calibration_is_another_result(room: Path, tmp_path: Path) -> None:
+    run(job(room, tmp_path / "out"))
+    write_room(tmp_path / "other", cameras=4)
+    options = replace(NONE, calibration=tmp_path / "other")
+    changed = job(room, tmp_path / "out", options)
+    run(changed)
+    assert changed.steps.skipped == []
+    assert isinstance(chosen_method(CameraSteps(changed).find(), options), Calibration)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The steps from a calibration to a capture."""
+
+import errno
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rooms import write_room
+from structgstream.data.prepared import PreparedCapture, prepared_entries, read_prepared
+from structgstream.data.timeline import Clock
+from structgstream.data.tone import ToneCurve
+from structgstream.errors import ConfigError, StorageError
+from structgstream.preparation.calibrating import chosen_method, from_other_tool
+from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assembled, held_out_of, with_tones
+from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.job import Job, new_job
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.steps import FOLDER, Silent
+
+NONE = PrepareOptions(synchronize="none", near=0.25)
+
+
+def made(where: Path, options: PrepareOptions = NONE) -> tuple[Footage, SolvedCalibration, PreparedCapture]:
+    write_room(where, cameras=4)
+    footage = find_footage(where)
+    method = chosen_method(footage, options)
+    assert not isinstance(method, str)
+    solved = from_other_tool(method, footage)
+    clocks = {name: Clock(0.1 * index) for index, name in enumerate(footage.cameras)}
+    return footage, solved, assembled(footage, clocks, solved, options)
+
+
+def job(videos: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
+    found = new_job(videos, capture, options=options, listener=Silent())
+    found.steps._keys["synchronize"] = "a key"
+    return found
+
+
+def test_the_content_of_a_capture(tmp_path: Path) -> None:
+    _, solved, content = made(tmp_path / "videos")
+    assert (content.near, content.unit, content.fps) == (0.25, "arbitrary", pytest.approx(30.0))
+    assert content.held_out == frozenset()
+    for index, (name, camera) in enumerate(content.cameras.items()):
+        assert camera.files == f"videos/{name}.mp4"
+        assert camera.clock == Clock(0.1 * index)
+        assert camera.filmed == solved.cameras[name]
+    metric = assembled(find_footage(tmp_path / "videos"), {}, replace(solved, metres=True), replace(NONE, near=None))
+    assert metric.unit == "metres"
+    assert metric.near > 0
+    assert next(iter(metric.cameras.values())).clock == Clock()
+    wide = replace(NONE, field_of_view=40.0, size=(64, 48))
+    small = assembled(find_footage(tmp_path / "videos"), {}, solved, wide)
+    assert {(one.pinhole.width, one.pinhole.height) for one in small.cameras.values()} == {(64, 48)}
+
+
+def test_who_is_held_out(tmp_path: Path) -> None:
+    _, _, content = made(tmp_path / "videos", replace(NONE, held_out=("cam01", "cam03")))
+    assert content.held_out == {"cam01", "cam03"}
+    _, _, content = made(tmp_path / "videos", replace(NONE, held_out=("auto",)))
+    assert len(content.held_out) == 1
+    assert held_out_of(replace(NONE, held_out=()), None) == frozenset()  # pyright: ignore[reportArgumentType]
+
+
+def test_curves_are_of_those_cameras_that_have_one(tmp_path: Path) -> None:
+    _, _, content = made(tmp_path / "videos")
+    curve = ToneCurve.__new__(ToneCurve)
+    toned = with_tones(content, {"cam02": curve})
+    assert {name: camera.tone is curve for name, camera in toned.cameras.items()} == {
+        "cam00": False, "cam01": False, "cam02": True, "cam03": False,
+    }  # fmt: skip
+
+
+def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:
+    footage, _, content = made(tmp_path / "videos")
+    (tmp_path / "videos" / "masks" / "cam00").mkdir(parents=True)
+    (tmp_path / "videos" / "masks" / "cam00" / "0.png").write_bytes(b"mask")
+    one = job(tmp_path / "videos", tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    CaptureSteps(one).bring(footage, content)
+    for name in content.cameras:
+        assert (tmp_path / "out" / "videos" / f"{name}.mp4").samefile(tmp_path / "videos" / f"{name}.mp4")
+    assert (tmp_path / "out" / "masks" / "cam00" / "0.png").read_bytes() == b"mask"
+    assert read_prepared(tmp_path / "out").near == 0.25
+    assert one.told["bring"] == "4 cameras by hard link or copy"
+
+
+def test_a_near_plane_that_is_given_is_not_looked_for(tmp_path: Path) -> None:
+    _, _, content = made(tmp_path / "videos")
+    one = job(tmp_path / "videos", tmp_path / "out")
+    assert CaptureSteps(one).near(content) is content
+    assert "near" not in one.told
+
+
+def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, CaptureSteps, PreparedCapture]:
+    footage, _, content = made(tmp_path / "videos", options)
+    content = replace(content, cameras={n: replace(c, clock=Clock()) for n, c in content.cameras.items()})
+    one = job(tmp_path / "videos", tmp_path / "out", options)
+    steps = CaptureSteps(one)
+    (tmp_path / "out").mkdir(exist_ok=True)
+    steps.bring(footage, content)
+    return one, steps, content
+
+
+def test_near_plane_and_points_are_kept(tmp_path: Path) -> None:
+    options = replace(NONE, near=None)
+    one, steps, content = brought(tmp_path, options)
+    near = steps.near(content)
+    assert near.near > 0
+    pointed = steps.points(near)
+    points = np.load(tmp_path / "out" / POINTS)
+    assert points.shape[1] == 3
+    assert np.isfinite(points).all()
+    assert one.told["points"] == f"{len(points):,} points of frame 0"
+    written = read_prepared(tmp_path / "out")
+    assert (written.near, written.points) == (near.near, POINTS) == (pointed.near, pointed.points)
+    again, steps, content = brought(tmp_path, options)
+    assert prepared_entries(steps.points(steps.near(content))) == prepared_entries(pointed)
+    assert again.steps.skipped == ["near", "points"]
+
+
+def test_a_full_disk_while_points_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, steps, content = brought(tmp_path)
+
+    def full(path: object, values: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(StorageError, match=r"points.npy cannot be written \(No space left on device\)"):
+        steps.points(content)
+
+
+def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None:
+    one, steps, content = brought(tmp_path)
+    content = steps.points(content)
+    findings = steps.check(content)
+    report = tmp_path / "out" / "report" / "index.html"
+    assert report.is_file()
+    kept = json.loads((tmp_path / "out" / FOLDER / "check.json").read_text())
+    assert len(kept["values"]["findings"]) == len(findings)
+    report.unlink()
+    again, steps, content = brought(tmp_path)
+    assert steps.check(steps.points(content)) == findings
+    assert again.steps.skipped == ["points"]
+    assert report.is_file()
+    assert one.told["check"].endswith("findings; report/index.html")
+
+
+def test_a_size_that_cannot_be(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        made(tmp_path / "videos", replace(NONE, field_of_view=181.0))

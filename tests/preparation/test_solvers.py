@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls of the solvers: which clocks, which pictures, and what is said when there are none."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from captures import write_video
+from structgstream.data.timeline import Clock
+from structgstream.errors import CalibrationError, CaptureError
+from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.solvers import (
+    TIMESTAMPS,
+    Clocks,
+    board_footage,
+    first_clocks,
+    matched_pictures,
+    synchronized,
+)
+
+NAMES = ("a", "b", "c")
+
+
+def picture(value: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
+    return np.full((size[1], size[0], 3), value, np.uint8)
+
+
+def filmed(
+    folder: Path, *, frames: int = 12, size: tuple[int, int] = (64, 48), names: tuple[str, ...] = NAMES
+) -> Footage:
+    """Videos at 30 frames a second whose brightness rises by 10 a frame, by 1 a camera."""
+    for index, name in enumerate(names):
+        write_video(folder / f"{name}.mp4", [picture(20 + 10 * i + index, size) for i in range(frames)])
+    return find_footage(folder)
+
+
+def table(footage: Footage, late: dict[str, float]) -> None:
+    """``timestamps.csv`` of cameras that are late."""
+    lines = ["camera,frame,seconds"]
+    for name in footage.cameras:
+        lines += [f"{name},{i},{i / 30 + late.get(name, 0.0):.6f}" for i in range(len(footage.stamps(name)))]
+    (footage.where / TIMESTAMPS).write_text("\n".join(lines) + "\n")
+
+
+def test_one_signal_starts_all(tmp_path: Path) -> None:
+    found = synchronized(filmed(tmp_path), PrepareOptions(synchronize="none"))
+    assert (found.method, found.sure) == ("none", True)
+    assert dict(found.clocks) == dict.fromkeys(NAMES, Clock())
+    assert found.told.startswith("none: ")
+
+
+def test_a_table_of_times_is_taken_by_itself(tmp_path: Path) -> None:
+    footage = filmed(tmp_path)
+    table(footage, {"b": 0.1})
+    found = synchronized(footage, PrepareOptions())
+    assert (found.method, found.sure) == ("csv", True)
+    starts = {name: clock.offset_seconds for name, clock in found.clocks.items()}
+    assert starts["b"] - starts["a"] == pytest.approx(0.1, abs=1e-4)
+    assert starts["c"] - starts["a"] == pytest.approx(0.0, abs=1e-4)
+    assert set(found.late_seconds) == set(found.uncertainty_seconds) == set(NAMES)
+
+
+def test_single_pictures_have_no_clocks(tmp_path: Path) -> None:
+    footage = filmed(tmp_path, frames=1)
+    assert synchronized(footage, PrepareOptions(synchronize="audio")).method == "none"
+
+
+def test_who_asked_for_nothing_is_told_of_none(tmp_path: Path) -> None:
+    footage = filmed(tmp_path)
+    with pytest.raises(CaptureError, match="--synchronize none") as asked:
+        synchronized(footage, PrepareOptions())
+    with pytest.raises(CaptureError) as named:
+        synchronized(footage, PrepareOptions(synchronize="audio"))
+    assert "Cameras that one signal starts" in str(asked.value)
+    assert "Cameras that one signal starts" not in str(named.value)
+
+
+def test_before_a_calibration_motion_may_fail_and_nothing_else(tmp_path: Path) -> None:
+    footage = filmed(tmp_path)
+    for how in ("auto", "motion"):
+        found = first_clocks(footage, PrepareOptions(synchronize=how))
+        assert (found.method, found.sure, dict(found.clocks)) == ("motion", False, dict.fromkeys(NAMES, Clock()))
+        assert found.told.startswith("motion: not without the calibration (")
+    with pytest.raises(CaptureError):
+        first_clocks(footage, PrepareOptions(synchronize="audio"))
+    (tmp_path / TIMESTAMPS).write_text("a,b\n")
+    with pytest.raises(CaptureError, match="timestamps.csv"):
+        first_clocks(footage, PrepareOptions())
+
+
+def test_videos_without_a_moment_in_common(tmp_path: Path) -> None:
+    footage = filmed(tmp_path)
+    table(footage, {"b": 9.0})
+    with pytest.raises(CaptureError, match="no instant in common"):
+        synchronized(footage, PrepareOptions())
+
+
+def test_pictures_are_of_the_same_moments(tmp_path: Path) -> None:
+    """Brightness says which frame it is."""
+    footage = filmed(tmp_path)
+    clocks = {name: Clock(index * 2 / 30) for index, name in enumerate(NAMES)}
+    shots = matched_pictures(footage, Clocks(clocks, "none", ""), PrepareOptions(instants=3))
+    seen = {name: [round((float(shot.mean()) - 20 - index) / 10) for shot in pictures_of(shots, name)]
+            for index, name in enumerate(NAMES)}  # fmt: skip
+    assert len(seen["a"]) == 3
+    assert [[a - b for a, b in zip(seen["a"], seen[name], strict=True)] for name in NAMES] == [
+        [0] * 3,
+        [2] * 3,
+        [4] * 3,
+    ]
+
+
+def pictures_of(shots: object, name: str) -> list[np.ndarray]:
+    found = shots[name]  # type: ignore[index]
+    return [np.asarray(one) for one in (found if isinstance(found, list) else list(found))]
+
+
+def test_the_board_is_filmed_by_all_in_the_same_mode(tmp_path: Path) -> None:
+    footage = filmed(tmp_path / "take")
+    filmed(tmp_path / "board", frames=3, names=(*NAMES, "d"))
+    options = PrepareOptions(board_videos=tmp_path / "board")
+    assert board_footage(footage, options).cameras == NAMES
+    (tmp_path / "board" / "b.mp4").unlink()
+    with pytest.raises(CaptureError, match="board has no video of camera 'b' of .*take; film the board with it too"):
+        board_footage(footage, options)
+    filmed(tmp_path / "board", frames=3, names=("b",), size=(48, 64))
+    with pytest.raises(CalibrationError, match="'b' filmed the board with 48x64 pixels .* and the take with 64x48"):
+        board_footage(footage, options)
+    assert board_footage(footage.only(("a", "c")), replace(options, fps=25)).cameras == ("a", "c")
