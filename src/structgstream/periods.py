@@ -100,6 +100,11 @@ class PeriodPlan:
             self._floor = residual
         self._last.append(residual)
 
+    @property
+    def remembered(self) -> int:
+        """How many of the last frames :meth:`needed` may name."""
+        return 0 if self._config.residual is None else self._config.frames
+
     def needed(self, count: int) -> list[int]:
         """The frames whose residuals a run that goes on with frame ``count`` has to measure again."""
         assert self._first is not None, "a period has begun"
