@@ -155,15 +155,21 @@ def measured(options: argparse.Namespace, folder: Path) -> list[Row]:
     seed, trainer = options.seed, real_writer(options.real_frames)
     real_seconds = timed(trainer, folder / "real")
     sent: Sent = repeated(open_stream(folder / "real"), frames=FRAMES)
+    periods = repeated(open_stream(folder / "real"), frames=FRAMES, each_a_period=True)
 
     def add(row: Row) -> None:
         rows.append(row)
         print(table([row]).splitlines()[-1], flush=True)
 
-    for name, writer in (("segments", segments_writer(sent)), ("file", file_writer(sent))):
+    for name, stream, writer in (
+        ("segments", sent, segments_writer(sent)),
+        ("file", sent, file_writer(sent)),
+        ("segments of 8 periods", periods, segments_writer(periods)),
+        ("file of 8 periods", periods, file_writer(periods)),
+    ):
         limit = timed(writer, folder / name)
         row = Row(f"kill -9, {name}")
-        add(killed_streams(row, writer, kills=options.kills, whole=sent.whole, folder=folder, seed=seed, limit=limit))
+        add(killed_streams(row, writer, kills=options.kills, whole=stream.whole, folder=folder, seed=seed, limit=limit))
     if options.real:
         whole, row = content(folder / "real"), Row("kill -9, trainer and segments")
         limit = real_seconds

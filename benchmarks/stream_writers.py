@@ -47,29 +47,35 @@ class Sent:
         header: its header.
         packets: its packets.
         whole: its bytes as a file.
+        begins: frames with which other periods begin, all with the same header.
     """
 
     header: StreamHeader
     packets: list[Packet]
     whole: bytes
+    begins: frozenset[int] = frozenset()
 
 
-def repeated(reader: StreamReader, *, frames: int) -> Sent:
+def repeated(reader: StreamReader, *, frames: int, each_a_period: bool = False) -> Sent:
     """A stream of ``frames`` packets, which are those of ``reader`` again and again with other numbers and times.
 
-    Its containers are right; decoding it would make no sense.
+    With ``each_a_period`` every repetition is another period. Its containers are right; decoding it makes no sense.
     """
+    begins = frozenset(range(len(reader), frames, len(reader))) if each_a_period else frozenset[int]()
+    header = replace(reader.header, periods=each_a_period)
     packets = []
     for index in range(frames):
         (*_, one) = reader.group(index % len(reader))
         payload = FRAME.pack(index, index / reader.header.fps) + one.payload[FRAME.size :]
         packets.append(replace(one, index=index, pts_seconds=index / reader.header.fps, payload=payload))
     sink = MemorySink()
-    sink.open(reader.header)
+    sink.open(header)
     for packet in packets:
+        if packet.index in begins:
+            sink.begin(header)
         sink.write(packet)
     sink.close()
-    return Sent(reader.header, packets, sink.data)
+    return Sent(header, packets, sink.data, begins)
 
 
 def segments_writer(sent: Sent) -> Writer:
@@ -99,6 +105,8 @@ def send(sink: PacketSink, sent: Sent, start: int, report: Report) -> None:
     sink.open(sent.header)
     for packet in sent.packets[start:]:
         time.sleep(PACE_SECONDS)
+        if packet.index in sent.begins:
+            sink.begin(sent.header)
         sink.write(packet)
         report(packet.index)
     sink.close()

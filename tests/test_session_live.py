@@ -2,7 +2,7 @@
 """Sessions of sources whose length nobody knows: asked when the trainer is free, ended, resumed exactly."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,15 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.frames import MultiViewFrame
+from structgstream.periods import PeriodConfig
+from structgstream.presets import StreamConfig
 from structgstream.recorder import record
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
 
 RIG = arc_rig(4, width=40, height=30)
+PERIODS = replace(QUICK, key_interval_seconds=0.1, period=PeriodConfig(seconds=0.7, residual=9.0, frames=2, share=0.5))
+"""Another period begins with frame 3."""
 
 
 def filmed(number: int) -> dict[str, np.ndarray]:
@@ -58,6 +62,9 @@ class Now:
         self.instant = 0
         self._kept = KeptFrames(self.folder, cameras=self.rig.training, resume=self.resume)
 
+    def keep(self, first: int, *, last: int) -> None:
+        self._kept.need(first, last=last)
+
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         index = start
         for frame in self._kept.following(start) if self.resume else ():
@@ -93,17 +100,22 @@ def test_a_queue_of_all_frames_may_be_read_ahead(tmp_path: Path) -> None:
     assert source.asked[:2] == [0, 0]
 
 
-@pytest.mark.parametrize("killed_after", [1, 3])
-@pytest.mark.parametrize("newest_only", [True, False])
+@pytest.mark.parametrize(
+    ("killed_after", "newest_only", "config"),
+    [(1, True, QUICK), (3, True, QUICK), (1, False, QUICK), (3, False, QUICK)]
+    + [(killed_after, True, PERIODS) for killed_after in (3, 4, 5)],
+)
 def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
-    tmp_path: Path, killed_after: int, newest_only: bool
+    tmp_path: Path, killed_after: int, newest_only: bool, config: StreamConfig
 ) -> None:
-    pipeline, backend = stream_pipeline(QUICK), quickest_backend()
+    pipeline, backend = stream_pipeline(config), quickest_backend()
     assert pipeline.method.needs_before, "otherwise no picture is needed again"
     whole = tmp_path / "whole.sgs"
-    list(record(whole, Now(kept_folder(whole), 5), pipeline, backend).reports)
+    list(record(whole, Now(kept_folder(whole), 6), pipeline, backend).reports)
+    with open_stream(whole) as reader:
+        assert [period.first_frame for period in reader.periods] == [0, 3][: 1 + config.period.enabled]
     path = tmp_path / "x.sgs"
-    run = record(path, Now(kept_folder(path), 5, newest_only=newest_only), pipeline, backend)
+    run = record(path, Now(kept_folder(path), 6, newest_only=newest_only), pipeline, backend)
     killed, kept = b"", {}
     for report in run.reports:
         if report.index + 1 == killed_after:
@@ -116,9 +128,9 @@ def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
         file.unlink()
     for name, content in kept.items():
         (kept_folder(path) / name).write_bytes(content)
-    again = record(path, Now(kept_folder(path), 5, resume=True), pipeline, backend, resume=True)
+    again = record(path, Now(kept_folder(path), 6, resume=True), pipeline, backend, resume=True)
     assert again.done == killed_after
-    assert [report.index for report in again.reports] == list(range(killed_after, 5))
+    assert [report.index for report in again.reports] == list(range(killed_after, 6))
     assert path.read_bytes() == whole.read_bytes()
 
 

@@ -14,7 +14,7 @@ from typing import Generic
 from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
-from structgstream.data.source import FrameStream, frame_count, may_read_ahead
+from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
@@ -193,6 +193,7 @@ class Session(Generic[State, Memory]):
         method, begins = self._pipeline.method, past is None or task.begins is not None
         if begins:
             self._plan.begin(task.frame.index, task.frame.pts_seconds)
+            keep_frames(self._source, task.frame.index, last=self._plan.remembered)
         self._measure(state, task)
         if begins:
             return Past(state, method.prepare(state, lambda: task))
@@ -222,6 +223,7 @@ class Session(Generic[State, Memory]):
         first = period.first_frame
         older = resumed.scene(count - 2) if method.needs_older and count - 1 > first else None
         self._plan.begin(first, resumed.packets[first].pts_seconds, number=period.number)
+        keep_frames(self._source, first, last=self._plan.remembered)
         for index in self._plan.needed([info.pts_seconds for info in resumed.packets], self._keys):
             self._measure(resumed.scene(index), self._task_again(index))
         return Past(state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older)

@@ -36,6 +36,16 @@ def test_frame_0_and_the_last_frames_are_kept_and_no_more(tmp_path: Path) -> Non
     assert list(again.following(20)) == []
 
 
+def test_what_a_period_needs_is_kept_instead(tmp_path: Path) -> None:
+    frames = kept(tmp_path / "x.live")
+    for index in range(20):
+        frames.keep(frame(index), origin_seconds=0.0)
+        if index == 12:
+            frames.need(11, last=4)
+    found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").iterdir())
+    assert found == [11, *range(14, 20)]
+
+
 def test_frames_of_a_run_that_was_resumed_earlier_are_removed(tmp_path: Path) -> None:
     """A stream that lost its last frames goes on before those that are kept."""
     frames = kept(tmp_path / "x.live")

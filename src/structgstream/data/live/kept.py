@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures that a resumed live run needs, which no camera sends twice: of frame 0 and of the last frames.
+"""The pictures that a resumed live run needs, which no camera sends twice: of a period's first and of the last frames.
 
 They lie in ``OUT.live`` beside the stream: a frame's file is complete before the frame is handed out, so whenever the
 run ends, those of the frame before the first one that the stream lacks are there. What is older than :data:`LAST`
@@ -16,7 +16,7 @@ from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
 
 LAST = 3
-"""Frames besides frame 0: one that is fitted, the one before it, and one that may have been read ahead."""
+"""Frames besides the period's first: one that is fitted, the one before it, and one that may have been read ahead."""
 NAME = re.compile(r"frame-(\d{8})\.pictures")
 
 
@@ -39,8 +39,13 @@ class KeptFrames:
 
     def __init__(self, folder: Path, *, cameras: tuple[str, ...], resume: bool) -> None:
         self._folder, self._cameras = folder, cameras
+        self._first, self._last = 0, LAST
         if not resume:
             self._remove(self._files())
+
+    def need(self, first: int, *, last: int) -> None:
+        """From now on frame ``first`` is kept, and so are ``last`` frames before the one that is fitted."""
+        self._first, self._last = first, max(last + LAST - 1, LAST)
 
     def keep(self, frame: MultiViewFrame, *, origin_seconds: float) -> None:
         """Keeps a frame's pictures, and removes those that are no longer needed.
@@ -60,7 +65,9 @@ class KeptFrames:
             raise StorageError(f"The folder {self._folder} cannot be made ({error.strerror}).") from None
         kept = replace(frame, images=images, masks=masks)
         write_pictures(self._path(frame.index), kept, sync=True, origin_seconds=origin_seconds)
-        self._remove({n: file for n, file in self._files().items() if n > frame.index or 0 < n <= frame.index - LAST})
+        oldest = frame.index - self._last + 1
+        files = self._files().items()
+        self._remove({n: file for n, file in files if n > frame.index or (n < oldest and n != self._first)})
 
     def following(self, start: int) -> Iterator[MultiViewFrame]:
         """The kept frames from number ``start`` on, without a gap; none if the next frame is ``start``.
