@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Broken files become one sentence that names file, camera and remedy."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from structgstream.data.calibration_files import reading
+from structgstream.data.calibration_files.reading import each_camera, first_json_with, readable, reason
+from structgstream.data.posed import PosedCamera
+from structgstream.errors import CalibrationError
+
+FILE = Path("rig.json")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (KeyError("fx"), "no 'fx'"),
+        (ValueError("odd"), "ValueError: odd"),
+        (PermissionError(13, "Permission denied", "rig.json"), "Permission denied"),
+        (OSError("odd"), "OSError: odd"),
+    ],
+)
+def test_what_was_wrong_in_a_clause(error: Exception, said: str) -> None:
+    assert reason(error) == said
+    with pytest.raises(CalibrationError) as found, readable(FILE, "fx and fy"):
+        raise error
+    assert str(found.value) == f"rig.json cannot be read ({said}); expected fx and fy."
+
+
+def test_what_is_told_already_is_not_told_again() -> None:
+    with pytest.raises(CalibrationError, match="^as it is$"), readable(FILE, "more"):
+        raise CalibrationError("as it is")
+    with pytest.raises(ZeroDivisionError), readable(FILE, "more"):
+        raise ZeroDivisionError  # a mistake of ours
+
+
+def camera(name: str, entry: dict) -> PosedCamera:
+    if entry.get("own"):
+        raise CalibrationError("its own sentence")
+    return PosedCamera(name, np.eye(4), np.eye(3) * entry["fx"], None)
+
+
+def test_a_broken_entry_names_its_camera() -> None:
+    found = each_camera([("a", {"fx": 1}), ("b", {"fx": 2})], camera, file=FILE, expected="fx")
+    assert [one.name for one in found] == ["a", "b"]
+    with pytest.raises(CalibrationError, match=r"^Camera 'b' of rig\.json cannot be read \(no 'fx'\); expected fx\.$"):
+        each_camera([("a", {"fx": 1}), ("b", {})], camera, file=FILE, expected="fx")
+    with pytest.raises(CalibrationError, match="^its own sentence$"):
+        each_camera([("b", {"own": True})], camera, file=FILE, expected="fx")
+    with pytest.raises(CalibrationError, match=r"^rig\.json holds no cameras; expected fx\.$"):
+        each_camera([], camera, file=FILE, expected="fx")
+
+
+def test_the_first_file_with_a_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert first_json_with(tmp_path, "cams") == ()
+    (tmp_path / "a.json").write_text('{"cameras": "cams"')
+    (tmp_path / "b.txt").write_text('{"cams": 1}')
+    (tmp_path / "c.json").write_text(json.dumps({"cams": 1}))
+    (tmp_path / "d.json").write_text(json.dumps({"cams": 1}))
+    assert first_json_with(tmp_path, "cams") == (tmp_path / "a.json",)
+    (tmp_path / "a.json").unlink()
+    assert first_json_with(tmp_path, "cams") == (tmp_path / "c.json",)
+    monkeypatch.setattr(reading, "LARGEST_BYTES", 5)
+    assert first_json_with(tmp_path, "cams") == ()

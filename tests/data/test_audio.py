@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sound of a video, on the clock of its pictures."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from captures import write_video
+from structgstream.data import audio
+from structgstream.data.audio import read_audio
+from structgstream.errors import CaptureError
+
+RATE = 48_000
+
+
+def with_sound(path: Path, *, start: float = 0.0, rate: int = RATE, seconds: float = 1.0) -> Path:
+    """A video whose sound, a click in its middle, begins at ``start`` seconds."""
+    samples = np.zeros(round(rate * seconds), np.float32)
+    samples[len(samples) // 2] = 0.9
+    with av.open(str(path), "w") as container:
+        video = container.add_stream("mpeg4", rate=30)
+        video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
+        sound = container.add_stream("pcm_f32le", rate=rate)
+        sound.layout = "mono"
+        for index in range(5):
+            picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")
+            picture.pts = index
+            container.mux(video.encode(picture))
+        container.mux(video.encode(None))
+        frame = av.AudioFrame.from_ndarray(samples[None], format="flt", layout="mono")
+        frame.sample_rate, frame.pts = rate, round(start * rate)
+        container.mux(sound.encode(frame))
+        container.mux(sound.encode(None))
+    return path
+
+
+@pytest.mark.parametrize("start", [0.0, 0.25])
+def test_sample_k_sounds_at_k_over_the_rate(tmp_path: Path, start: float) -> None:
+    samples = read_audio(with_sound(tmp_path / "a.mkv", start=start))
+    assert samples is not None
+    assert samples.dtype == np.float32
+    assert int(np.abs(samples).argmax()) == pytest.approx((start + 0.5) * RATE, abs=60)  # Matroska keeps milliseconds
+    assert len(samples) == pytest.approx((start + 1.0) * RATE, abs=60)
+    assert not samples[: round(start * RATE) - 60 if start else 0].any()
+
+
+def test_another_rate_is_converted(tmp_path: Path) -> None:
+    samples = read_audio(with_sound(tmp_path / "a.mkv", rate=16_000), rate=RATE)
+    assert samples is not None
+    assert int(np.abs(samples).argmax()) == pytest.approx(0.5 * RATE, abs=60)
+
+
+def test_a_video_without_sound(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [np.zeros((48, 64, 3), np.uint8)] * 2)
+    assert read_audio(tmp_path / "a.mp4") is None
+
+
+def test_a_very_long_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audio, "LONGEST_SECONDS", 0.9)
+    with pytest.raises(CaptureError, match=r"a\.mkv is longer than two hours; cut it to the take"):
+        read_audio(with_sound(tmp_path / "a.mkv"))
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_text("no video")
+    with pytest.raises(CaptureError, match=r"a\.mp4 cannot be opened"):
+        read_audio(tmp_path / "a.mp4")

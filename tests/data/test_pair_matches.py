@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matches of pairs of pictures, of a picture and the same one moved."""
+
+import numpy as np
+import pytest
+
+from filmed import noise_texture
+from structgstream.data.pair_matches import MatchConfig, PairMatcher
+
+SIDE, SHIFT = 256, 17
+
+
+def pictures() -> dict[str, np.ndarray]:
+    """``b`` shows what ``a`` shows, 17 pixels further left; ``other`` something else, ``empty`` nothing."""
+    wide = np.asarray(noise_texture(1, size=SIDE + SHIFT))
+    return {
+        "a": wide[:SIDE, :SIDE].copy(),
+        "b": wide[:SIDE, SHIFT : SIDE + SHIFT].copy(),
+        "other": np.asarray(noise_texture(2, size=SIDE)),
+        "empty": np.full((SIDE, SIDE, 3), 90, np.uint8),
+    }
+
+
+def test_matches_are_where_the_same_is_seen() -> None:
+    matcher = PairMatcher(pictures())
+    one, two = matcher.matches([("a", "b")])["a", "b"]
+    assert len(one) == len(two) >= 20
+    assert np.median(np.abs(one - two - [SHIFT, 0.0])) < 0.1
+    rows = matcher.indices([("a", "b")])["a", "b"]
+    np.testing.assert_array_equal(matcher.keypoints("a")[rows[:, 0]], one)
+    np.testing.assert_array_equal(matcher.keypoints("b")[rows[:, 1]], two)
+
+
+@pytest.mark.parametrize("second", ["other", "empty"])
+def test_what_is_not_the_same_has_none(second: str) -> None:
+    one, two = PairMatcher(pictures()).matches([("a", second)])["a", second]
+    assert one.shape == two.shape == (0, 2)
+
+
+def test_a_pair_needs_its_number_and_share_of_inliers() -> None:
+    known = pictures()
+    found = len(PairMatcher(known).indices([("a", "b")])["a", "b"])
+    assert len(PairMatcher(known, MatchConfig(min_inliers=found)).indices([("a", "b")])["a", "b"]) == found
+    for config in (MatchConfig(min_inliers=10 * found), MatchConfig(min_inlier_share=1.01)):
+        assert len(PairMatcher(known, config).indices([("a", "b")])["a", "b"]) == 0
+
+
+def test_masked_pixels_have_no_keypoints() -> None:
+    mask = np.ones((SIDE, SIDE), bool)
+    mask[:, : SIDE // 2] = False
+    matcher = PairMatcher(pictures(), masks={"a": mask})
+    one, _ = matcher.matches([("a", "b")])["a", "b"]
+    assert len(one)
+    assert matcher.keypoints("a")[:, 0].min() >= SIDE // 2 - 1
+
+
+def test_a_picture_and_a_pair_are_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    matcher = PairMatcher(pictures())
+    extracted: list[str] = []
+    extract = matcher._extract
+    monkeypatch.setattr(matcher, "_extract", lambda name: extracted.append(name) or extract(name))
+    first = matcher.indices([("a", "b")])
+    again = matcher.indices([("a", "b"), ("a", "other")])
+    assert sorted(extracted) == ["a", "b", "other"]
+    assert again["a", "b"] is first["a", "b"]
+    assert list(again) == [("a", "b"), ("a", "other")]
