@@ -15,8 +15,7 @@ import torch
 
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
-from structgstream.errors import ConfigError
+from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.boundaries import equal_groups, quiet_groups
 from structgstream.groups.growing_file import partial_path, write_whole
@@ -27,16 +26,7 @@ from structgstream.lookahead import Lookahead
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.training.motion_start import with_displacements
-from structgstream.training.residuals import ResidualFloor, residual_floor
-from structgstream.training.tracking import (
-    TrackConfig,
-    Tracked,
-    Tracker,
-    TrackPictures,
-    spread_cameras,
-    track_frame,
-)
-from structgstream.training.views import View
+from structgstream.training.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
 
 
 @dataclass(frozen=True)
@@ -110,7 +100,7 @@ def track_capture(
     last = done[-1][0] if done else None
     writer = TrackWriter(path, head, keep=done[-1][1] if done else 0)
     try:
-        past = Pass.at(base, source, options.tracking, backend, last)
+        past = Pass.at(base, options.tracking, backend, last)
         changed = {start.frame: float(start.changed[-1]) for start, _ in done}
         yield from _frames(past, source, writer, every=every, changed=changed)
         frames = len(source)
@@ -127,10 +117,16 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
 
     Raises:
         ConfigError: it is another track.
+        StreamError: it is finished, and damaged.
     """
-    if not path.exists() and (not partial_path(path).exists() or partial_path(path).stat().st_size < 64):
+    if not path.exists() and not partial_path(path).exists():
         return None
-    found = open_track(path)
+    try:
+        found = open_track(path)
+    except StreamError:
+        if path.exists():
+            raise
+        return None  # A pass that was interrupted before its first start.
     if vars(found.head) != vars(head):
         differing = [name for name, value in vars(head).items() if getattr(found.head, name) != value]
         raise ConfigError(
@@ -151,7 +147,6 @@ class Pass:
     Args:
         first: frame 0.
         tracker: how movers are followed.
-        floor: residuals of frame 0.
         step: of positions.
         tracked: where movers are in the last frame.
         index: the last frame.
@@ -159,25 +154,19 @@ class Pass:
 
     first: Scene
     tracker: Tracker
-    floor: ResidualFloor
     step: float
     tracked: Tracked
     index: int
 
     @classmethod
-    def at(
-        cls, base: GroupBase, source: FrameSource, config: TrackConfig, backend: Backend, start: TrackStart | None
-    ) -> "Pass":
+    def at(cls, base: GroupBase, config: TrackConfig, backend: Backend, start: TrackStart | None) -> "Pass":
         """The state at ``start``, or at frame 0."""
         online, scene = base.config.online, on_device(base.scene(), backend.device)
         rig = base.header.similarity.rig(base.header.rig)
-        tracker = Tracker.of(config, online.motion, online.start, rig=rig, backend=backend)
-        views = tracker.views(next(_cameras(source, config).frames(0)))
-        floor = residual_floor(scene, views, scale=tracker.motion.picture_scale, backend=backend)
-        tracked, index = Tracked.at_rest(scene), 0
-        if start is not None:
-            tracked, index = tracked_at(scene, start, step=base.position_step), start.frame
-        return cls(scene, tracker, floor, base.position_step, tracked, index)
+        tracker = Tracker(config, online.motion, online.start.lift, rig, backend)
+        if start is None:
+            return cls(scene, tracker, base.position_step, Tracked.at_rest(scene), 0)
+        return cls(scene, tracker, base.position_step, tracked_at(scene, start, step=base.position_step), start.frame)
 
     def start(self, changed: list[float]) -> TrackStart:
         """The start record of the last frame; the state is rounded to it."""
@@ -214,11 +203,6 @@ def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor
     return found[0], found[1]
 
 
-def _cameras(source: FrameSource, config: TrackConfig) -> FrameSource:
-    """The capture of the cameras that are tracked with, so that no other pictures are decoded."""
-    return select_cameras(source, spread_cameras(source.rig, config.cameras))
-
-
 def _frames(
     past: Pass, source: FrameSource, writer: TrackWriter, *, every: int, changed: dict[int, float]
 ) -> Generator[TrackProgress, None, None]:
@@ -226,9 +210,10 @@ def _frames(
     shares: list[float] = []
     began = time.process_time()
     with Lookahead(_observed(past, source)) as observed:
-        for index, pictures in observed:
-            past.tracked = track_frame(past.tracker, past.tracked, pictures, past.floor)
-            past.index, seconds = index, past.tracked.seconds
+        for pictures in observed:
+            past.tracked = track_frame(past.tracker, past.tracked, pictures)
+            past.index = index = pictures.index
+            seconds = past.tracked.seconds
             moved, stored = past.tracked.moved, 0
             shares.append(pictures.changed_share)
             if index % every == 0:
@@ -239,12 +224,11 @@ def _frames(
             began = now
 
 
-def _observed(past: Pass, source: FrameSource) -> Generator[tuple[int, TrackPictures], None, None]:
-    """Every frame after that of ``past`` with its reduced pictures and what changed, made while another is tracked."""
-    chosen = _cameras(source, TrackConfig(cameras=past.tracker.start.views))
-    frames = read_ahead(chosen).frames(past.index)
-    before: list[View] = past.tracker.views(next(frames))
+def _observed(past: Pass, source: FrameSource) -> Generator[TrackPictures, None, None]:
+    """Reduced pictures of every frame after that of ``past``, and what changed, made while another is tracked."""
+    frames = read_ahead(source).frames(past.index)
+    before = past.tracker.pictures(next(frames), None).views
     for frame in frames:
-        pictures = past.tracker.pictures(frame, before)
-        before = pictures.views
-        yield frame.index, pictures
+        found = past.tracker.pictures(frame, before)
+        before = found.views
+        yield found
