@@ -48,7 +48,7 @@ class Track:
     """Allow an N that is no multiple of the interval of key packets; each group then costs a key packet more."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
-    cameras: int = 14
+    cameras: int = 10
     """Most cameras to track with in a frame; of more, every second or third, in turn."""
     device: Device = "auto"
     """Compute back-end."""

@@ -2,7 +2,8 @@
 """Tracking: movers follow lifted flow through every frame, without an iteration.
 
 What carries a sequential run through large motion is its motion start (``motion_start``), not its iterations. Tracking
-is that alone, made cheap: reduced pictures, every other camera in turn, and only the tiles in which pictures changed.
+is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed, and sums of flow at
+a quarter of the size.
 Flow from the last pictures to these displaces the movers, then flow from the rendering to these, which bounds drift,
 because renderings do not forget what things look like. Gaussians are generated once a camera and frame.
 """
@@ -35,11 +36,11 @@ from structgstream.training.views import View, area_mean, reduced, training_view
 class TrackConfig:
     """Tracking; not in the paper."""
 
-    scale: float = 0.5
+    scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
-    cameras: int = 14
+    cameras: int = 10
     """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
-    picture_scale: float = 0.5
+    picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
