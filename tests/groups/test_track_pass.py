@@ -5,10 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from clip_groups import FRAMES, LENGTH, OPTIONS, made, track
 from structgstream.errors import ConfigError
+from structgstream.groups.base import GroupBase
 from structgstream.groups.growing_file import partial_path
+from structgstream.groups.segment_file import open_segment
+from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import open_track
 from structgstream.groups.track_pass import groups_path
 
@@ -56,3 +60,23 @@ def test_quiet_groups_begin_at_starts(tmp_path: Path) -> None:
     assert found.groups is not None
     assert {first for first, _ in found.groups[1:]} <= set(found.starts)
     assert found.groups[-1][1] == FRAMES
+
+
+def test_after_a_finished_group_it_begins_where_that_has_fitted_things(tmp_path: Path) -> None:
+    base, group = GroupBase.read(made().header), open_segment(made().segments[1])
+    path = tmp_path / "track"
+    options = replace(OPTIONS, after=group)
+    assert track(path, made().header, options=options) == FRAMES - 4
+    found = open_track(path)
+    assert (found.starts, found.groups) == ([3, 4], [(4, 6)])
+    fitted = GroupSoFar(base, 2, [group.record(0), group.record(1)]).scene(3)
+    start = found.start(3)
+    z = base.scene().anchors.positions
+    moved = z.clone()
+    moved[torch.from_numpy(start.movers).long()] += torch.from_numpy(start.displacements) * base.position_step
+    torch.testing.assert_close(moved, fitted.anchors.positions, atol=1e-6, rtol=0)
+    whole = path.read_bytes()
+    path.unlink()
+    assert track(path, made().header, options=options, stop_after=1) == 1
+    track(path, made().header, options=options)
+    assert path.read_bytes() == whole

@@ -48,7 +48,10 @@ class Track:
     """Allow an N that is no multiple of the interval of key packets; each group then costs a key packet more."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
-    cameras: int = 10
+    after: Annotated[Path | None, tyro.conf.arg(metavar="SEGMENT", help_behavior_hint="")] = None
+    """Begin at the end of this finished group, where things are as it has fitted them: starts for the groups after it,
+    without what tracking lost before."""
+    cameras: int = 14
     """Most cameras to track with in a frame; of more, every second or third, in turn."""
     device: Device = "auto"
     """Compute back-end."""
@@ -64,6 +67,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.groups.boundaries import check_length
     from structgstream.groups.growing_file import partial_path
     from structgstream.groups.pictures import open_for
+    from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_pass import TrackOptions, groups_path
     from structgstream.kernels.backend import select_backend
     from structgstream.training.tracking import TrackConfig
@@ -81,7 +85,8 @@ def main(arguments: list[str]) -> None:
         for path in (options.output, partial_path(options.output), groups_path(options.output)):
             path.unlink(missing_ok=True)
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    chosen = TrackOptions(length, options.quiet, TrackConfig(cameras=options.cameras))
+    after = None if options.after is None else open_segment(options.after)
+    chosen = TrackOptions(length, options.quiet, after, TrackConfig(cameras=options.cameras))
     _track(options.output, source, base, chosen, backend)
     _say(options.output, len(source))
 

@@ -20,6 +20,8 @@ from structgstream.groups.base import GroupBase
 from structgstream.groups.boundaries import equal_groups, quiet_groups
 from structgstream.groups.growing_file import partial_path, write_whole
 from structgstream.groups.pictures import fingerprint
+from structgstream.groups.segment_file import Segment
+from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import TrackFile, TrackHead, TrackStart, TrackWriter, open_track
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
@@ -36,12 +38,19 @@ class TrackOptions:
     Args:
         length: frames of a group.
         quiet: whether groups begin where little moves, rather than at equal distances.
+        after: a finished group, from whose last frame on is tracked, which corrects what tracking has lost before.
         tracking: how movers are followed.
     """
 
     length: int
     quiet: bool = False
+    after: Segment | None = None
     tracking: TrackConfig = field(default_factory=TrackConfig)
+
+    @property
+    def first(self) -> int:
+        """The first frame of the first group."""
+        return 0 if self.after is None else self.after.identity.end
 
 
 @dataclass(frozen=True)
@@ -89,27 +98,66 @@ def track_capture(
         step=base.position_step,
         movers=len(base.scene().anchors) + len(base.scene().free),
         every=every,
-        config=asdict(options.tracking) | {"length": options.length, "quiet": options.quiet, "frames": len(source)},
+        config=asdict(options.tracking)
+        | {"length": options.length, "quiet": options.quiet, "frames": len(source)}
+        | ({} if options.after is None else {"after": options.after.identity.sha256}),
     )
     found = _existing(path, head)
     if found is not None and found.groups is not None:
         return
     if not options.quiet:
-        _write_groups(path, equal_groups(len(source), options.length))
+        _write_groups(path, _groups(options, len(source), {}))
     done = [] if found is None else [*found.whole_starts()]
-    last = done[-1][0] if done else None
     writer = TrackWriter(path, head, keep=done[-1][1] if done else 0)
     try:
+        last = done[-1][0] if done else None
+        if last is None and options.after is not None:
+            last = start_after(options.after, base)
+            writer.write(last)
+        changed = {start.frame: float(start.changed[-1]) for start, _ in done if len(start.changed)}
         past = Pass.at(base, options.tracking, backend, last)
-        changed = {start.frame: float(start.changed[-1]) for start, _ in done}
-        yield from _frames(past, source, writer, every=every, changed=changed)
-        frames = len(source)
-        quiet = options.quiet
-        groups = quiet_groups(frames, options.length, changed) if quiet else equal_groups(frames, options.length)
+        yield from _frames(past, source, writer, first=options.first, every=every, changed=changed)
+        groups = _groups(options, len(source), changed)
         _write_groups(path, groups)
-        writer.finish(frames, groups)
+        writer.finish(len(source), groups)
     finally:
         writer.close()
+
+
+def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
+    """The groups of a capture of ``frames`` frames, those after ``options.after`` only."""
+    first = options.first
+    if options.quiet:
+        later = {frame - first: share for frame, share in changed.items() if frame > first}
+        found = quiet_groups(frames - first, options.length, later)
+    else:
+        found = equal_groups(frames - first, options.length)
+    return [(first + begin, first + end) for begin, end in found]
+
+
+def start_after(group: Segment, base: GroupBase) -> TrackStart:
+    """Where the movers of frame 0 are in the last frame of a finished group, whose births are not among them.
+
+    Raises:
+        ConfigError: the group is not finished, or has another header.
+    """
+    if not group.complete or group.init != base.init:
+        what = "is not finished" if not group.complete else "has another header"
+        raise ConfigError(f"{group.name} {what}; track on from a finished group of the same header.")
+    identity, first = group.identity, base.scene()
+    so_far = GroupSoFar(base, identity.first, [group.record(number) for number in range(len(group.entries))])
+    last, before = so_far.scene(identity.end - 1), so_far.scene(max(identity.end - 2, identity.first))
+    at, then, z = (scene.anchors.positions for scene in (last, before, first))
+    displacements = ((at - z) / base.position_step).round().to(torch.int32)
+    velocities = ((at - then) / base.position_step).round().to(torch.int32)
+    rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
+    return TrackStart(
+        identity.end - 1,
+        rows.to(torch.int32).numpy(),
+        displacements[rows].numpy(),
+        velocities[rows].numpy(),
+        np.zeros(0, np.float32),
+    )
 
 
 def _existing(path: Path, head: TrackHead) -> TrackFile | None:
@@ -204,9 +252,12 @@ def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor
 
 
 def _frames(
-    past: Pass, source: FrameSource, writer: TrackWriter, *, every: int, changed: dict[int, float]
+    past: Pass, source: FrameSource, writer: TrackWriter, *, first: int, every: int, changed: dict[int, float]
 ) -> Generator[TrackProgress, None, None]:
-    """Tracks from the frame after ``past`` to the end; ``changed`` gets the change at each start."""
+    """Tracks from the frame after ``past`` to the end, with a start at ``first`` and every so many frames after it.
+
+    ``changed`` gets the change at each start.
+    """
     shares: list[float] = []
     began = time.process_time()
     with Lookahead(_observed(past, source)) as observed:
@@ -216,7 +267,7 @@ def _frames(
             seconds = past.tracked.seconds
             moved, stored = past.tracked.moved, 0
             shares.append(pictures.changed_share)
-            if index % every == 0:
+            if index >= first and (index - first) % every == 0:
                 start = past.start(shares)
                 stored, changed[index], shares = writer.write(start), float(start.changed[-1]), []
             share, now = pictures.changed_share, time.process_time()

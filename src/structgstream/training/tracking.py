@@ -3,9 +3,9 @@
 
 What carries a sequential run through large motion is its motion start (``motion_start``), not its iterations. Tracking
 is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed, and sums of flow at
-a quarter of the size.
-Flow from the last pictures to these displaces the movers, then flow from the rendering to these, which bounds drift,
-because renderings do not forget what things look like. Gaussians are generated once a camera and frame.
+a quarter of the size. Flow from the last pictures to these displaces the movers, then flow from the rendering to these,
+which bounds drift, because renderings do not forget what things look like. Gaussians are generated once a camera and
+frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ class TrackConfig:
 
     scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
-    cameras: int = 10
+    cameras: int = 14
     """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
