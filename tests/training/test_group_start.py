@@ -45,14 +45,14 @@ def fit(world: World, displacements: torch.Tensor, *, start: GroupStartConfig = 
         world.scene,
         displacements,
         views,
-        detect_changes(views, first, config=MOTION, backend=backend),
+        detect_changes(views, first, config=config.motion, backend=backend),
         frame_index=FRAME,
         config=config,
         start=start,
         backend=backend,
         seed=1,
         steps=STEPS,
-        floor=residual_floor(world.scene, first, scale=MOTION.picture_scale, backend=backend),
+        floor=residual_floor(world.scene, first, scale=config.motion.picture_scale, backend=backend),
     )
 
 
@@ -96,7 +96,7 @@ def test_changes_are_priced_against_frame_0() -> None:
 def test_births_of_several_rounds_have_identities_of_their_own() -> None:
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
-    motion = replace(MOTION, picture_scale=1.0)
+    motion = MotionConfig(enabled=True, picture_scale=1.0)
     config = replace(CONFIG, motion=motion, births=BirthConfig(enabled=True, least_hits=2))
     found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
     births = found.scene.free.births

@@ -22,10 +22,10 @@ from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_
 from structgstream.scene.scene import Scene
 from structgstream.training.flow_maps import flow_map
 from structgstream.training.lifting import LiftConfig, lift_motion
-from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig, detect_changes
+from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
 from structgstream.training.motion_start import with_displacements
 from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
-from structgstream.training.picture_change import PictureChange
+from structgstream.training.picture_change import PictureChange, detect_picture_changes
 from structgstream.training.residuals import apply_camera_color
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.trust import ViewChange, trusted_views
@@ -42,6 +42,8 @@ class TrackConfig:
     """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
+    finest_level: int = 1
+    """Of the flow search's pyramid: 0 is the size of these pictures, 1 half of it."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
     correct_every: int = 1
@@ -94,14 +96,17 @@ class Tracker:
             return TrackPictures(frame.index, views)
         stride = -(-len(views) // max(self.config.cameras, 2))
         chosen = [n for n in range(len(views)) if n % stride == frame.index % stride]
-        gate = replace(
-            self.motion,
-            picture_scale=self.config.picture_scale,
-            reach_pixels=max(1, round(self.motion.reach_pixels * self.config.scale)),
-        )
         taken = [views[n] for n in chosen]
-        every = [view.index for view in taken]
-        found = detect_changes(taken, before, config=gate, backend=self.backend, flow_from=every)
+        found = detect_picture_changes(
+            taken,
+            before,
+            threshold=self.motion.change_threshold,
+            reach_pixels=max(1, round(self.motion.reach_pixels * self.config.scale)),
+            scale=self.config.picture_scale,
+            backend=self.backend,
+            flow_from=[view.index for view in taken],
+            finest_level=self.config.finest_level,
+        )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
 
@@ -217,7 +222,8 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     picture = torch.where(counting[..., None], rendered, view.image)
     small = view.reduced(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    flow = flow_map(picture, view.image, counting, size, mask=counting)
+    level = tracker.config.finest_level
+    flow = flow_map(picture, view.image, counting, size, mask=counting, finest_level=level)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([flow, inside[..., None], small.colors], dim=-1)
     sums = gather_maps(moved, scene, small.camera, maps, backend) * _enlarged(tracker, view, size)
