@@ -125,7 +125,7 @@ def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest
     asked, real = [], method.fit_group_start
 
     def short(*arguments, **options):
-        asked.append((options["start"].births, options["config"].motion.picture_scale))
+        asked.append((options["start"].births, options["config"].start.views))
         if len(asked) == 1:
             raise OutOfMemoryError("to test")
         return real(*arguments, **options)
@@ -133,7 +133,7 @@ def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(method, "fit_group_start", short)
     assert fit(tmp_path / "g.sgs", task(made(), LENGTH)) == LENGTH
     assert [births for births, _ in asked] == [50, 12]
-    assert asked[1][1] == asked[0][1] / 2
+    assert asked[1][1] == asked[0][1] // 2
     assert '"lowered budgets": 1' in (tmp_path / "g.log.jsonl").read_text().splitlines()[0]
 
     def none(*arguments, **options):
