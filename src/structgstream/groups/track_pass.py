@@ -223,13 +223,14 @@ class Pass:
         displacements = ((now - z) / self.step).round().to(torch.int32).cpu()
         velocities = (self.tracked.velocities / self.step).round().to(torch.int32).cpu()
         rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
-        stored = TrackStart(
+        found = TrackStart(
             self.index,
             rows.to(torch.int32).numpy(),
             displacements[rows].numpy(),
             velocities[rows].numpy(),
             np.asarray(changed, np.float32),
         )
+        stored = TrackStart.unpacked(found.packed())  # What a pass that goes on from here reads.
         self.tracked = tracked_at(self.first, stored, step=self.step)
         return stored
 
