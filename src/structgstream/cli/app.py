@@ -22,6 +22,8 @@ COMMANDS = {
     "prepare": "turn videos of your own cameras into a calibrated capture, and check it",
     "board": "write a calibration board to print",
     "reconstruct": "turn a capture into a stream, frame by frame",
+    "track": "follow what moves through a capture, so that groups of frames can be fitted apart",
+    "join": "put groups of frames that were fitted apart together to one stream",
     "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
     "serve": "serve a folder of streams to viewers, live ones while they are made",

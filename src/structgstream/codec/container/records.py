@@ -74,7 +74,7 @@ def may_be_prefix(data: bytes | memoryview) -> bool:
     return any(prefix(periods=periods).startswith(bytes(data)) for periods in (False, True))
 
 
-def packed(kind: RecordType, payload: bytes, *, period: int = 0) -> bytes:
+def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:
     """A record as bytes: header, payload, CRC-32 of both.
 
     Args:

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The serial pass: movers of frame 0 followed through every frame of a capture, into a track.
+
+At a start what is stored is rounded, and the pass goes on from the rounded values, so that an interrupted pass that
+goes on from its last start writes the same bytes.
+"""
+
+import time
+from collections.abc import Generator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from structgstream.data.prefetch import read_ahead
+from structgstream.data.source import FrameSource
+from structgstream.errors import ConfigError, StreamError
+from structgstream.groups.base import GroupBase
+from structgstream.groups.boundaries import equal_groups, quiet_groups
+from structgstream.groups.growing_file import partial_path, write_whole
+from structgstream.groups.pictures import fingerprint
+from structgstream.groups.segment_file import Segment
+from structgstream.groups.segment_sink import GroupSoFar
+from structgstream.groups.track_file import TrackFile, TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.kernels.backend import Backend
+from structgstream.lookahead import Lookahead
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+from structgstream.training.motion_start import with_displacements
+from structgstream.training.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """Options of a pass.
+
+    Args:
+        length: frames of a group.
+        quiet: whether groups begin where little moves, rather than at equal distances.
+        after: a finished group, from whose last frame on is tracked, which corrects what tracking has lost before.
+        tracking: how movers are followed.
+    """
+
+    length: int
+    quiet: bool = False
+    after: Segment | None = None
+    tracking: TrackConfig = field(default_factory=TrackConfig)
+
+    @property
+    def first(self) -> int:
+        """The first frame of the first group."""
+        return 0 if self.after is None else self.after.identity.end
+
+
+@dataclass(frozen=True)
+class TrackProgress:
+    """One tracked frame.
+
+    Args:
+        frame: its index.
+        moved: number of movers that were followed.
+        changed: share of pixels that changed.
+        cpu_seconds: processor time of all threads.
+        seconds: wall-clock seconds by stage.
+        stored_bytes: of its start record; 0 if it has none.
+    """
+
+    frame: int
+    moved: int
+    changed: float
+    cpu_seconds: float
+    seconds: Mapping[str, float]
+    stored_bytes: int = 0
+
+
+def groups_path(track: Path) -> Path:
+    """The path of a track's list of groups, one ``a:b`` a line."""
+    return track.with_name(f"{track.name}.groups")
+
+
+def track_capture(
+    path: Path, source: FrameSource, base: GroupBase, options: TrackOptions, backend: Backend
+) -> Generator[TrackProgress, None, None]:
+    """Tracks through ``source`` into the file ``path``; goes on where an interrupted pass has stopped.
+
+    The generator yields after each frame; a track that is finished yields nothing.
+
+    Raises:
+        ConfigError: ``path`` is another track.
+        StorageError: it cannot be written.
+    """
+    # Every second of key packets may be a quiet place; other passes need their own starts only.
+    every = min(base.key_interval, options.length) if options.quiet else options.length
+    head = TrackHead(
+        header=base.sha256,
+        capture=fingerprint(source),
+        step=base.position_step,
+        movers=len(base.scene().anchors) + len(base.scene().free),
+        every=every,
+        config=asdict(options.tracking)
+        | {"length": options.length, "quiet": options.quiet, "frames": len(source)}
+        | ({} if options.after is None else {"after": options.after.identity.sha256}),
+    )
+    found = _existing(path, head)
+    if found is not None and found.groups is not None:
+        return
+    if not options.quiet:
+        _write_groups(path, _groups(options, len(source), {}))
+    done = [] if found is None else [*found.whole_starts()]
+    writer = TrackWriter(path, head, keep=done[-1][1] if done else 0)
+    try:
+        last = done[-1][0] if done else None
+        if last is None and options.after is not None:
+            last = start_after(options.after, base)
+            writer.write(last)
+        changed = {start.frame: float(start.changed[-1]) for start, _ in done if len(start.changed)}
+        past = Pass.at(base, options.tracking, backend, last)
+        yield from _frames(past, source, writer, first=options.first, every=every, changed=changed)
+        groups = _groups(options, len(source), changed)
+        _write_groups(path, groups)
+        writer.finish(len(source), groups)
+    finally:
+        writer.close()
+
+
+def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
+    """The groups of a capture of ``frames`` frames, those after ``options.after`` only."""
+    first = options.first
+    if options.quiet:
+        later = {frame - first: share for frame, share in changed.items() if frame > first}
+        found = quiet_groups(frames - first, options.length, later)
+    else:
+        found = equal_groups(frames - first, options.length)
+    return [(first + begin, first + end) for begin, end in found]
+
+
+def start_after(group: Segment, base: GroupBase) -> TrackStart:
+    """Where the movers of frame 0 are in the last frame of a finished group, whose births are not among them.
+
+    Raises:
+        ConfigError: the group is not finished, or has another header.
+    """
+    if not group.complete or group.init != base.init:
+        what = "is not finished" if not group.complete else "has another header"
+        raise ConfigError(f"{group.name} {what}; track on from a finished group of the same header.")
+    identity, first = group.identity, base.scene()
+    so_far = GroupSoFar(base, identity.first, [group.record(number) for number in range(len(group.entries))])
+    last, before = so_far.scene(identity.end - 1), so_far.scene(max(identity.end - 2, identity.first))
+    at, then, z = (scene.anchors.positions for scene in (last, before, first))
+    displacements = ((at - z) / base.position_step).round().to(torch.int32)
+    velocities = ((at - then) / base.position_step).round().to(torch.int32)
+    rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
+    return TrackStart(
+        identity.end - 1,
+        rows.to(torch.int32).numpy(),
+        displacements[rows].numpy(),
+        velocities[rows].numpy(),
+        np.zeros(0, np.float32),
+    )
+
+
+def _existing(path: Path, head: TrackHead) -> TrackFile | None:
+    """What is there of the track; None without anything.
+
+    Raises:
+        ConfigError: it is another track.
+        StreamError: it is finished, and damaged.
+    """
+    if not path.exists() and not partial_path(path).exists():
+        return None
+    try:
+        found = open_track(path)
+    except StreamError:
+        if path.exists():
+            raise
+        return None  # A pass that was interrupted before its first start.
+    if vars(found.head) != vars(head):
+        differing = [name for name, value in vars(head).items() if getattr(found.head, name) != value]
+        raise ConfigError(
+            f"{path} is a track of another {' and '.join(differing)}; give the same header, capture and options, "
+            "another name, or --overwrite."
+        )
+    return found
+
+
+def _write_groups(path: Path, groups: list[tuple[int, int]]) -> None:
+    write_whole(groups_path(path), "".join(f"{first}:{end}\n" for first, end in groups).encode())
+
+
+@dataclass
+class Pass:
+    """The state of a pass.
+
+    Args:
+        first: frame 0.
+        tracker: how movers are followed.
+        step: of positions.
+        tracked: where movers are in the last frame.
+        index: the last frame.
+    """
+
+    first: Scene
+    tracker: Tracker
+    step: float
+    tracked: Tracked
+    index: int
+
+    @classmethod
+    def at(cls, base: GroupBase, config: TrackConfig, backend: Backend, start: TrackStart | None) -> "Pass":
+        """The state at ``start``, or at frame 0."""
+        online, scene = base.config.online, on_device(base.scene(), backend.device)
+        rig = base.header.similarity.rig(base.header.rig)
+        tracker = Tracker(config, online.motion, online.start.lift, rig, backend)
+        if start is None:
+            return cls(scene, tracker, base.position_step, Tracked.at_rest(scene), 0)
+        return cls(scene, tracker, base.position_step, tracked_at(scene, start, step=base.position_step), start.frame)
+
+    def start(self, changed: list[float]) -> TrackStart:
+        """The start record of the last frame; the state is rounded to it."""
+        z = torch.cat([self.first.anchors.positions, self.first.free.means])
+        now = torch.cat([self.tracked.scene.anchors.positions, self.tracked.scene.free.means])
+        displacements = ((now - z) / self.step).round().to(torch.int32).cpu()
+        velocities = (self.tracked.velocities / self.step).round().to(torch.int32).cpu()
+        rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
+        found = TrackStart(
+            self.index,
+            rows.to(torch.int32).numpy(),
+            displacements[rows].numpy(),
+            velocities[rows].numpy(),
+            np.asarray(changed, np.float32),
+        )
+        stored = TrackStart.unpacked(found.packed())  # What a pass that goes on from here reads.
+        self.tracked = tracked_at(self.first, stored, step=self.step)
+        return stored
+
+
+def tracked_at(first: Scene, start: TrackStart, *, step: float) -> Tracked:
+    """Where the movers of frame 0 are at ``start``."""
+    displacements, velocities = dense(first, start, step=step)
+    return Tracked(with_displacements(first, displacements), velocities)
+
+
+def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Displacements since frame 0 and velocities at ``start``, ``[M + F, 3]`` each, in units of the scene."""
+    like, rows = first.anchors.positions, torch.from_numpy(start.movers).to(first.anchors.positions.device).long()
+    found = []
+    for values in (start.displacements, start.velocities):
+        full = torch.zeros(len(first.anchors) + len(first.free), 3).to(like)
+        full[rows] = torch.from_numpy(values).to(like) * step
+        found.append(full)
+    return found[0], found[1]
+
+
+def _frames(
+    past: Pass, source: FrameSource, writer: TrackWriter, *, first: int, every: int, changed: dict[int, float]
+) -> Generator[TrackProgress, None, None]:
+    """Tracks from the frame after ``past`` to the end, with a start at ``first`` and every so many frames after it.
+
+    ``changed`` gets the change at each start.
+    """
+    shares: list[float] = []
+    began = time.process_time()
+    with Lookahead(_observed(past, source)) as observed:
+        for pictures in observed:
+            past.tracked = track_frame(past.tracker, past.tracked, pictures)
+            past.index = index = pictures.index
+            seconds = past.tracked.seconds
+            moved, stored = past.tracked.moved, 0
+            shares.append(pictures.changed_share)
+            if index >= first and (index - first) % every == 0:
+                start = past.start(shares)
+                stored, changed[index], shares = writer.write(start), float(start.changed[-1]), []
+            share, now = pictures.changed_share, time.process_time()
+            yield TrackProgress(index, moved, share, now - began, seconds, stored)
+            began = now
+
+
+def _observed(past: Pass, source: FrameSource) -> Generator[TrackPictures, None, None]:
+    """Reduced pictures of every frame after that of ``past``, and what changed, made while another is tracked."""
+    frames = read_ahead(source).frames(past.index)
+    before = past.tracker.pictures(next(frames), None).views
+    for frame in frames:
+        found = past.tracker.pictures(frame, before)
+        before = found.views
+        yield found
