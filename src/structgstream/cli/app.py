@@ -21,6 +21,8 @@ COMMANDS = {
     "prepare": "turn videos of your own cameras into a calibrated capture, and check it",
     "board": "write a calibration board to print",
     "reconstruct": "turn a capture into a stream, frame by frame",
+    "parallel": "turn a capture into a stream, groups of frames side by side, on one machine or many",
+    "plan": "how long a capture would take, on how many machines, and how many bytes it would be",
     "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
     "serve": "serve a folder of streams to viewers, live ones while they are made",

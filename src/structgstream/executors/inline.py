@@ -6,6 +6,7 @@ import runpy
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -71,8 +72,9 @@ def _called(module: str, arguments: list[str], environment: Mapping[str, str], *
     Raises:
         KeyboardInterrupt: the user pressed Ctrl-C, also if the program ended because of it.
     """
-    with _printing(log), _as_program(module, arguments, environment):
+    with warnings.catch_warnings(), _printing(log), _as_program(module, arguments, environment):
         try:
+            warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")  # This process may know it.
             runpy.run_module(module, run_name="__main__", alter_sys=True)
         except SystemExit as ending:
             if isinstance(ending.code, str):

@@ -23,7 +23,7 @@ OLDEST = (2, 52)
 OBJECT_STORE_BYTES = 80 * 2**20
 """Ray's least: commands and endings are all that travels."""
 IN_FLIGHT = 2
-"""Tasks handed to Ray for each worker: one runs, and one is there when it ends. Ray would take, and hold, any number."""
+"""Tasks handed to Ray for each worker: one runs, and one is there when it ends."""
 COUNT_SECONDS = 10.0
 """How old the count of the cluster's workers may be."""
 TOKEN_FILE = Path(".ray") / "auth_token"

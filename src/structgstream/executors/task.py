@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 PYTHON = "{python}"
-"""As the first word of a command: the interpreter of the process that runs it, which lies elsewhere on other machines."""
+"""As a command's first word: the interpreter of the process that runs it, which lies elsewhere on other machines."""
 TAIL_BYTES = 4000
 """How much of what a task has printed is kept in its ending."""
 
