@@ -3,8 +3,9 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig
@@ -63,6 +64,38 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
         return value
 
     return plain(asdict(config))
+
+
+def from_json(values: Mapping[str, Any]) -> StreamConfig:
+    """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
+
+    Raises:
+        ConfigError: they are of another version of this program, or no configuration of a stream.
+    """
+    try:
+        config = _read(StreamConfig, values)
+        if to_json(config) == dict(values):
+            return config
+    except (TypeError, ValueError, KeyError):
+        pass
+    raise ConfigError(
+        "The header's configuration is of another version of structgstream, or another method's; reconstruct its "
+        "stream again with this version."
+    )
+
+
+def _read(kind: Any, value: Any) -> Any:
+    """``value``, plain JSON, as a ``kind``: a dataclass, a container, or what JSON has itself."""
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return kind(**{name: _read(hints[name], item) for name, item in value.items()})
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        (kind,) = (of for of in arguments if of is not type(None))
+        return None if value is None else _read(kind, value)
+    if origin is tuple:
+        return tuple(_read(arguments[0], item) for item in value)
+    return origin(value) if origin in (frozenset, dict) else value
 
 
 def preset_named(name: str) -> StreamConfig:

@@ -21,6 +21,8 @@ COMMANDS = {
     "prepare": "turn videos of your own cameras into a calibrated capture, and check it",
     "board": "write a calibration board to print",
     "reconstruct": "turn a capture into a stream, frame by frame",
+    "track": "follow what moves through a capture, so that groups of frames can be fitted apart",
+    "join": "put groups of frames that were fitted apart together to one stream",
     "parallel": "turn a capture into a stream, groups of frames side by side, on one machine or many",
     "plan": "how long a capture would take, on how many machines, and how many bytes it would be",
     "evaluate": "score a stream against the held-out cameras",

@@ -67,6 +67,8 @@ class Parallel:
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
     quiet: bool = False
     """Begin groups where little moves."""
+    odd: bool = False
+    """Allow an N that is no multiple of the key interval; each group then costs a key packet more."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default), fast, or tiny; fields of the configuration are options as of reconstruct."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
@@ -142,7 +144,11 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     header += [*_words("start", capture.start or None), *_words("near", capture.near)]
     header += _words("scale", None if capture.scale == 1.0 else capture.scale)
     header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
-    track = [*_words("groups", options.groups), *(["--quiet"] if options.quiet else [])]
+    track = [
+        *_words("groups", options.groups),
+        *(["--quiet"] if options.quiet else []),
+        *(["--odd"] if options.odd else []),
+    ]
     unit = Unit(
         str(options.scene.absolute()),
         capture.frames,

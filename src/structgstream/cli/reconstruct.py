@@ -53,6 +53,11 @@ class Reconstruct:
     Example: structgstream reconstruct basketball -o ball --sink segments --window 600
 
     Example: structgstream reconstruct rig.toml -o now.sgs --live --preset fast --record take1
+
+    With --init HEADER.sgs it fits one group of frames, which are joined later (reconstruct --init --help,
+    docs/groups.md):
+
+    Example: structgstream reconstruct basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
     """
 
     scene: tyro.conf.Positional[Folder]
@@ -84,6 +89,11 @@ class Reconstruct:
 
 def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
+    if any(argument == "--init" or argument.startswith("--init=") for argument in arguments):
+        from structgstream.cli import group_run
+
+        group_run.main(arguments)
+        return
     if "--help-config" in arguments:
         _print_config(arguments)
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)

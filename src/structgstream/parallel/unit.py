@@ -85,8 +85,6 @@ def groups_of(track: Path) -> Groups | None:
         StreamError: they have gaps, or are no groups.
     """
     path = track.with_name(f"{track.name}.groups")
-    if not path.exists():
-        path = track.with_suffix(".groups")
     try:
         text = path.read_text()
     except OSError:

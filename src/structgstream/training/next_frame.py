@@ -35,6 +35,8 @@ class StartingPoint:
         partition: of which the scene is the moving part; None for a whole scene.
         focuses: by view index, the focus on the scene; None for whole pictures of all views.
         new_free: free Gaussians to add.
+        reference: anchors as in ``scene``, from whose values changes are priced; free Gaussians then have no price.
+            None: changes since ``scene``.
     """
 
     scene: Scene
@@ -43,6 +45,7 @@ class StartingPoint:
     partition: Partition | None = None
     focuses: Mapping[int, Focus] | None = None
     new_free: FreeGaussians | None = None
+    reference: Scene | None = None
 
     @property
     def seen(self) -> list[View]:

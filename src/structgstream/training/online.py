@@ -9,7 +9,7 @@
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -33,7 +33,7 @@ from structgstream.training.optim import Adam
 from structgstream.training.optimize import Schedule, optimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields, values_of_rows
 from structgstream.training.partition import Partition
-from structgstream.training.patching import PatchingConfig
+from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.picture_change import PictureChange
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.population import Population
@@ -144,22 +144,22 @@ def fit_next_frame(
     if pictures is None:
         pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
 
-    def fit_with(iteration_backend: Backend) -> FitResult[Scene]:
-        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
-        fit = _FrameFit(config, backend, iteration_backend, frame.index, generator, watch, steps or {}, on_step)
+    def fit_with(fit: FrameFit) -> FitResult[Scene]:
         if pictures.changes is None:
             return fit.optimize(
                 StartingPoint(scene, pictures.views, _prior_displacements(scene, older, config.motion_prior))
             )
         return _fit_moving_part(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
 
-    if backend.device.type != "cuda":
-        return fit_with(backend)
-    # The host can run ahead of a GPU because no iteration synchronises.
-    return run_with_pair_budget(
-        lambda budget: fit_with(nonblocking(backend, budget)),
-        capacity=max(1 << 18, 8 * slot_count(scene)),
-        device=backend.device,
+    return run_frame_fit(
+        fit_with,
+        config=config,
+        backend=backend,
+        frame_index=frame.index,
+        seed=seed,
+        steps=steps,
+        on_step=on_step,
+        slots=slot_count(scene),
     )
 
 
@@ -168,8 +168,35 @@ def needs_older(config: OnlineConfig) -> bool:
     return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
 
 
+def run_frame_fit(
+    fit_with: "Callable[[FrameFit], FitResult[Scene]]",
+    *,
+    config: OnlineConfig,
+    backend: Backend,
+    frame_index: int,
+    seed: int,
+    steps: Mapping[str, float] | None,
+    on_step: StepListener | None,
+    slots: int,
+) -> FitResult[Scene]:
+    """Calls ``fit_with`` with a :class:`FrameFit`, on a GPU again with more memory if that of ``slots`` is short."""
+
+    def run(iteration_backend: Backend) -> FitResult[Scene]:
+        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
+        return fit_with(
+            FrameFit(config, backend, iteration_backend, frame_index, generator, watch, steps or {}, on_step)
+        )
+
+    if backend.device.type != "cuda":
+        return run(backend)
+    # The host can run ahead of a GPU because no iteration synchronises.
+    return run_with_pair_budget(
+        lambda budget: run(nonblocking(backend, budget)), capacity=max(1 << 18, 8 * slots), device=backend.device
+    )
+
+
 @dataclass(frozen=True)
-class _FrameFit:
+class FrameFit:
     """The optimisation of one frame; ``iteration_backend`` is the back-end of the iterations."""
 
     config: OnlineConfig
@@ -237,14 +264,17 @@ class _FrameFit:
         )
 
     def _parameters(self, start: StartingPoint) -> tuple[Parameters, BitPrice | None]:
-        """The leaves of the scene as in the previous frame, and the price of changing their bins."""
+        """The leaves of the scene as it was, and the price of changing their bins since then or ``start.reference``."""
         config = self.config
         dynamic = config.dynamic if start.partition is None else config.dynamic.difference(SHARED_FIELDS)
         trained = parameters_of_fields(dynamic)
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(start.scene, trained=trained, steps=steps)
         rounding = config.rounding.resolved()
-        return parameters, BitPrice.of(parameters, steps, weight=rounding.rate_weight, free=rounding.free_priced)
+        known, free = parameters, rounding.free_priced
+        if start.reference is not None:
+            known, free = Parameters.of(start.reference, trained=trained, steps=steps), False
+        return parameters, BitPrice.of(known, steps, weight=rounding.rate_weight, free=free)
 
 
 def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], start: StartingPoint) -> None:
@@ -270,7 +300,7 @@ def _prior_displacements(scene: Scene, older: Scene | None, motion_prior: float)
 
 
 def _fit_moving_part(
-    fit: _FrameFit,
+    fit: FrameFit,
     scene: Scene,
     views: list[View],
     changes: list[PictureChange | None],
@@ -296,7 +326,7 @@ def _fit_moving_part(
             replace(partition, moving=with_displacements(partition.moving, start.displacements)),
             trusted,
             start.focuses,
-            frame_index=fit.frame_index,
+            first_birth=fit.frame_index * BIRTHS_PER_FRAME,
             floor=floor,
             room=config.patching.max_free - len(partition.still.free),
             least_pixels=config.motion.least_pixels,

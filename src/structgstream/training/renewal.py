@@ -17,7 +17,6 @@ from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig, ViewResidual, blamed_mask, sweep_births, view_residual
 from structgstream.training.observation import gather_maps
 from structgstream.training.partition import Partition
-from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.residuals import ResidualFloor, apply_camera_color
 from structgstream.training.views import View, mean_of_counting
 
@@ -47,7 +46,7 @@ def renew_free_gaussians(
     views: Sequence[View],
     focuses: Mapping[int, Focus],
     *,
-    frame_index: int,
+    first_birth: int,
     floor: ResidualFloor | None,
     room: int,
     least_pixels: float,
@@ -60,7 +59,7 @@ def renew_free_gaussians(
         partition: with its moving part after the motion start.
         views: of the frame.
         focuses: by view index, the focus on the moving part.
-        frame_index: for the identities of births.
+        first_birth: identity of the first birth.
         floor: residuals of frame 0; None for none.
         room: largest number of births.
         least_pixels: views where a Gaussian covers fewer pixels do not count.
@@ -100,7 +99,7 @@ def renew_free_gaussians(
             missing,
             depths,
             moving.camera_color,
-            first_birth=frame_index * BIRTHS_PER_FRAME,
+            first_birth=first_birth,
             config=replace(config, most=max(0, min(config.most, room - int(kept.sum())))),
             backend=backend,
         )

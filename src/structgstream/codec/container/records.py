@@ -51,7 +51,7 @@ def prefix() -> bytes:
     return PREFIX.pack(MAGIC, MAJOR, MINOR)
 
 
-def packed(kind: RecordType, payload: bytes) -> bytes:
+def packed(kind: int, payload: bytes) -> bytes:
     """A record as bytes: header, payload, CRC-32 of both.
 
     Raises:

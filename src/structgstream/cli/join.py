@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream join``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.app import UsageError
+from structgstream.cli.options import parse_options
+from structgstream.cli.progress import human_bytes
+
+
+@dataclass(frozen=True)
+class Join:
+    """Puts groups of frames that were fitted apart together to one stream (docs/groups.md).
+
+    Every checksum is verified, and that the segments have one header and every frame once.
+
+    Example: structgstream join groups/*.sgs -o ball.sgs
+    """
+
+    segments: tyro.conf.Positional[tuple[Path, ...]]
+    """The segments that reconstruct --init has written, in any order."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    """The stream file to write."""
+    check: bool = False
+    """Decode every frame of the result, too."""
+    overwrite: bool = False
+    """Replace OUT.sgs when it exists."""
+
+
+def main(arguments: list[str]) -> None:
+    """Writes the file and prints its size."""
+    options = parse_options(Join, "join", arguments=arguments)
+    output = options.output
+    if not options.segments:
+        raise UsageError("join needs the segments of a stream.")
+    if output.exists() and not options.overwrite:
+        raise UsageError(f"{output} exists; replace it with --overwrite, or choose another name.")
+    from structgstream.groups.join import join_segments
+
+    frames = join_segments(options.segments, output, check=options.check)
+    what = "1 frame" if frames == 1 else f"{frames} frames"
+    text = f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}"
+    Console().print(text, highlight=False, markup=False, soft_wrap=True)

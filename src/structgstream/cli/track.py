@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream track``."""
+
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from structgstream.cli.app import Interrupted, UsageError
+from structgstream.cli.options import Device, Folder, StreamFile, parse_options
+from structgstream.cli.progress import human_bytes
+from structgstream.cli.termination import Terminated, Termination
+
+if TYPE_CHECKING:
+    from structgstream.data.source import FrameSource
+    from structgstream.groups.base import GroupBase
+    from structgstream.groups.track_pass import TrackOptions
+    from structgstream.kernels.backend import Backend
+
+
+@dataclass(frozen=True)
+class Track:
+    """Follows what moves through every frame, so that groups of frames can be fitted apart (docs/groups.md).
+
+    TRACK holds where things are when a group begins, TRACK.groups a line a:b for each group. After Ctrl-C or a kill the
+    same command goes on; a finished track is left as it is.
+
+    Example: structgstream track basketball --init header.sgs -o ball.track --groups 60
+
+    Example: structgstream track basketball --init header.sgs -o ball.track --groups 60 --quiet
+    """
+
+    scene: tyro.conf.Positional[Folder]
+    """The capture that the header was made from."""
+    init: Annotated[StreamFile, tyro.conf.arg(metavar="HEADER.sgs")]
+    """A stream whose header and frame 0 the groups share: reconstruct --frames 1, or any longer stream."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="TRACK")]
+    """The track to write."""
+    groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Frames of a group. Default: as many as from one key packet to the next."""
+    quiet: bool = False
+    """Begin groups where little moves, half of N to one and a half times N apart."""
+    odd: bool = False
+    """Allow an N that is no multiple of the interval of key packets; each group then costs a key packet more."""
+    frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
+    """Number of frames. Default: all."""
+    cameras: int = 8
+    """Most cameras to track with."""
+    device: Device = "auto"
+    """Compute back-end."""
+    overwrite: bool = False
+    """Replace TRACK when it exists."""
+
+
+def main(arguments: list[str]) -> None:
+    """Tracks with a progress bar, and lists the groups."""
+    options = parse_options(Track, "track", arguments=arguments)
+    from structgstream.cli.app import usage_errors
+    from structgstream.groups.base import GroupBase
+    from structgstream.groups.boundaries import check_length
+    from structgstream.groups.growing_file import partial_path
+    from structgstream.groups.pictures import open_for
+    from structgstream.groups.track_pass import TrackOptions, groups_path
+    from structgstream.kernels.backend import select_backend
+    from structgstream.training.tracking import TrackConfig
+
+    base = GroupBase.read(options.init)
+    length = base.key_interval if options.groups is None else options.groups
+    with usage_errors():
+        if not options.odd or length < 1:
+            check_length(length, key_interval=base.key_interval)
+    if options.cameras < 2:
+        raise UsageError(f"--cameras must be at least 2, got {options.cameras}.")
+    source = open_for(base.header, options.scene, frames=options.frames)
+    backend = select_backend(options.device)
+    if options.overwrite:
+        for path in (options.output, partial_path(options.output), groups_path(options.output)):
+            path.unlink(missing_ok=True)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    chosen = TrackOptions(length, options.quiet, TrackConfig(cameras=options.cameras))
+    _track(options.output, source, base, chosen, backend)
+    _say(options.output, len(source))
+
+
+def _track(path: Path, source: "FrameSource", base: "GroupBase", options: "TrackOptions", backend: "Backend") -> None:
+    from structgstream.groups.track_pass import track_capture
+
+    columns = [TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TimeElapsedColumn()]
+    done = 0
+    try:
+        with (
+            Termination() as ending,
+            Progress(*columns, TimeRemainingColumn(), console=Console()) as bars,
+            closing(track_capture(path, source, base, options, backend)) as frames,
+        ):
+            task = bars.add_task("tracking", total=len(source) - 1)
+            for progress in frames:
+                done = progress.frame
+                bars.update(task, completed=done)
+                if ending.asked and done + 1 < len(source):
+                    raise Terminated
+    except (KeyboardInterrupt, Terminated) as error:
+        ended = Terminated if isinstance(error, Terminated) else Interrupted
+        raise ended(
+            f"Frame {done} of {len(source) - 1} was tracked; give the same command to go on from the last start."
+        ) from None
+
+
+def _say(path: Path, frames: int) -> None:
+    from structgstream.groups.track_file import open_track
+
+    groups = open_track(path).groups or []
+    size = human_bytes(path.stat().st_size)
+    Console().print(
+        f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
+        + " ".join(f"{first}:{end}" for first, end in groups[:8])
+        + (" ..." if len(groups) > 8 else ""),
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all groups share: the init record and frame 0 of a stream."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from structgstream.codec.container.byte_source import FileBytes
+from structgstream.codec.container.payload import parse_packet
+from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
+from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.header import unpack_header
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.errors import ConfigError, StreamError
+from structgstream.presets import StreamConfig, from_json
+from structgstream.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class GroupBase:
+    """The beginning of a stream: everything that a group is fitted from, apart from its pictures and the track.
+
+    Args:
+        name: of the file, for messages.
+        header: content of the init record.
+        init: the bytes of prefix and init record.
+        first: the bytes of the record of frame 0.
+        packet: frame 0.
+    """
+
+    name: str
+    header: StreamHeader
+    init: bytes
+    first: bytes
+    packet: Packet
+
+    @classmethod
+    def read(cls, path: Path | str) -> "GroupBase":
+        """The beginning of the stream file ``path``, which may be longer.
+
+        Raises:
+            StreamError: it is no stream, or is damaged or cut before the end of frame 0.
+        """
+        data = FileBytes(path)
+        check_prefix(data, str(path))
+        init = read_record(data, PREFIX.size)
+        first = None if init is None else read_record(data, init.end)
+        if init is None or init.type != RecordType.INIT or first is None or first.type != RecordType.KEY:
+            raise StreamError(
+                f"{path} has no whole frame 0 at its beginning; make it with: structgstream reconstruct CAPTURE "
+                f"--frames 1 -o {path} --overwrite"
+            )
+        head, record = bytes(data[: init.end]), bytes(data[init.end : first.end])
+        data.close()
+        packet = parse_packet(first.payload, PacketKind.KEY)
+        return cls(str(path), unpack_header(init.payload), head, record, packet)
+
+    @property
+    def sha256(self) -> str:
+        """Of the bytes of prefix, init record and frame 0."""
+        return hashlib.sha256(self.init + self.first).hexdigest()
+
+    @cached_property
+    def config(self) -> StreamConfig:
+        """The configuration of the stream, which is that of every group.
+
+        Raises:
+            ConfigError: it is of another version, or has no motion start, without which a group cannot begin.
+        """
+        config = from_json(self.header.config)
+        if config.codec != "compact" or not (config.online.motion.enabled and config.online.start.enabled):
+            raise ConfigError(
+                f"{self.name} was made with codec {config.codec} and motion start "
+                f"{'on' if config.online.start.enabled else 'off'}; groups need the codec compact and the motion "
+                "start, as the presets compact and fast have them."
+            )
+        return config
+
+    @property
+    def key_interval(self) -> int:
+        """Frames from one key packet to the next."""
+        return max(1, round(self.header.fps * self.config.key_interval_seconds))
+
+    @property
+    def position_step(self) -> float:
+        """The quantization step of positions, in units of the scene."""
+        return self.header.steps["anchor_positions"]
+
+    def scene(self) -> Scene:
+        """The decoded frame 0, on the CPU."""
+        return SceneDecoder(self.header).decode(self.packet)

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The file of a tracking pass: where movers are when a group may begin.
+
+::
+
+    signature, version | head record | start record ... | end record
+
+Records are framed as those of a stream (``codec/container/records``), each with a CRC-32. The file grows under the name
+``TRACK.partial`` and gets its own name when the pass is done; a group may begin as soon as its start record is there.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.codec.container.byte_source import ByteSource, FileBytes
+from structgstream.codec.container.records import CHECKSUM, RECORD, packed, read_head, read_record
+from structgstream.errors import StreamError
+from structgstream.groups.growing_file import GrowingFile, partial_path
+
+SIGNATURE = b"\x89SGT\r\n\x1a\n"
+MAJOR, MINOR = 1, 0
+PREFIX = struct.Struct("<8sHH")
+START = struct.Struct("<III")  # frame, number of movers, number of changed shares
+SHARE_UNIT = 1 / 65535
+
+
+class TrackRecord(IntEnum):
+    """Types of records."""
+
+    HEAD = 1
+    START = 2
+    END = 3
+
+
+@dataclass(frozen=True)
+class TrackStart:
+    """Where movers (Note [Movers]) are in a frame, in steps of positions; those that are not listed are where frame 0
+    has them.
+
+    Args:
+        frame: the frame.
+        movers: ``[r]`` int32, ascending.
+        displacements: ``[r, 3]`` int32, since frame 0.
+        velocities: ``[r, 3]`` int32, since the frame before.
+        changed: ``[n]`` float32, share of pixels that changed in each frame since the last start, this one included.
+    """
+
+    frame: int
+    movers: NDArray[np.int32]
+    displacements: NDArray[np.int32]
+    velocities: NDArray[np.int32]
+    changed: NDArray[np.float32]
+
+    def packed(self) -> bytes:
+        """The payload of a start record."""
+        shares = np.clip(np.round(self.changed / SHARE_UNIT), 0, 65535).astype("<u2")
+        gaps = np.diff(self.movers, prepend=np.int32(0)).astype(np.int32)
+        table = np.column_stack([gaps, self.displacements, self.velocities]).astype("<i4")
+        # Bytes of one significance lie together: the upper ones of small numbers are all alike.
+        planes = np.ascontiguousarray(table.T).view(np.uint8).reshape(-1, 4).T.tobytes()
+        return START.pack(self.frame, len(self.movers), len(shares)) + zlib.compress(shares.tobytes() + planes, 9)
+
+    @classmethod
+    def unpacked(cls, payload: bytes) -> "TrackStart":
+        """The content of a start record.
+
+        Raises:
+            ValueError: it violates the format.
+        """
+        frame, rows, shares = START.unpack_from(payload)
+        size = 2 * shares + 28 * rows
+        unpacker = zlib.decompressobj()
+        data = unpacker.decompress(payload[START.size :], size)
+        if len(data) != size or not unpacker.eof:
+            raise ValueError("a start record of another length than it states")
+        changed = np.frombuffer(data, "<u2", shares).astype(np.float32) * np.float32(SHARE_UNIT)
+        planes = np.frombuffer(data, np.uint8, 28 * rows, 2 * shares).reshape(4, -1)
+        table = np.ascontiguousarray(planes.T).view("<i4").reshape(7, rows).astype(np.int32)
+        movers = np.cumsum(table[0], dtype=np.int32)
+        return cls(frame, movers, table[1:4].T.copy(), table[4:7].T.copy(), changed)
+
+
+@dataclass(frozen=True)
+class TrackHead:
+    """What a track is of.
+
+    Args:
+        header: SHA-256 of the header and frame 0 that it begins with (``base.GroupBase.sha256``).
+        capture: fingerprint of the capture.
+        step: of positions, in units of the scene.
+        movers: number of movers of frame 0.
+        every: frames from one possible start to the next.
+        config: of the pass, as plain JSON values.
+    """
+
+    header: str
+    capture: str
+    step: float
+    movers: int
+    every: int
+    config: Mapping[str, Any]
+
+
+class TrackFile:
+    """A track that is read; of a pass that is not done, what is whole.
+
+    Attributes:
+        head: what it is of.
+        starts: the frames at which groups may begin, frame 0 not included.
+        groups: ``(first frame, end)`` of the groups that the pass chose; None if it is not done.
+        frames: number of tracked frames; None if it is not done.
+        end: offset after the last whole start record.
+
+    Raises:
+        StreamError: it is no track, or of another version.
+    """
+
+    def __init__(self, data: ByteSource, name: str) -> None:
+        self._data, self._name, self._offsets = data, name, dict[int, int]()
+        self.groups: list[tuple[int, int]] | None = None
+        self.frames: int | None = None
+        if len(data) < PREFIX.size or not bytes(data[: PREFIX.size]).startswith(SIGNATURE):
+            raise StreamError(f"{name} is no track; make one with: structgstream track CAPTURE --init HEADER -o {name}")
+        if (major := PREFIX.unpack(data[: PREFIX.size])[1]) != MAJOR:
+            raise StreamError(f"{name} is a track of version {major}; this program reads {MAJOR}. Make it again.")
+        head = read_record(data, PREFIX.size)
+        if head is None or head.type != TrackRecord.HEAD:
+            raise StreamError(f"The beginning of the track {name} is damaged; make it again.")
+        try:
+            self.head = TrackHead(**json.loads(head.payload))
+        except (TypeError, ValueError) as error:
+            raise StreamError(f"The head of the track {name} does not follow the format ({error}).") from error
+        self.end = self._scan(head.end)
+
+    @property
+    def starts(self) -> list[int]:
+        """The frames at which groups may begin, ascending."""
+        return [*self._offsets]
+
+    def _scan(self, offset: int) -> int:
+        # Heads only: a start's checksum is verified when it is read.
+        while (found := read_head(self._data, offset)) is not None:
+            kind, length = found
+            after = offset + RECORD.size + length + CHECKSUM.size
+            if kind == TrackRecord.START and length >= START.size:
+                frame = START.unpack(self._data[offset + RECORD.size : offset + RECORD.size + START.size])[0]
+                self._offsets[frame] = offset
+            elif kind == TrackRecord.END and (record := read_record(self._data, offset)) is not None:
+                facts = json.loads(record.payload)
+                self.frames = facts["frames"]
+                self.groups = [(first, end) for first, end in facts["groups"]]
+                break
+            else:
+                break
+            offset = after
+        return offset
+
+    def start(self, frame: int) -> TrackStart:
+        """Where movers are in ``frame``.
+
+        Raises:
+            StreamError: the pass has stored no start there, or it is damaged.
+        """
+        if frame not in self._offsets:
+            near = ", ".join(map(str, self.starts[:8])) or "none"
+            raise StreamError(
+                f"The track {self._name} has no start at frame {frame}; it has {near}"
+                f"{', ...' if len(self._offsets) > 8 else ''}. Begin groups there, or track again with other --groups."
+            )
+        record = read_record(self._data, self._offsets[frame])
+        try:
+            if record is not None:
+                return TrackStart.unpacked(record.payload)
+        except (ValueError, struct.error, zlib.error):
+            pass
+        raise StreamError(f"The start at frame {frame} in the track {self._name} is damaged; track again.")
+
+    def whole_starts(self) -> Iterator[tuple[TrackStart, int]]:
+        """The starts in order up to the first damaged one, each with the offset after it."""
+        for frame in self.starts:
+            record = read_record(self._data, self._offsets[frame])
+            if record is None:
+                return
+            yield self.start(frame), record.end
+
+
+def open_track(path: Path) -> TrackFile:
+    """The track at ``path``, or what is there of it while its pass runs.
+
+    Raises:
+        StreamError: there is none, or it is no track.
+    """
+    partial = partial_path(path)
+    found = partial if not path.exists() and partial.exists() else path
+    return TrackFile(FileBytes(found), str(found))
+
+
+class TrackWriter:
+    """Writes the track ``path``.
+
+    Args:
+        path: of the finished track.
+        head: what it is of.
+        keep: bytes of an interrupted pass that stay; 0 to begin again.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+
+    def __init__(self, path: Path, head: TrackHead, *, keep: int = 0) -> None:
+        self._file = GrowingFile(path, keep=keep)
+        if not keep:
+            self._file.append(PREFIX.pack(SIGNATURE, MAJOR, MINOR))
+            self._file.append(packed(TrackRecord.HEAD, json.dumps(vars(head), sort_keys=True).encode()))
+
+    def write(self, start: TrackStart) -> int:
+        """Appends a start; returns its bytes."""
+        return self._file.append(packed(TrackRecord.START, start.packed()))
+
+    def finish(self, frames: int, groups: Sequence[tuple[int, int]]) -> None:
+        """Ends the track, and gives it its name."""
+        facts = {"frames": frames, "groups": [list(group) for group in groups]}
+        self._file.append(packed(TrackRecord.END, json.dumps(facts).encode()))
+        self._file.finish()
+
+    def close(self) -> None:
+        """Closes the file, which may go on later."""
+        self._file.close()
