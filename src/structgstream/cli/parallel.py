@@ -79,6 +79,8 @@ class Parallel:
     """Random seed. Default: the preset's."""
     overwrite: bool = False
     """Replace OUT and its parts when they exist."""
+    store: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    """Where the parts meet if the machines share no folder, such as s3://bucket/runs/ball. Needs the extra cloud."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
     run: WorkerOptions = field(default_factory=WorkerOptions)
 
@@ -91,6 +93,7 @@ def main(arguments: list[str]) -> None:
     if options.groups is not None and options.groups < 1:
         raise UsageError(f"--groups counts frames, from 1; got {options.groups}.")
     from structgstream.errors import StorageError
+    from structgstream.parallel.object_folder import ObjectFolder
     from structgstream.parallel.parts import Parts
 
     parts = Parts(parts_folder(options.output))
@@ -98,12 +101,14 @@ def main(arguments: list[str]) -> None:
     with parts.held():
         if options.overwrite:
             parts.clear()
+            if options.store is not None:
+                ObjectFolder(options.store).clear()
         if options.output.exists() and not options.overwrite and not parts.notes:
             raise StorageError(f"{options.output} exists; replace it with --overwrite, or choose another name.")
         with usage_errors():
             executor = opened(chosen, options.device)
         with executor:
-            _drive(_job(options, rest), parts, executor, console)
+            _drive(_job(options, rest), parts, executor, options.store, console)
     size = human_bytes(options.output.stat().st_size)
     _say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}, which can be deleted.")
 
@@ -163,13 +168,16 @@ def _words(name: str, value: object) -> list[str]:
     return [] if value is None else [f"--{name}", str(value)]
 
 
-def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", console: Console) -> None:
+def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", store: str | None, console: Console) -> None:
     from structgstream.evaluation.run_log import read_log
     from structgstream.parallel.driver import drive
+    from structgstream.parallel.exchange import ObjectStore
+    from structgstream.parallel.object_folder import ObjectFolder
 
+    exchange = None if store is None else ObjectStore(ObjectFolder(store), parts, cut=job.unit.cut)
     with ParallelDisplay(console, lambda first, end: len(read_log(parts.segment(first, end)))) as display:
         try:
-            drive(job, parts, executor, listener=display.show)
+            drive(job, parts, executor, exchange=exchange, listener=display.show)
         except KeyboardInterrupt:
             raise Interrupted(f"Whole frames are kept in {parts.folder}; go on with the same command.") from None
 

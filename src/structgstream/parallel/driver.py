@@ -11,8 +11,9 @@ from structgstream.executors.executor import Executor, TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.places import Place
 from structgstream.executors.task import Ending, Task
-from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
-from structgstream.parallel.unit import HEADER, JOIN, TRACK, Groups, Unit, groups_of
+from structgstream.parallel.exchange import Exchange, SharedFolder
+from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of, write_whole
+from structgstream.parallel.unit import HEADER, JOIN, TRACK, Groups, Unit, groups_of, groups_path
 
 POLL_SECONDS = 0.5
 LINES_TOLD = 6
@@ -72,7 +73,14 @@ class Job:
         return {**given, "track": unit.track, "device": unit.device}
 
 
-def drive(job: Job, parts: Parts, executor: Executor, *, listener: Listener | None = None) -> Groups:
+def drive(
+    job: Job,
+    parts: Parts,
+    executor: Executor,
+    *,
+    exchange: Exchange | None = None,
+    listener: Listener | None = None,
+) -> Groups:
     """Makes what is missing of the parts, and joins them to ``job.output``; returns the groups.
 
     Call it again after an interruption: parts that are whole are not made again.
@@ -81,6 +89,7 @@ def drive(job: Job, parts: Parts, executor: Executor, *, listener: Listener | No
         job: what is to be made.
         parts: the folder of parts, which this process holds (:meth:`Parts.held`).
         executor: runs the tasks, all but the joining, which is done here.
+        exchange: how parts come here; None if all machines see the folder.
         listener: told of the state, twice a second and when something ends.
 
     Raises:
@@ -88,14 +97,15 @@ def drive(job: Job, parts: Parts, executor: Executor, *, listener: Listener | No
         StorageError: the parts cannot be written, or are not seen here.
     """
     parts.keep_to(job.plan)
-    return _Drive(job, parts, executor, listener or (lambda status: None)).run()
+    return _Drive(job, parts, executor, exchange or SharedFolder(), listener or (lambda status: None)).run()
 
 
 class _Drive:
     """The state of :func:`drive`."""
 
-    def __init__(self, job: Job, parts: Parts, executor: Executor, tell: Listener) -> None:
+    def __init__(self, job: Job, parts: Parts, executor: Executor, exchange: Exchange, tell: Listener) -> None:
         self._job, self._unit, self._parts, self._executor, self._tell = job, job.unit, parts, executor, tell
+        self._exchange = exchange
         self._status = Status(HEADER)
         self._index: dict[str, int] = {}
         self._next = 0  # of the groups, the first that is not submitted
@@ -107,7 +117,7 @@ class _Drive:
         self._run_alone(self._unit.header_task(self._parts), self._parts.header)
         self._header_key = sha256_of(self._parts.header)
         self._say(stage=TRACK)
-        self._executor.submit(self._unit.track_task(self._parts), gpus=self._job.gpus)
+        self._executor.submit(self._exchange.track(self._unit.track_task(self._parts)), gpus=self._job.gpus)
         is_tracked = False
         while not is_tracked or self._executor.running or self._executor.waiting:
             self._submit_groups(is_tracked=is_tracked)
@@ -128,15 +138,19 @@ class _Drive:
     def _run_alone(self, task: Task, part: Path) -> None:
         """Frame 0: there is nothing beside it to do."""
         self._tell(self._status)
-        self._executor.submit(task, gpus=self._job.gpus)
+        self._executor.submit(self._exchange.header(task), gpus=self._job.gpus)
         while not (endings := self._executor.wait(POLL_SECONDS)):
             self._tell(self._status)
+        self._keep_words(endings[0])
         if not endings[0].done:
             raise TaskError(_sentence(endings, self._parts))
+        self._exchange.bring(part)
         self._parts.note(endings[0], key_of(task.command), part, frames=1)
 
     def _submit_groups(self, *, is_tracked: bool) -> None:
         """Those whose beginning the track has."""
+        if not is_tracked:
+            self._exchange.follow()
         if not self._status.groups:
             groups = groups_of(self._parts.track)
             if groups is None:
@@ -152,7 +166,7 @@ class _Drive:
             if self._parts.is_whole(task.name, self._key(task), Path(task.result)):
                 states[self._next] = State.DONE
             else:
-                self._executor.submit(task, gpus=self._job.gpus)
+                self._executor.submit(self._exchange.group(task, groups[self._next][0]), gpus=self._job.gpus)
                 states[self._next] = State.READY
             self._next += 1
         self._say(states=tuple(states), tracked=self._next)
@@ -165,19 +179,29 @@ class _Drive:
         return key_of(task.command, self._header_key)
 
     def _ended(self, ending: Ending) -> None:
+        self._keep_words(ending)
         if not ending.done:
             self._failed.append(ending)
             self._say(failed=tuple(failed.name for failed in self._failed))
         if ending.name == TRACK:
             if ending.done:
+                self._exchange.bring(self._parts.track)
+                self._exchange.bring(groups_path(self._parts.track))
                 frames = (groups_of(self._parts.track) or [(0, 0)])[-1][1]
                 self._parts.note(ending, key_of(self._header_key), self._parts.track, frames=frames)
             return
         first, end = self._status.groups[self._index[ending.name]]
         if ending.done:
             task = self._unit.group_task(self._parts, first, end)
+            self._exchange.bring(Path(task.result))
             self._parts.note(ending, self._key(task), Path(task.result), frames=end - first)
         self._mark({ending.name: State.DONE if ending.done else State.FAILED})
+
+    def _keep_words(self, ending: Ending) -> None:
+        """What a task on another machine has printed is kept here."""
+        log = self._parts.log(ending.name)
+        if ending.output and not log.exists():
+            write_whole(log, ending.output.encode())
 
     def _show_running(self) -> None:
         self._mark({name: State.RUNNING for name in self._executor.running if name in self._index})

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands that a parallel run consists of, as tasks: header, tracking pass, a group each, joining."""
 
+import tempfile
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,12 @@ class ReadsTrack(Protocol):
     def __call__(self, track: Path, /) -> Collection[int]: ...
 
 
+class CutsTrack(Protocol):
+    """Makes of a track one with the start of a single group, which is all that it reads."""
+
+    def __call__(self, track: Path, first: int, /) -> bytes: ...
+
+
 def starts_in(track: Path) -> Collection[int]:
     """The starts of a file of ``structgstream track``; none while it has no head yet."""
     from structgstream.groups.track_file import open_track
@@ -29,6 +36,24 @@ def starts_in(track: Path) -> Collection[int]:
         return open_track(track).starts
     except StreamError:
         return ()
+
+
+def cut_track(track: Path, first: int) -> bytes:
+    """A track with the one start that a group needs, as it is while its pass runs.
+
+    Raises:
+        StreamError: there is none, or it is damaged.
+    """
+    from structgstream.groups.growing_file import partial_path
+    from structgstream.groups.track_file import TrackWriter, open_track
+
+    found = open_track(track)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "start"
+        writer = TrackWriter(path, found.head)
+        writer.write(found.start(first))
+        writer.close()
+        return partial_path(path).read_bytes()
 
 
 @dataclass(frozen=True)
@@ -43,6 +68,7 @@ class Unit:
         device: further words for all of them: which back-end computes.
         program: what the commands are given to.
         starts: reads a track.
+        cut: takes from a track what one group needs.
     """
 
     capture: str
@@ -52,6 +78,7 @@ class Unit:
     device: tuple[str, ...] = ()
     program: tuple[str, ...] = PROGRAM
     starts: ReadsTrack = field(default=starts_in, compare=False)
+    cut: CutsTrack = field(default=cut_track, compare=False)
 
     def header_task(self, parts: Parts) -> Task:
         """Frame 0, which all groups share."""
@@ -78,13 +105,18 @@ class Unit:
         return Task(JOIN, command, str(output), parts.log(JOIN))
 
 
+def groups_path(track: Path) -> Path:
+    """Where the groups of a track are listed."""
+    return track.with_name(f"{track.name}.groups")
+
+
 def groups_of(track: Path) -> Groups | None:
     """The groups that a track is for; None while they are not decided.
 
     Raises:
         StreamError: they have gaps, or are no groups.
     """
-    path = track.with_name(f"{track.name}.groups")
+    path = groups_path(track)
     try:
         text = path.read_text()
     except OSError:
