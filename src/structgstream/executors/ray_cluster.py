@@ -91,6 +91,7 @@ class RayEngine:
             num_gpus=gpus,
             max_retries=task.retries,
             retry_exceptions=[CommandKilled],
+            scheduling_strategy="SPREAD",  # Else one machine gets tasks after tasks while others begin their workers.
         )
         # A file of this machine is no place for what is printed on another.
         sent = replace(task, log=None)

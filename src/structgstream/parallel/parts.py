@@ -146,7 +146,7 @@ class Parts:
             return False
 
     def note(self, ending: Ending, key: str, part: Path, *, frames: int) -> Note:
-        """Notes that a task has ended well.
+        """Notes that a task has ended well; one that has only found its part whole again is noted already.
 
         Raises:
             StorageError: its part is not there, or the note cannot be written.
@@ -167,6 +167,9 @@ class Parts:
                 f"The task {ending.name} has ended well, but {part} cannot be read here ({error.strerror}); do all "
                 "machines see this folder at the same place?"
             ) from error
+        earlier = self.notes.get(note.name)
+        if earlier is not None and (earlier.key, earlier.sha256) == (note.key, note.sha256):
+            return earlier
         self.notes[note.name] = note
         try:
             with (self.folder / NOTES).open("a") as file:
