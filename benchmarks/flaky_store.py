@@ -51,6 +51,7 @@ def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
+        s3fs.S3FileSystem.clear_instance_cache()  # Those of an earlier server go to its address.
         s3fs.S3FileSystem().mkdir(BUCKET)
         application.every = every
         yield f"s3://{BUCKET}/run", application

@@ -130,7 +130,7 @@ def killed_drivers(row: Row, folder: Path, *, whole: str, kills: int, most: floa
         while True:
             process = driver(run, real=real)
             try:
-                _, said = process.communicate(timeout=rng.uniform(0, most) if row.events < kills else None)
+                _, said = process.communicate(timeout=rng.uniform(0, 2 * most) if row.events < kills else None)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.communicate()

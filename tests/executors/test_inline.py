@@ -34,6 +34,7 @@ def run(
     inline.submit(task)
     with inline:
         ending = all_endings(inline)["task"]
+    assert ending.output == log.read_text()
     return ending.status, log.read_text()
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine ``inline``: tasks run in this process, one after the other, where a debugger sees them."""
 
+import io
 import os
 import runpy
 import sys
@@ -12,10 +13,12 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import IO
 
-from structgstream.executors.process import CommandProcess, waited_for
+from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
 from structgstream.executors.task import PYTHON, Ending, Task
 
 WAIT_SECONDS = 3600.0
+INTERRUPTED = 130
+"""The status of a command that Ctrl-C has ended."""
 
 
 class InlineEngine:
@@ -46,8 +49,8 @@ class InlineEngine:
         if task.command[:2] != (PYTHON, "-m"):
             return [_in_a_process(task)]
         begun = time.monotonic()
-        status = _called(task.command[2], list(task.command[3:]), task.environment, log=task.log)
-        return [Ending(task.name, status, time.monotonic() - begun)]
+        status, said = _called(task.command[2], list(task.command[3:]), task.environment, log=task.log)
+        return [Ending(task.name, status, time.monotonic() - begun, output=said)]
 
     def stop(self) -> None:
         """See ``Engine.stop``."""
@@ -66,26 +69,34 @@ def _in_a_process(task: Task) -> Ending:
         raise
 
 
-def _called(module: str, arguments: list[str], environment: Mapping[str, str], *, log: Path | None) -> int:
-    """Runs a module as the program it is, and returns the status it would end with.
+def _called(module: str, arguments: list[str], environment: Mapping[str, str], *, log: Path | None) -> tuple[int, str]:
+    """Runs a module as the program it is; the status it would end with, and the end of what it has printed.
 
     Raises:
         KeyboardInterrupt: the user pressed Ctrl-C, also if the program ended because of it.
     """
-    with warnings.catch_warnings(), _printing(log), _as_program(module, arguments, environment):
-        try:
+    with opened_log(log) as file:
+        began_at = file.tell()
+        with io.TextIOWrapper(file, write_through=True) as text:
+            with _printing(text), _as_program(module, arguments, environment):
+                status = _status_of(module)
+            return status, tail_of(file, began_at)
+
+
+def _status_of(module: str) -> int:
+    try:
+        with warnings.catch_warnings():
             warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")  # This process may know it.
             runpy.run_module(module, run_name="__main__", alter_sys=True)
-        except SystemExit as ending:
-            if isinstance(ending.code, str):
-                print(ending.code, file=sys.stderr)
-            status = 0 if ending.code is None else ending.code if isinstance(ending.code, int) else 1
-            if status == 130:
-                raise KeyboardInterrupt from None
-            return status
-        except Exception:
-            traceback.print_exc()
-            return 1
+    except SystemExit as ending:
+        if ending.code == INTERRUPTED:
+            raise KeyboardInterrupt from None
+        if isinstance(ending.code, str):
+            print(ending.code, file=sys.stderr)
+        return 0 if ending.code is None else ending.code if isinstance(ending.code, int) else 1
+    except Exception:
+        traceback.print_exc()
+        return 1
     return 0
 
 
@@ -107,13 +118,7 @@ def _as_program(module: str, arguments: list[str], environment: Mapping[str, str
 
 
 @contextmanager
-def _printing(log: Path | None) -> Iterator[None]:
-    """What the block prints goes to ``log``."""
-    file: IO[str]
-    if log is None:
-        file = open(os.devnull, "w")  # noqa: SIM115
-    else:
-        log.parent.mkdir(parents=True, exist_ok=True)
-        file = log.open("a")
-    with file, redirect_stdout(file), redirect_stderr(file):
+def _printing(text: IO[str]) -> Iterator[None]:
+    """What the block prints goes to ``text``."""
+    with redirect_stdout(text), redirect_stderr(text):
         yield

@@ -30,7 +30,8 @@ class CommandProcess:
 
     def __init__(self, task: Task, *, environment: Mapping[str, str]) -> None:
         self.name = task.name
-        self._log, self._began_at = _opened(task.log)
+        self._log = opened_log(task.log)
+        self._began_at = self._log.tell()
         self._begun = time.monotonic()
         tied = [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid())]
         self._process = subprocess.Popen(
@@ -57,8 +58,10 @@ class CommandProcess:
         self._process.returncode = code = os.waitstatus_to_exitcode(status)
         os.close(self.descriptor)
         seconds = time.monotonic() - self._begun
+        with self._log:
+            said = tail_of(self._log, self._began_at)
         peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-        return Ending(self.name, code, seconds, attempts, peak, self._tail())
+        return Ending(self.name, code, seconds, attempts, peak, said)
 
     def ask(self) -> None:
         """Asks it to end."""
@@ -77,12 +80,6 @@ class CommandProcess:
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 
-    def _tail(self) -> str:
-        with self._log:
-            end = self._log.seek(0, os.SEEK_END)
-            self._log.seek(max(self._began_at, end - TAIL_BYTES))
-            return self._log.read().decode(errors="replace")
-
 
 def waited_for(processes: Sequence[CommandProcess], seconds: float) -> bool:
     """Waits until one of them has ended, for at most so long; whether one has."""
@@ -92,10 +89,18 @@ def waited_for(processes: Sequence[CommandProcess], seconds: float) -> bool:
     return bool(poll.poll(round(seconds * 1000)))
 
 
-def _opened(log: Path | None) -> tuple[BinaryIO, int]:
-    """Where the output goes, and where that of this attempt begins."""
+def opened_log(log: Path | None) -> BinaryIO:
+    """The file that output goes to, at its end; one without a name if there is none."""
     if log is None:
-        return tempfile.TemporaryFile(), 0
+        return tempfile.TemporaryFile()
     log.parent.mkdir(parents=True, exist_ok=True)
     file = log.open("ab+")
-    return file, file.seek(0, os.SEEK_END)
+    file.seek(0, os.SEEK_END)
+    return file
+
+
+def tail_of(file: BinaryIO, begin: int) -> str:
+    """The end of what was written from byte ``begin`` on."""
+    end = file.seek(0, os.SEEK_END)
+    file.seek(max(begin, end - TAIL_BYTES))
+    return file.read().decode(errors="replace")
