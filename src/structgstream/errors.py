@@ -11,6 +11,7 @@
     |-- BackendError            a compute back-end is not available on this machine
     |-- ConfigError             an option has an invalid value
     |-- OutOfMemoryError        a kernel has not enough memory; also a MemoryError
+    |-- TaskError               tasks of a run failed; what the others made is kept
     |-- PlayerError             the player cannot be served, or does not fit in a page
     `-- MissingExtraError       an optional dependency is not installed
 
@@ -52,6 +53,10 @@ class OutOfMemoryError(StructGStreamError, MemoryError):
 
     def __init__(self, work: str) -> None:
         super().__init__(f"Not enough memory {work}; close other programs, or use smaller pictures (--scale 0.5).")
+
+
+class TaskError(StructGStreamError):
+    """Tasks of a run failed; the message says which, and why the first did. What the others made is kept."""
 
 
 class PlayerError(StructGStreamError):

@@ -24,6 +24,8 @@ COMMANDS = {
     "reconstruct": "turn a capture into a stream, frame by frame",
     "track": "follow what moves through a capture, so that groups of frames can be fitted apart",
     "join": "put groups of frames that were fitted apart together to one stream",
+    "parallel": "turn a capture into a stream, groups of frames side by side, on one machine or many",
+    "plan": "how long a capture would take, on how many machines, and how many bytes it would be",
     "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
     "serve": "serve a folder of streams to viewers, live ones while they are made",

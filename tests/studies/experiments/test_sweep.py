@@ -2,6 +2,7 @@
 """A sweep goes on where it was stopped, does nothing twice, and one failure takes along only what needs it."""
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,18 @@ import pytest
 from fake_tasks import Frames
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
+from structgstream.executors.opening import ExecutorOptions
 from structgstream_studies.experiments import sweep as module
-from structgstream_studies.experiments.sweep import Outcome, Progress, sweep, unique, worker_slots
-from structgstream_studies.experiments.worker import WorkerSlot
+from structgstream_studies.experiments.sweep import Listener, Outcome, Progress, executor_for, sweep, unique
 
-SEATS = [WorkerSlot("reference", 1), WorkerSlot("reference", 1)]
+TESTS = Path(__file__).parent
+
+
+def swept(tasks: list[Frames], folder: Path, *, listener: Listener | None = None) -> Outcome:
+    """A sweep in two processes, which find the tasks' module."""
+    with pytest.MonkeyPatch.context() as patched, executor_for("reference", ExecutorOptions(workers=2)) as executor:
+        patched.setenv("PYTHONPATH", os.pathsep.join([str(TESTS), *filter(None, sys.path)]))
+        return sweep(tasks, executor, folder=folder, device="reference", listener=listener)
 
 
 def tasks_in(folder: Path) -> list[Frames]:
@@ -39,11 +47,11 @@ class Stopped:
     """A sweep that fails, is begun again and stopped, and then goes on to its end."""
 
     def __init__(self, folder: Path) -> None:
-        tasks, logs = tasks_in(folder), folder / "logs"
+        tasks = tasks_in(folder)
         log_path(tasks[0].stream).write_text('{"index": 0}\n')
         self.folder = folder
         self.shown: list[Progress] = []
-        self.first = sweep(tasks, SEATS, logs=logs, listener=self.shown.append)
+        self.first = swept(tasks, folder, listener=self.shown.append)
         self.after_first = contents(folder)
 
         def stop(progress: Progress) -> None:
@@ -51,11 +59,11 @@ class Stopped:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            sweep(tasks, SEATS, logs=logs, listener=stop)
+            swept(tasks, folder, listener=stop)
         self.after_second = contents(folder)
         self.process_of_second = read_log(tasks[3].stream)[2]["process"]
         (folder / "go").touch()
-        self.third = sweep(tasks[:-2], SEATS, logs=logs)
+        self.third = swept(tasks[:-2], folder)
         self.after_third = contents(folder)
 
 
@@ -109,29 +117,24 @@ def test_what_is_left_is_done_in_the_end(stopped: Stopped) -> None:
 
 def test_a_sweep_of_nothing_ends_at_once(stopped: Stopped) -> None:
     done = tasks_in(stopped.folder)[:4]
-    assert sweep(done, SEATS, logs=stopped.folder / "none").skipped == ("bad", "left", "ready", "right")
+    assert swept(done, stopped.folder / "none").skipped == ("bad", "left", "ready", "right")
     assert not (stopped.folder / "none").exists()
-    assert sweep([], SEATS, logs=stopped.folder / "none") == Outcome((), (), ())
+    assert swept([], stopped.folder / "none") == Outcome((), (), ())
 
 
-@pytest.mark.parametrize(("jobs", "threads"), [(None, [1] * 8), (3, [2] * 3), (1, [8]), (12, [1] * 12)])
-def test_cores_are_shared_out(monkeypatch: pytest.MonkeyPatch, jobs: int | None, threads: list[int]) -> None:
-    monkeypatch.setattr(module, "usable_cores", lambda: 8)
-    assert worker_slots("cpu", jobs=jobs) == [WorkerSlot("cpu", count) for count in threads]
-
-
-def test_jobs_take_turns_on_the_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_is_asked_for_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert [seat.gpu for seat in worker_slots("auto", jobs=None)] == [0, 1]
-    assert [seat.gpu for seat in worker_slots("cuda", jobs=3)] == [0, 1, 0]
-    assert [seat.gpu for seat in worker_slots("cpu", jobs=2)] == [None, None]
+    assert [module.gpus_of(device) for device in ("auto", "cuda", "cpu")] == [2, 2, 0]
+    executor_for("cuda", ExecutorOptions()).engine.check(1)
+    with pytest.raises(ConfigError, match="needs 1 GPUs, and a worker here has 0"):
+        executor_for("cpu", ExecutorOptions()).engine.check(1)
 
 
 def test_no_jobs_are_refused() -> None:
     with pytest.raises(ConfigError, match="1 or more, got 0"):
-        worker_slots("cpu", jobs=0)
+        executor_for("cpu", ExecutorOptions(workers=0))
 
 
 def test_tasks_of_one_name_are_one(tmp_path: Path) -> None:

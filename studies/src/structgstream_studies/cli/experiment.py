@@ -14,6 +14,7 @@ from rich.text import Text
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import CaptureOptions, Device, Folder
 from structgstream.cli.tables import compact_table, literal_cells
+from structgstream.executors.opening import ExecutorName, ExecutorOptions
 from structgstream_studies.errors import ExperimentError
 
 if TYPE_CHECKING:
@@ -35,6 +36,10 @@ class ExperimentOptions:
     """Random seeds; every result is given with its spread over them."""
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Number of parallel runs, each on its share of the cores. Default: one per core, or one per GPU."""
+    executor: ExecutorName = "local"
+    """What runs them: processes of this machine, this process (inline), or a Ray cluster (docs/cluster.md)."""
+    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")] = None
+    """Head of the Ray cluster, whose machines see the capture and FOLDER at the same place. Default: one begun here."""
     device: Device = "auto"
     """What computes."""
     scored: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
@@ -79,14 +84,16 @@ def run_sweep(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
         ExperimentError: tasks failed; the others are done.
         Interrupted: the user pressed Ctrl-C.
     """
-    from structgstream_studies.experiments.sweep import sweep, worker_slots
+    from structgstream_studies.experiments.sweep import executor_for, gpus_of, sweep
 
-    seats, logs = worker_slots(options.device, jobs=options.jobs), options.output / "logs"
+    device, folder = options.device, options.output
+    given = ExecutorOptions(options.executor, workers=options.jobs, address=options.address)
+    gpus = int(device == "cuda" or gpus_of(device) > 0)
     console = Console()
     view = Display(console)
     try:
-        with view:
-            outcome = sweep(tasks, seats, logs=logs, listener=view.show)
+        with executor_for(device, given) as executor, view:
+            outcome = sweep(tasks, executor, folder=folder, device=device, gpus=gpus, listener=view.show)
     except KeyboardInterrupt:
         raise Interrupted("Whole frames are stored; go on with the same command.") from None
     if outcome.skipped:
@@ -96,7 +103,7 @@ def run_sweep(tasks: Sequence["Task"], options: ExperimentOptions) -> None:
         waiting = f", and {len(outcome.blocked)} that needed them were not begun" if outcome.blocked else ""
         raise ExperimentError(
             f"{len(outcome.failed)} of {len(tasks)} steps failed ({names}){waiting}. Why is in "
-            f"{logs / (outcome.failed[0] + '.txt')}; the same command goes on with what is left."
+            f"{folder / 'logs' / (outcome.failed[0] + '.txt')}; the same command goes on with what is left."
         )
 
 

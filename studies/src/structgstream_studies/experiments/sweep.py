@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs many tasks on the available cores or GPUs; finished tasks are skipped, so a sweep can be resumed."""
+"""Runs the tasks of an experiment by an executor; finished tasks are skipped, so a sweep can be resumed."""
 
-import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from structgstream.errors import ConfigError
 from structgstream.evaluation.environment import usable_cores
+from structgstream.executors import task as executors
+from structgstream.executors.executor import Executor, TaskQueue
+from structgstream.executors.opening import ExecutorOptions, open_executor
 from structgstream.kernels.backend import BackendName
-from structgstream_studies.experiments.worker import Task, WorkerSlot, work
+from structgstream_studies.experiments.worker import Task, command_of
 
 POLL_SECONDS = 0.5
-ENDING_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
@@ -40,20 +37,21 @@ class Outcome:
     skipped: tuple[str, ...]
 
 
-def worker_slots(device: BackendName, *, jobs: int | None) -> list[WorkerSlot]:
-    """Places to compute at: one for each GPU, or ``jobs`` shares of the cores (default: one core each).
-
-    Raises:
-        ConfigError: ``jobs`` is less than 1.
-    """
+def gpus_of(device: BackendName) -> int:
+    """How many GPUs of this machine tasks on ``device`` use."""
     import torch
 
-    if jobs is not None and jobs < 1:
-        raise ConfigError(f"The number of jobs must be 1 or more, got {jobs}.")
-    gpus = torch.cuda.device_count() if device in ("auto", "cuda") else 0
-    count = jobs or gpus or usable_cores()
-    threads = max(1, usable_cores() // count)
-    return [WorkerSlot(device, threads, number % gpus if gpus else None) for number in range(count)]
+    return torch.cuda.device_count() if device in ("auto", "cuda") else 0
+
+
+def executor_for(device: BackendName, options: ExecutorOptions) -> TaskQueue:
+    """What runs the tasks: by default a process for each GPU, or for each core.
+
+    Raises:
+        ConfigError: less than one worker, or a cluster that cannot be joined.
+        MissingExtraError: a package is missing.
+    """
+    return open_executor(options, cores=usable_cores(), gpus=gpus_of(device))
 
 
 def unique(tasks: Iterable[Task]) -> list[Task]:
@@ -62,50 +60,48 @@ def unique(tasks: Iterable[Task]) -> list[Task]:
 
 
 def sweep(
-    tasks: Sequence[Task], seats: Sequence[WorkerSlot], *, logs: Path, listener: Listener | None = None
+    tasks: Sequence[Task],
+    executor: Executor,
+    *,
+    folder: Path,
+    device: BackendName = "auto",
+    gpus: int = 0,
+    listener: Listener | None = None,
 ) -> Outcome:
     """Does every task that is not done, each in its own process, as soon as those that it needs are done.
 
     Args:
         tasks: with distinct names, in an order in which each follows the tasks that it needs.
-        seats: one task at a time runs on each.
-        logs: folder for what the tasks print, ``NAME.txt`` each.
+        executor: runs them; those that were not begun are left in it if others that they need fail.
+        folder: what tasks print goes to ``logs/NAME.txt`` in it; on other machines it must lie at the same place.
+        device: what computes.
+        gpus: how many GPUs a task uses, 0 or 1.
         listener: called twice a second.
 
     Raises:
-        KeyboardInterrupt: after the running tasks have ended; their stored frames are kept for resuming.
+        KeyboardInterrupt: the executor's ``with`` block ends running tasks; their stored frames are kept for resuming.
     """
     skipped = {task.name for task in tasks if task.done()}
-    waiting = {task.name: task for task in tasks if task.name not in skipped}
-    finished, failed = set(skipped), list[str]()
-    free, running = list(seats), dict[str, tuple[BaseProcess, WorkerSlot, Task]]()
-    context = get_context("spawn")  # torch's threads do not survive a fork
-    try:
-        while True:
-            for name in [name for name, task in waiting.items() if finished.issuperset(task.needs)]:
-                if not free:
-                    break
-                task, seat = waiting.pop(name), free.pop(0)
-                process = context.Process(target=work, args=(task, seat, logs / f"{name}.txt"), name=name)
-                process.start()
-                running[name] = (process, seat, task)
-            if not running:
-                return Outcome(tuple(failed), tuple(waiting), tuple(sorted(skipped)))
-            time.sleep(POLL_SECONDS)
-            for name, (process, seat, _) in list(running.items()):
-                if process.is_alive():
-                    continue
-                del running[name]
-                free.append(seat)
-                if process.exitcode == 0:
-                    finished.add(name)
-                else:
-                    failed.append(name)
-            if listener is not None:
-                stored = {name: (_stored(task.stream), task.frames) for name, (_, _, task) in running.items()}
-                listener(Progress(stored, len(finished), len(tasks), tuple(failed)))
-    finally:
-        _end(process for process, _, _ in running.values())
+    begun = {task.name: task for task in tasks if task.name not in skipped}
+    for name in skipped:
+        executor.finished(name)
+    for name, task in begun.items():
+        command = command_of(task, device, folder=folder / "tasks")
+        log = (folder / "logs" / f"{name}.txt").absolute()
+        given = executors.Task(name, command, str(task.stream.absolute()), log, retries=1)
+        executor.submit(given, after=task.needs, gpus=gpus)
+    finished, failed = len(skipped), list[str]()
+    while True:
+        for ending in executor.wait(POLL_SECONDS):
+            if ending.done:
+                finished += 1
+            else:
+                failed.append(ending.name)
+        if listener is not None:
+            stored = {name: (_stored(begun[name].stream), begun[name].frames) for name in executor.running}
+            listener(Progress(stored, finished, len(tasks), tuple(failed)))
+        if not executor.running:
+            return Outcome(tuple(failed), tuple(executor.waiting), tuple(sorted(skipped)))
 
 
 def _stored(stream: Path) -> int:
@@ -117,15 +113,3 @@ def _stored(stream: Path) -> int:
             return sum(1 for _ in file)
     except OSError:
         return 0
-
-
-def _end(processes: Iterable[BaseProcess]) -> None:
-    """Asks politely, then not: streams are whole after every frame either way."""
-    ending = list(processes)
-    for process in ending:
-        with suppress(OSError):
-            process.terminate()
-    for process in ending:
-        process.join(ENDING_SECONDS)
-        if process.is_alive():
-            process.kill()

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs one task in a separate process, to isolate crashes."""
+"""Runs one task of an experiment as a program: ``python -m structgstream_studies.experiments.worker TASK DEVICE``.
 
-import os
+TASK is a file in which :func:`command_of` has written the task, which is a value.
+"""
+
+import pickle
 import sys
 import traceback
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from structgstream.errors import StructGStreamError
+from structgstream.errors import StorageError, StructGStreamError
+from structgstream.executors.task import PYTHON
 from structgstream.kernels.backend import Backend, BackendName
 
 
@@ -42,38 +46,45 @@ class Task(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class WorkerSlot:
-    """Where a task computes: a back-end, a number of threads, and which GPU where there is one."""
-
-    device: BackendName
-    threads: int
-    gpu: int | None = None
+DONE, FAILED = 0, 1
 
 
-FAILED = 1
+def command_of(task: Task, device: BackendName, *, folder: Path) -> tuple[str, ...]:
+    """The command that runs a task, which is stored in ``folder`` for it.
 
-
-def work(task: Task, seat: WorkerSlot, log: Path) -> None:
-    """Runs a task; what it prints goes to ``log``. Ends the process with status 1 when the task fails."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as file:
-        os.dup2(file.fileno(), sys.stdout.fileno())
-        os.dup2(file.fileno(), sys.stderr.fileno())
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+    path = (folder / f"{task.name}.task").absolute()
     try:
-        import torch
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(task))
+    except OSError as error:
+        raise StorageError(f"The task {path} cannot be written ({error.strerror}).") from error
+    return (PYTHON, "-m", __name__, str(path), device)
 
+
+def work(task: Task, device: BackendName) -> int:
+    """Runs a task here; what goes wrong is printed. Returns the status of its process."""
+    try:
         from structgstream.kernels.backend import select_backend
 
-        torch.set_num_threads(seat.threads)
-        if seat.gpu is not None:
-            torch.cuda.set_device(seat.gpu)
-        task.run(select_backend(seat.device))
+        task.run(select_backend(device))
     except StructGStreamError as error:
         print(f"{task.name}: {error}", file=sys.stderr, flush=True)
-        sys.exit(FAILED)
-    except KeyboardInterrupt:
-        sys.exit(FAILED)
+        return FAILED
     except Exception:
         traceback.print_exc()
-        sys.exit(FAILED)
+        return FAILED
+    return DONE
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the task of a file that :func:`command_of` has written."""
+    path, device = arguments
+    task: Task = pickle.loads(Path(path).read_bytes())
+    return work(task, device)  # type: ignore[arg-type]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

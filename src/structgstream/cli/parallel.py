@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``structgstream parallel``."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from rich.console import Console
+
+from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.options import CaptureOptions, Device, Folder, parse_known_options, resolve_config
+from structgstream.cli.parallel_display import ParallelDisplay
+from structgstream.cli.progress import human_bytes
+from structgstream.executors.opening import ExecutorName, ExecutorOptions
+
+if TYPE_CHECKING:
+    from structgstream.executors.executor import TaskQueue
+    from structgstream.parallel.driver import Job
+    from structgstream.parallel.parts import Parts
+
+
+@dataclass(frozen=True)
+class WorkerOptions:
+    """Options that say what runs the groups."""
+
+    executor: ExecutorName = "local"
+    """local: processes of this machine; inline: this process, one group after the other; ray: a Ray cluster, which
+    needs the extra cluster (docs/cluster.md)."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Groups at a time. Default: one a GPU, or one a core. A cluster that is joined has its own number."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Threads of each. Default: its share of the cores; one on a cluster."""
+    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")] = None
+    """Head of the Ray cluster to join. Default: one that is begun here, for this run."""
+
+    @property
+    def chosen(self) -> ExecutorOptions:
+        """As executors take them.
+
+        Raises:
+            UsageError: an address without Ray.
+        """
+        if self.address is not None and self.executor != "ray":
+            raise UsageError("--address is the head of a Ray cluster; add --executor ray.")
+        return ExecutorOptions(self.executor, self.workers, self.threads, self.address)
+
+
+@dataclass(frozen=True)
+class Parallel:
+    """Turns a recorded capture into a stream, groups of frames side by side.
+
+    Frame 0 is fitted first, then a pass tracks what moves through all frames, and each group of frames is fitted as
+    soon as the pass has come to it (docs/groups.md). The parts are kept in OUT.parts; after Ctrl-C, a crash or a
+    failure the same command goes on with what is not whole there. Where a group runs does not change a byte.
+
+    Example: structgstream parallel basketball -o ball.sgs --groups 30 --workers 2
+
+    Example: structgstream parallel basketball -o ball.sgs --executor ray --address head:6379
+    """
+
+    scene: tyro.conf.Positional[Folder]
+    """The capture; on a cluster all machines see it at the same place."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    """The stream file to write; on a cluster all machines see its folder at the same place."""
+    groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Frames of a group: a multiple of the key interval. Default: one key interval."""
+    quiet: bool = False
+    """Begin groups where little moves."""
+    odd: bool = False
+    """Allow an N that is no multiple of the key interval; each group then costs a key packet more."""
+    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """compact (default), fast, or tiny; fields of the configuration are options as of reconstruct."""
+    quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
+    """0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
+    device: Device = "auto"
+    """Compute back-end; auto takes the first available of cuda, cpu, reference."""
+    seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Random seed. Default: the preset's."""
+    overwrite: bool = False
+    """Replace OUT and its parts when they exist."""
+    store: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    """Where the parts meet if the machines share no folder, such as s3://bucket/runs/ball. Needs the extra cloud."""
+    capture: CaptureOptions = field(default_factory=CaptureOptions)
+    run: WorkerOptions = field(default_factory=WorkerOptions)
+
+
+def main(arguments: list[str]) -> None:
+    """Runs with a display of all groups."""
+    options, rest = parse_known_options(Parallel, "parallel", arguments=arguments)
+    resolve_config(options.preset, rest, command="parallel", seed=options.seed)
+    chosen = options.run.chosen
+    if options.groups is not None and options.groups < 1:
+        raise UsageError(f"--groups counts frames, from 1; got {options.groups}.")
+    from structgstream.errors import StorageError
+    from structgstream.parallel.object_folder import ObjectFolder
+    from structgstream.parallel.parts import Parts
+
+    parts = Parts(parts_folder(options.output))
+    console = Console()
+    with parts.held():
+        if options.overwrite:
+            parts.clear()
+            if options.store is not None:
+                ObjectFolder(options.store).clear()
+        if options.output.exists() and not options.overwrite and not parts.notes:
+            raise StorageError(f"{options.output} exists; replace it with --overwrite, or choose another name.")
+        with usage_errors():
+            executor = opened(chosen, options.device)
+        with executor:
+            _drive(_job(options, rest), parts, executor, options.store, console)
+    size = human_bytes(options.output.stat().st_size)
+    _say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}, which can be deleted.")
+
+
+def parts_folder(output: Path) -> Path:
+    """Where the parts of a stream are."""
+    return output.with_name(f"{output.name}.parts").absolute()
+
+
+def opened(options: ExecutorOptions, device: Device) -> "TaskQueue":
+    """The executor that was asked for, on this machine's cores and GPUs.
+
+    Raises:
+        ConfigError: less than one worker, or a cluster that cannot be joined.
+        MissingExtraError: a package is missing.
+    """
+    from structgstream.evaluation.environment import usable_cores
+    from structgstream.executors.opening import open_executor
+
+    return open_executor(options, cores=usable_cores(), gpus=gpus_of(device))
+
+
+def gpus_of(device: Device) -> int:
+    """How many GPUs of this machine the tasks use."""
+    if device not in ("auto", "cuda"):
+        return 0
+    import torch
+
+    return torch.cuda.device_count()
+
+
+def _job(options: Parallel, rest: list[str]) -> "Job":
+    from structgstream.parallel.driver import Job
+    from structgstream.parallel.unit import Unit
+
+    capture = options.capture
+    header = [*_words("preset", options.preset), *_words("quality", options.quality), *_words("seed", options.seed)]
+    header += [*_words("start", capture.start or None), *_words("near", capture.near)]
+    header += _words("scale", None if capture.scale == 1.0 else capture.scale)
+    header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
+    track = [
+        *_words("groups", options.groups),
+        *(["--quiet"] if options.quiet else []),
+        *(["--odd"] if options.odd else []),
+    ]
+    unit = Unit(
+        str(options.scene.absolute()),
+        capture.frames,
+        (*header, *rest),
+        tuple(track),
+        ("--device", options.device),
+    )
+    return Job(unit, options.output.absolute(), int(options.device == "cuda" or gpus_of(options.device) > 0))
+
+
+def _words(name: str, value: object) -> list[str]:
+    return [] if value is None else [f"--{name}", str(value)]
+
+
+def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", store: str | None, console: Console) -> None:
+    from structgstream.evaluation.run_log import read_log
+    from structgstream.parallel.driver import drive
+    from structgstream.parallel.exchange import ObjectStore
+    from structgstream.parallel.object_folder import ObjectFolder
+
+    exchange = None if store is None else ObjectStore(ObjectFolder(store), parts, cut=job.unit.cut)
+    with ParallelDisplay(console, lambda first, end: len(read_log(parts.segment(first, end)))) as display:
+        try:
+            drive(job, parts, executor, exchange=exchange, listener=display.show)
+        except KeyboardInterrupt:
+            raise Interrupted(f"Whole frames are kept in {parts.folder}; go on with the same command.") from None
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the user sees of a parallel run: a cell for each group on a terminal, a line for each ending elsewhere."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from structgstream.parallel.driver import State, Status
+
+STYLES = {
+    "waiting for the track": ("·", "dim"),
+    "ready": ("○", ""),
+    "running": ("◐", "cyan"),
+    "done": ("●", "green"),
+    "failed": ("✗", "red"),
+}
+WORST_FIRST = ("failed", "running", "ready", "waiting for the track", "done")
+OTHERS = ("running", "ready", "waiting for the track", "failed")
+ROWS = 6
+SHOWN = 8
+FramesOf = Callable[[int, int], int]
+"""How many frames a running group has by now."""
+
+
+def cells(states: Sequence["State"], *, width: int) -> Text:
+    """The groups in order, a sign each; of many, one for several, which shows what is least done among them."""
+    share = max(1, -(-len(states) // (width * ROWS)))
+    text = Text()
+    for start in range(0, len(states), share):
+        several = states[start : start + share]
+        state = next(name for name in WORST_FIRST if name in several)
+        sign, style = STYLES[state]
+        text.append(sign, style)
+        if (start // share + 1) % width == 0:
+            text.append("\n")
+    return text
+
+
+def counted(status: "Status") -> str:
+    """The state in words."""
+    if not status.groups:
+        return {"header": "frame 0", "track": "tracking begins"}.get(status.stage, status.stage)
+    counts = Counter(str(state) for state in status.states)
+    frames = sum(end - first for (first, end), state in zip(status.groups, status.states) if state == "done")
+    parts = [f"{counts['done']} of {len(status.groups)} groups done ({frames} of {status.groups[-1][1]} frames)"]
+    parts += [
+        f"{counts[name]} {name}" for name in ("running", "ready", "waiting for the track", "failed") if counts[name]
+    ]
+    return ", ".join(["joining", *parts[:1]] if status.stage == "join" else parts)
+
+
+class ParallelDisplay:
+    """Shows a state when told: a picture of all groups that renews itself, or lines.
+
+    Args:
+        console: where to write.
+        frames_of: how far a group is.
+    """
+
+    def __init__(self, console: Console, frames_of: FramesOf) -> None:
+        self._console, self._frames_of = console, frames_of
+        self._begun = time.monotonic()
+        self._live = Live(Text(), console=console, refresh_per_second=2)
+        self._told = ""
+
+    def __enter__(self) -> "ParallelDisplay":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def show(self, status: "Status") -> None:
+        """Shows it."""
+        if self._console.is_terminal:
+            self._live.update(self._picture(status))
+            return
+        done = sum(state == "done" for state in status.states)
+        line = f"{status.stage}: {done} of {len(status.groups)} groups done" if status.groups else status.stage
+        line += f", failed: {', '.join(status.failed)}" if status.failed else ""
+        if line != self._told:
+            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+            self._console.file.flush()
+            self._told = line
+
+    def _picture(self, status: "Status") -> Text:
+        width = max(10, min(self._console.width - 2, 100))
+        seconds = time.monotonic() - self._begun
+        text = Text(f"{counted(status)}, {seconds / 60:.0f} min {seconds % 60:.0f} s\n")
+        text.append_text(cells(status.states, width=width))
+        running = [group for group, state in zip(status.groups, status.states) if state == "running"]
+        for first, end in running[:SHOWN]:
+            text.append(f"\n  frames {first}:{end}  {self._frames_of(first, end)} of {end - first}")
+        if len(running) > SHOWN:
+            text.append(f"\n  and {len(running) - SHOWN} more")
+        return text

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The executor that a caller names."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from structgstream.executors.executor import TaskQueue
+from structgstream.executors.inline import InlineEngine
+from structgstream.executors.local import LocalEngine
+from structgstream.executors.places import shared_out
+
+ExecutorName = Literal["inline", "local", "ray"]
+
+
+@dataclass(frozen=True)
+class ExecutorOptions:
+    """What runs tasks.
+
+    Args:
+        name: ``inline``: this process, one task after the other; ``local``: processes of this machine; ``ray``: a Ray
+            cluster.
+        workers: tasks at a time; None for one a GPU, or one a core. A cluster that is joined has its own number.
+        threads: of each worker; None for its share of the cores, and one on a cluster.
+        address: of the Ray cluster; None begins one on this machine.
+    """
+
+    name: ExecutorName = "local"
+    workers: int | None = None
+    threads: int | None = None
+    address: str | None = None
+
+
+def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> TaskQueue:
+    """The executor, which its ``with`` block ends.
+
+    Args:
+        options: which.
+        cores: of this machine that may be used.
+        gpus: of this machine that may be used.
+
+    Raises:
+        ConfigError: less than one worker or thread, or a cluster that cannot be joined.
+        MissingExtraError: a package is missing.
+    """
+    places = shared_out(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)
+    if options.name == "inline":
+        return TaskQueue(InlineEngine())
+    if options.name == "local":
+        return TaskQueue(LocalEngine(places))
+    from structgstream.executors.ray_cluster import RayEngine, RayOptions
+
+    threads = options.threads or (1 if options.address else places[0].threads)
+    return TaskQueue(RayEngine(RayOptions(options.address, len(places), threads)))

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a parallel run costs: seconds on so many workers, bytes, and how many workers a wanted finish takes.
+
+Note [Serial part]: frame 0 is fitted before anything else, the tracking pass goes through all frames on one worker, and
+joining comes last. The first does not grow with the capture; the second and third grow with its frames, whatever the
+number of workers. A group waits for the pass to come to it, so that no number of workers ends before the pass has, and
+the last group after it.
+"""
+
+import heapq
+import math
+from dataclasses import dataclass
+
+from structgstream.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What was measured, of one worker.
+
+    Args:
+        header_seconds: frame 0, with the start of its process.
+        track_start_seconds: of the tracking pass, until its first frame.
+        track_seconds: of a tracked frame.
+        start_seconds: of a group: process, header, and what its first frame takes longer than others.
+        frame_seconds: of a frame fitted after another.
+        join_start_seconds: until joining begins.
+        join_seconds: of a joined frame.
+        header_bytes: init record and frame 0.
+        first_bytes: key packet that begins a group.
+        key_bytes: another key packet.
+        frame_bytes: another packet.
+        worker_bytes: largest resident memory of a worker.
+    """
+
+    header_seconds: float
+    track_start_seconds: float
+    track_seconds: float
+    start_seconds: float
+    frame_seconds: float
+    join_start_seconds: float
+    join_seconds: float
+    header_bytes: float
+    first_bytes: float
+    key_bytes: float
+    frame_bytes: float
+    worker_bytes: float
+
+
+@dataclass(frozen=True)
+class Work:
+    """How much there is to do.
+
+    Args:
+        frames: of the capture.
+        group: frames of a group.
+        key_interval: frames from one key packet to the next.
+
+    Raises:
+        ConfigError: less than one of them.
+    """
+
+    frames: int
+    group: int
+    key_interval: int
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value < 1:
+                raise ConfigError(f"{name} must be 1 or more, got {value}.")
+
+    @property
+    def groups(self) -> list[int]:
+        """The length of each group."""
+        whole, rest = divmod(self.frames, self.group)
+        return [self.group] * whole + ([rest] if rest else [])
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a run takes.
+
+    Args:
+        workers: at a time.
+        seconds: from the beginning to the joined stream.
+        header_seconds: of these, frame 0, alone.
+        tail_seconds: of these, after the tracking pass: what is left of the groups.
+        join_seconds: of these, joining, alone.
+        speedup: against one frame after the other on one worker.
+    """
+
+    workers: int
+    seconds: float
+    header_seconds: float
+    tail_seconds: float
+    join_seconds: float
+    speedup: float
+
+    @property
+    def efficiency(self) -> float:
+        """Share of the workers' time that a run on one would need, too."""
+        return self.speedup / self.workers
+
+
+def sequential_seconds(costs: Costs, work: Work) -> float:
+    """Of ``reconstruct``, one frame after the other."""
+    return costs.header_seconds + (work.frames - 1) * costs.frame_seconds
+
+
+def serial_seconds(costs: Costs, work: Work) -> float:
+    """What no number of workers shortens; see Note [Serial part]."""
+    tracking = costs.track_start_seconds + work.frames * costs.track_seconds
+    return costs.header_seconds + tracking + _joining(costs, work)
+
+
+def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
+    """A run on ``workers``: groups begin in their order, each as soon as a worker is free and the pass has come to it.
+
+    Raises:
+        ConfigError: less than one worker.
+    """
+    if workers < 1:
+        raise ConfigError(f"The number of workers must be 1 or more, got {workers}.")
+    begin = costs.header_seconds
+    tracking = begin + costs.track_start_seconds + work.frames * costs.track_seconds
+    free = [tracking, *[begin] * (workers - 1)]  # The pass is a task like others.
+    heapq.heapify(free)
+    first, end = 0, tracking
+    for length in work.groups:
+        tracked = begin if not first else begin + costs.track_start_seconds + (first + 1) * costs.track_seconds
+        fitted = length - 1 if not first else length  # Frame 0 is in the header.
+        done = max(heapq.heappop(free), tracked) + costs.start_seconds + fitted * costs.frame_seconds
+        heapq.heappush(free, done)
+        end, first = max(end, done), first + length
+    joining = _joining(costs, work)
+    total = end + joining
+    return Estimate(
+        workers, total, costs.header_seconds, end - tracking, joining, sequential_seconds(costs, work) / total
+    )
+
+
+def workers_for(costs: Costs, work: Work, seconds: float) -> Estimate | None:
+    """The least number of workers that end within ``seconds``; None if no number does."""
+    low, high = 1, len(work.groups) + 1
+    if estimate(costs, work, high).seconds > seconds:
+        return None
+    while low < high:
+        middle = (low + high) // 2
+        if estimate(costs, work, middle).seconds <= seconds:
+            high = middle
+        else:
+            low = middle + 1
+    return estimate(costs, work, low)
+
+
+def stream_bytes(costs: Costs, work: Work) -> float:
+    """Of the joined stream."""
+    total = costs.header_bytes
+    for i, length in enumerate(work.groups):
+        keys = math.ceil(length / work.key_interval) - 1
+        total += (costs.first_bytes if i else 0.0) + keys * costs.key_bytes + (length - 1 - keys) * costs.frame_bytes
+    return total
+
+
+def _joining(costs: Costs, work: Work) -> float:
+    return costs.join_start_seconds + work.frames * costs.join_seconds

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How parts come from the machines that make them to the driver, and the other way: a shared folder, or a store."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+from structgstream.executors.task import PYTHON, Task
+from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.parts import Parts
+from structgstream.parallel.staged import HERE, assembled, growing_files, write_here
+from structgstream.parallel.unit import CutsTrack, groups_path
+
+STAGED = (PYTHON, "-m", "structgstream.parallel.staged")
+LOOK_SECONDS = 1.0
+
+
+class Exchange(Protocol):
+    """What the driver asks of it."""
+
+    def header(self, task: Task) -> Task:
+        """The task of frame 0, for where it runs."""
+        ...
+
+    def track(self, task: Task) -> Task:
+        """The task of the tracking pass, for where it runs."""
+        ...
+
+    def group(self, task: Task, first: int) -> Task:
+        """The task of a group that begins at a frame whose start is here, for where it runs."""
+        ...
+
+    def bring(self, part: Path) -> None:
+        """Brings a part here that a task has made."""
+        ...
+
+    def follow(self) -> None:
+        """Brings here what the tracking pass has written by now."""
+        ...
+
+
+class SharedFolder:
+    """All machines see the parts at the same place."""
+
+    def header(self, task: Task) -> Task:
+        """See ``Exchange.header``."""
+        return task
+
+    def track(self, task: Task) -> Task:
+        """See ``Exchange.track``."""
+        return task
+
+    def group(self, task: Task, first: int) -> Task:
+        """See ``Exchange.group``."""
+        return task
+
+    def bring(self, part: Path) -> None:
+        """See ``Exchange.bring``."""
+
+    def follow(self) -> None:
+        """See ``Exchange.follow``."""
+
+
+class ObjectStore:
+    """Parts meet in an object store; the driver keeps copies.
+
+    Args:
+        store: the folder of the store.
+        parts: the driver's folder.
+        cut: takes from a track what one group needs.
+    """
+
+    def __init__(self, store: ObjectFolder, parts: Parts, *, cut: CutsTrack) -> None:
+        self._store, self._parts, self._cut = store, parts, cut
+        self._looked = 0.0
+
+    def header(self, task: Task) -> Task:
+        """See ``Exchange.header``."""
+        return self._staged(task, ["--gives", self._name(self._parts.header)])
+
+    def track(self, task: Task) -> Task:
+        """See ``Exchange.track``."""
+        name = self._name(self._parts.track)
+        files = ["--needs", self._name(self._parts.header), "--grows", name, "--early", f"{name}.groups"]
+        return self._staged(task, files)
+
+    def group(self, task: Task, first: int) -> Task:
+        """See ``Exchange.group``."""
+        track = self._parts.track.with_name(f"start-{first:06d}.sgt")
+        command = tuple(word.replace(str(self._parts.track), str(track)) for word in task.command)
+        partial, _ = growing_files(self._name(track))
+        if first:
+            self._store.write(partial, self._cut(self._parts.track, first))
+        segment = Path(task.result)
+        log = segment.with_suffix(".log.jsonl")
+        files = ["--needs", self._name(self._parts.header), "--needs", partial]
+        files += ["--gives", self._name(segment), "--gives", self._name(log)]
+        return self._staged(replace(task, command=command), files)
+
+    def bring(self, part: Path) -> None:
+        """See ``Exchange.bring``."""
+        if (data := self._store.read(self._name(part))) is not None:
+            write_here(part, data)
+
+    def follow(self) -> None:
+        """See ``Exchange.follow``; asks the store once a second."""
+        if time.monotonic() - self._looked < LOOK_SECONDS:
+            return
+        self._looked = time.monotonic()
+        track = self._parts.track
+        groups = groups_path(track)
+        if not groups.exists():
+            self.bring(groups)
+        partial = track.with_name(growing_files(track.name)[0])
+        with partial.open("ab") as file:
+            file.write(assembled(self._store, self._name(track), have=file.tell()))
+
+    def _name(self, path: Path) -> str:
+        return str(path.relative_to(self._parts.folder))
+
+    def _staged(self, task: Task, files: Sequence[str]) -> Task:
+        folder = str(self._parts.folder)
+        inner = (word.replace(folder, HERE) for word in task.command)
+        outer = (*STAGED, "--store", self._store.url, "--name", task.name, *files, "--")
+        return replace(task, command=(*outer, *inner))

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files under a URL, such as a folder of an object store, that all machines of a run see."""
+
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from structgstream.errors import MissingExtraError, StorageError
+
+T = TypeVar("T")
+TRIES = 8
+FIRST_DELAY_SECONDS = 0.1
+LONGEST_DELAY_SECONDS = 10.0
+_HASH_BYTES = 32
+
+
+class ObjectFolder:
+    """Objects by name. Each carries the hash of its content, so that one cut short or changed on its way is not taken.
+
+    A request that fails is made again, :data:`TRIES` times in all, with growing pauses.
+
+    Args:
+        url: of the folder, as fsspec takes it. Addresses and credentials come from the environment, as the scheme's
+            package reads them (``AWS_ENDPOINT_URL``, ``AWS_ACCESS_KEY_ID``, ...).
+
+    Raises:
+        MissingExtraError: fsspec, or the package for this scheme, is not installed.
+        StorageError: the URL is not understood.
+    """
+
+    def __init__(self, url: str) -> None:
+        try:
+            from fsspec.core import url_to_fs
+        except ModuleNotFoundError:
+            raise MissingExtraError("fsspec", "cloud") from None
+        self.url = url.rstrip("/")
+        try:
+            self._files, self._root = url_to_fs(self.url, use_listings_cache=False)
+        except ImportError as error:
+            raise MissingExtraError(str(error.name or "s3fs"), "cloud") from None
+        except Exception as error:  # Each file system has its own; all mean that it cannot be used.
+            raise StorageError(f"{url} cannot be used as a store ({_reason(error)}).") from error
+
+    def write(self, name: str, data: bytes) -> None:
+        """Writes or replaces an object.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        content = hashlib.sha256(data).digest() + data
+
+        def put() -> None:
+            if self._files.protocol in ("file", ("file", "local")):
+                self._files.makedirs(str(Path(f"{self._root}/{name}").parent), exist_ok=True)
+            self._files.pipe_file(f"{self._root}/{name}", content)
+
+        self._tried(put, f"write {name}")
+
+    def read(self, name: str) -> bytes | None:
+        """The content of an object; None if there is none.
+
+        Raises:
+            StorageError: it cannot be read, or is not what was written.
+        """
+
+        def get() -> bytes | None:
+            try:
+                content = self._files.cat_file(f"{self._root}/{name}")
+            except FileNotFoundError:
+                return None
+            digest, data = content[:_HASH_BYTES], content[_HASH_BYTES:]
+            if hashlib.sha256(data).digest() != digest:
+                raise ValueError("its hash is another")
+            return data
+
+        return self._tried(get, f"read {name}")
+
+    def names(self, folder: str) -> list[str]:
+        """Names of the objects in a folder of this one, in order.
+
+        Raises:
+            StorageError: they cannot be listed.
+        """
+
+        def listed() -> list[str]:
+            try:
+                self._files.invalidate_cache()
+                found = self._files.ls(f"{self._root}/{folder}", detail=False)
+            except FileNotFoundError:
+                return []
+            return sorted(f"{folder}/{str(path).rsplit('/', 1)[-1]}" for path in found)
+
+        return self._tried(listed, f"list {folder}")
+
+    def clear(self) -> None:
+        """Removes all objects.
+
+        Raises:
+            StorageError: they cannot be removed.
+        """
+
+        def removed() -> None:
+            self._files.invalidate_cache()
+            if self._files.exists(self._root):
+                self._files.rm(self._root, recursive=True)
+
+        self._tried(removed, "remove what is")
+
+    def _tried(self, action: Callable[[], T], what: str) -> T:
+        delay = FIRST_DELAY_SECONDS
+        for attempt in range(TRIES):
+            try:
+                return action()
+            except Exception as error:  # Each file system has its own.
+                if attempt + 1 == TRIES:
+                    raise StorageError(f"Cannot {what} in {self.url} ({_reason(error)}).") from error
+            time.sleep(delay)
+            delay = min(2 * delay, LONGEST_DELAY_SECONDS)
+        raise AssertionError("unreachable")
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks on Ray: what is asked of it, by a stand-in; and, where Ray is installed, what comes of it."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from sleepers import all_endings
+from structgstream.errors import ConfigError, MissingExtraError
+from structgstream.executors.executor import TaskQueue
+from structgstream.executors.ray_cluster import RayEngine, RayOptions
+from structgstream.executors.ray_worker import CommandKilled, run_task
+from structgstream.executors.task import Task
+
+
+class FakeRay:
+    """Has the functions that are called; tasks end in the order in which they were begun, when asked."""
+
+    __version__ = "2.60.0"
+
+    class exceptions:
+        class RayError(Exception):
+            pass
+
+    def __init__(self) -> None:
+        self.begun: list[dict[str, Any]] = []
+        self.given: dict[str, Any] = {}
+        self.cancelled: list[int] = []
+        self.most = 0
+        self.fails: set[str] = set()
+        self._in_flight: set[int] = set()
+
+    def init(self, **given: Any) -> None:
+        self.given = given
+
+    def shutdown(self) -> None:
+        self.given = {}
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 4.0}
+
+    def remote(self, function: Any) -> Any:
+        assert function is run_task
+
+        def options(**asked: Any) -> Any:
+            def remote(task: Task, environment: dict[str, str]) -> int:
+                self.begun.append({**asked, "task": task, "environment": environment})
+                self._in_flight.add(len(self.begun) - 1)
+                self.most = max(self.most, len(self._in_flight))
+                return len(self.begun) - 1
+
+            return SimpleNamespace(remote=remote)
+
+        return SimpleNamespace(options=options)
+
+    def wait(self, references: list[int], *, num_returns: int, timeout: float) -> tuple[list[int], list[int]]:
+        return references[:num_returns], references[num_returns:]
+
+    def get(self, reference: int) -> Any:
+        self._in_flight.discard(reference)
+        task = self.begun[reference]["task"]
+        if task.name in self.fails:
+            raise self.exceptions.RayError("the machine is gone")
+        return run_task(task, {})
+
+    def cancel(self, reference: int) -> None:
+        self.cancelled.append(reference)
+
+
+@pytest.fixture
+def ray(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
+    fake = FakeRay()
+    for name in [name for name in os.environ if name.startswith("RAY_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    monkeypatch.setitem(sys.modules, "ray", fake)  # type: ignore[arg-type]
+    return fake
+
+
+def test_a_cluster_that_is_begun_here_has_a_token_and_nothing_that_tells_or_listens(ray: FakeRay) -> None:
+    RayEngine(RayOptions(None, workers=2, cores=3))
+    assert os.environ["RAY_AUTH_MODE"] == "token"
+    assert len(os.environ["RAY_AUTH_TOKEN"]) == 64
+    assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
+    assert (ray.given["num_cpus"], ray.given["include_dashboard"]) == (6, False)
+
+
+def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRay) -> None:
+    with TaskQueue(RayEngine(RayOptions(None, workers=2, cores=2))) as executor:
+        for i in range(20):
+            executor.submit(Task(f"{i}", ("true",), log=Path("log.txt"), retries=3))
+        endings = all_endings(executor)
+    assert len(endings) == 20
+    assert all(ending.done for ending in endings.values())
+    assert ray.most == 4
+    asked = ray.begun[0]
+    assert (asked["max_retries"], asked["retry_exceptions"], asked["num_cpus"]) == (3, [CommandKilled], 2)
+    assert asked["environment"]["OMP_NUM_THREADS"] == "2"
+    assert asked["task"].log is None
+    assert not Path("log.txt").exists()
+
+
+def test_what_ray_gives_up_counts_as_killed_and_says_why(ray: FakeRay) -> None:
+    ray.fails = {"bad"}
+    with TaskQueue(RayEngine(RayOptions())) as executor:
+        executor.submit(Task("bad", ("true",)))
+        ending = all_endings(executor)["bad"]
+    assert ending.killed
+    assert ending.output == "the machine is gone"
+    assert len(ray.begun) == 1
+
+
+def test_closing_cancels_what_runs(ray: FakeRay) -> None:
+    executor = TaskQueue(RayEngine(RayOptions()))
+    executor.submit(Task("a", ("true",)))
+    executor._begin()
+    executor.close()
+    assert ray.cancelled == [0]
+    assert not ray.given
+
+
+def test_a_cluster_without_a_token_is_not_joined(ray: FakeRay, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    with pytest.raises(ConfigError, match="no token for the Ray cluster"):
+        RayEngine(RayOptions("head:6379"))
+    os.environ["RAY_AUTH_MODE"] = "disabled"
+    with pytest.raises(ConfigError, match="RAY_AUTH_MODE is 'disabled'"):
+        RayEngine(RayOptions("head:6379"))
+    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(tmp_path)}
+    RayEngine(RayOptions("head:6379"))
+    assert ray.given["address"] == "head:6379"
+
+
+def test_a_cluster_that_refuses_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(**given: Any) -> None:
+        raise ConnectionError("Failed to connect")
+
+    os.environ["RAY_AUTH_TOKEN"] = "word"
+    monkeypatch.setattr(ray, "init", refused)
+    with pytest.raises(ConfigError, match=r"head:6379 cannot be joined \(Failed to connect\)"):
+        RayEngine(RayOptions("head:6379"))
+
+
+def test_an_old_ray_or_none_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray, "__version__", "2.51.2", raising=False)
+    with pytest.raises(ConfigError, match="Ray 2.51.2 has no token authentication; 2.52 is the first"):
+        RayEngine(RayOptions())
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match="cluster"):
+        RayEngine(RayOptions())
+
+
+REAL = """
+import json, os
+from structgstream.executors.executor import TaskQueue
+from structgstream.executors.ray_cluster import RayEngine, RayOptions
+from structgstream.executors.task import PYTHON, Task
+from sleepers import all_endings
+with TaskQueue(RayEngine(RayOptions(None, workers=2))) as executor:
+    executor.submit(Task("first", ("sh", "-c", "echo $OMP_NUM_THREADS")))
+    executor.submit(Task("python", (PYTHON, "-m", "this")), after=["first"])
+    executor.submit(Task("bad", ("sh", "-c", "echo no power; exit 3")))
+    executor.submit(Task("once", ("sh", "-c", "test -e {0}/once || {{ touch {0}/once; kill -9 $$; }}".format({1!r}))))
+    executor.submit(Task("always", ("sh", "-c", "echo x >> {0}/always; kill -9 $$".format({1!r})), retries=2))
+    endings = all_endings(executor)
+print(json.dumps({{name: [ending.status, ending.output[:40]] for name, ending in endings.items()}}))
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray, of the extra cluster, is not installed")
+def test_tasks_on_a_real_cluster_of_this_machine(tmp_path: Path) -> None:
+    code = REAL.replace("{0}", str(tmp_path)).replace(".format({1!r})", "").replace("{{", "{").replace("}}", "}")
+    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    endings = json.loads(done.stdout.splitlines()[-1])
+    assert endings["first"] == [0, "1\n"]
+    assert endings["python"][0] == endings["once"][0] == 0
+    assert endings["bad"] == [3, "no power\n"]
+    assert endings["always"][0] == -1
+    assert (tmp_path / "always").read_text() == "x\n" * 3

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Objects are what was written, or none; what fails is tried again, and no longer than that."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from structgstream.errors import StorageError
+from structgstream.parallel import object_folder
+from structgstream.parallel.object_folder import TRIES, ObjectFolder
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ObjectFolder:
+    monkeypatch.setattr(object_folder, "FIRST_DELAY_SECONDS", 0.0)
+    return ObjectFolder(f"file://{tmp_path / 'store'}")
+
+
+def test_what_is_written_is_read(store: ObjectFolder) -> None:
+    for name, data in (("a", b""), ("deep/b", b"b" * 1000), ("deep/b", b"new")):
+        store.write(name, data)
+        assert store.read(name) == data
+    assert store.names("deep") == ["deep/b"]
+
+
+def test_what_is_not_there_is_none(store: ObjectFolder) -> None:
+    assert store.read("a") is None
+    assert store.names("deep") == []
+    store.clear()
+
+
+def test_cleared_is_empty(store: ObjectFolder) -> None:
+    store.write("deep/b", b"b")
+    store.clear()
+    assert store.read("deep/b") is None
+
+
+@pytest.mark.parametrize("damaged", [b"", b"short", None])
+def test_what_is_not_what_was_written_is_refused(store: ObjectFolder, tmp_path: Path, damaged: bytes | None) -> None:
+    store.write("a", b"content")
+    path = tmp_path / "store" / "a"
+    path.write_bytes(path.read_bytes()[:-1] + b"x" if damaged is None else damaged)
+    with pytest.raises(StorageError, match="Cannot read a in file://.* .its hash is another"):
+        store.read("a")
+
+
+@pytest.mark.parametrize("failures", [TRIES - 1, TRIES])
+def test_failures_are_tried_again_so_often(store: ObjectFolder, monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
+    store.write("a", b"content")
+    real, left = store._files.cat_file, [failures]
+
+    def failing(*arguments: Any) -> bytes:
+        left[0] -= 1
+        if left[0] >= 0:
+            raise ConnectionError("the cable is out")
+        return real(*arguments)
+
+    monkeypatch.setattr(store._files, "cat_file", failing)
+    if failures < TRIES:
+        assert store.read("a") == b"content"
+    else:
+        with pytest.raises(StorageError, match="the cable is out"):
+            store.read("a")
+
+
+def test_a_url_of_no_scheme_that_is_known_is_told() -> None:
+    with pytest.raises(StorageError, match="nonsense://a cannot be used as a store"):
+        ObjectFolder("nonsense://a")
