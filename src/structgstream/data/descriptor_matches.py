@@ -33,30 +33,40 @@ def mutual_matches(
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.intp)
     nearest, distinct = np.zeros(len(first), np.intp), np.zeros(len(first), bool)
-    back, most = np.zeros(len(second), np.intp), np.full(len(second), -np.inf, np.float32)
-    seen_first, seen_second = (None, None) if seen is None else (part.astype(np.float32) for part in seen)
+    nearest_value, most = np.empty(len(first), np.float32), np.full(len(second), -np.inf, np.float32)
+    bits = None if seen is None else tuple(np.packbits(part, axis=1) for part in seen)
     for start in range(0, len(first), BLOCK):  # all products at once would be gigabytes
         rows = slice(start, start + BLOCK)
         similarity = first[rows] @ second.T
-        if seen_first is not None and seen_second is not None:
-            similarity[seen_first[rows] @ seen_second.T == 0] = OPPOSITE
-        likest = similarity.argmax(0)
-        values = similarity[likest, np.arange(len(second))]
-        back = np.where(values > most, start + likest, back)
-        most = np.maximum(values, most)
-        nearest[rows], distinct[rows] = _distinct_nearest(similarity, ratio, distance)
-    kept = np.flatnonzero(distinct & (back[nearest] == np.arange(len(first))))
+        if bits is not None:
+            # Eight times as quick as an assignment to a mask.
+            similarity -= _never_together(bits[0][rows], bits[1]) * np.float32(2)
+            np.maximum(similarity, OPPOSITE, out=similarity)
+        # The largest values say which matches are mutual; where they are along the first axis costs ten times as much.
+        np.maximum(most, similarity.max(0), out=most)
+        nearest[rows], nearest_value[rows], distinct[rows] = _distinct_nearest(similarity, ratio, distance)
+    kept = np.flatnonzero(distinct & (nearest_value == most[nearest]))
+    _, once = np.unique(nearest[kept], return_index=True)  # equal descriptors of the first list are equally near
+    kept = np.sort(kept[once])
     return np.stack([kept, nearest[kept]], 1)
+
+
+def _never_together(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """``[N, M]``, where rows ``[N, B]`` and ``[M, B]`` of bits have none in common."""
+    apart = np.ones((len(first), len(second)), bool)
+    for one, two in zip(first.T, second.T, strict=True):
+        apart &= (one[:, None] & two) == 0
+    return apart
 
 
 def _distinct_nearest(
     similarity: NDArray[np.float32], ratio: float, distance: float
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """For each row the column of the largest value, and whether that stands out. Changes ``similarity``."""
+) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.bool_]]:
+    """For each row the column of the largest value, this, and whether it stands out. Changes ``similarity``."""
     lines = np.arange(len(similarity))
     nearest = similarity.argmax(1)
     top = similarity[lines, nearest]
     similarity[lines, nearest] = OPPOSITE
     next_best = similarity.max(1)
     apart, further = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, next_best))
-    return nearest, (apart < ratio * further) & (apart < distance)
+    return nearest, top, (apart < ratio * further) & (apart < distance)

@@ -227,13 +227,13 @@ def guided_matches(
     row, column = row[kept], column[kept]
     similarity = np.einsum("sd,sd->s", first.descriptors[row], second.descriptors[column])
     cost = np.sqrt(np.maximum(2 - 2 * similarity, 1e-12))
-    forward = _distinct_best(row, column, cost, second.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
-    backward = _distinct_best(column, row, cost, first.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
+    forward = distinct_best(row, column, cost, second.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
+    backward = distinct_best(column, row, cost, first.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
     mutual = np.intersect1d(forward, backward)
     return np.stack([row[mutual], column[mutual]], 1)
 
 
-def _distinct_best(
+def distinct_best(
     query: NDArray[np.intp],
     candidate: NDArray[np.intp],
     cost: NDArray[np.float32],
@@ -242,7 +242,16 @@ def _distinct_best(
     ratio: float,
     distinct_pixels: float,
 ) -> NDArray[np.intp]:
-    """Positions, in the candidate list, of each query's best candidate if it passes the ratio test."""
+    """Positions, in a list of candidates, of each query's best one if it passes the ratio test.
+
+    Args:
+        query: ``[C]``, whose candidate each is.
+        candidate: ``[C]``, index into ``pixels``.
+        cost: ``[C]``, descriptor distance.
+        pixels: ``[S, 2]`` of the candidates' keypoints.
+        ratio: largest ratio of the best cost to that of a rival.
+        distinct_pixels: what lies nearer to the best candidate is no rival of it.
+    """
     order = np.lexsort((cost, query))
     query_sorted = query[order]
     starts = np.flatnonzero(np.diff(query_sorted, prepend=-1))

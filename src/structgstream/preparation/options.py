@@ -48,7 +48,7 @@ class PrepareOptions:
         fps: frames a second of pictures; None for 30.
         without: names of cameras to leave out.
         link: how files are brought into the capture.
-        instants: number of instants that structure from motion looks at.
+        instants: most instants that structure from motion looks at; it looks at three where these have texture enough.
         tone: estimate a tone curve per camera.
     """
 
@@ -67,7 +67,7 @@ class PrepareOptions:
     fps: float | None = None
     without: tuple[str, ...] = ()
     link: Link = "hard"
-    instants: int = 3
+    instants: int = 9
     tone: bool = False
 
     def __post_init__(self) -> None:

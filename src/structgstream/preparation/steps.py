@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from structgstream.errors import StorageError
 
 FOLDER = "work"
-VERSION = 3  # of the steps' results; a new one does all steps again
+VERSION = 4  # of the steps' results; a new one does all steps again
 
 
 @dataclass(frozen=True)

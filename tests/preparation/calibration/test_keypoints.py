@@ -1,8 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from threading import Event
+
 import numpy as np
+import pytest
 
 from filmed import noise_texture
-from structgstream.preparation.calibration.keypoints import camera_keypoints
+from structgstream.preparation.calibration.keypoints import (
+    KeypointConfig,
+    all_keypoints,
+    camera_keypoints,
+    spread_order,
+)
 
 
 def scene(shift: int) -> np.ndarray:
@@ -36,8 +46,6 @@ def test_a_masked_part_gives_none() -> None:
 
 
 def test_reduced_pictures_give_pixels_of_the_whole_one() -> None:
-    from structgstream.preparation.calibration.keypoints import KeypointConfig
-
     large = np.repeat(np.repeat(scene(0), 4, 0), 4, 1)
     found = camera_keypoints([large], config=KeypointConfig(longest_side=200)).pixels
     small = camera_keypoints([scene(0)]).pixels
@@ -47,3 +55,47 @@ def test_reduced_pictures_give_pixels_of_the_whole_one() -> None:
 
 def test_bare_pictures_give_none() -> None:
     assert len(camera_keypoints([np.full((60, 80, 3), 90, np.uint8)] * 2)) == 0
+
+
+def test_further_instants_are_looked_at_where_the_first_give_little() -> None:
+    pictures = {"one": [scene(0), scene(20), scene(40), scene(60), scene(80)]}
+    config = KeypointConfig(instants=2, enough=1)
+    few = all_keypoints(pictures, None, workers=1, config=config)["one"]
+    assert few.seen.any(0).tolist() == [True, False, False, False, True]
+    every = all_keypoints(pictures, None, workers=1, config=replace(config, enough=10**6))["one"]
+    assert every.seen.any(0).all()
+    assert len(every) > len(few)
+
+
+def test_every_beginning_of_the_order_is_spread() -> None:
+    assert spread_order(0) == []
+    assert spread_order(1) == [0]
+    assert spread_order(9)[:3] == [0, 8, 4]
+    assert sorted(spread_order(9)) == list(range(9))
+
+
+def test_what_was_interrupted_looks_at_no_further_picture() -> None:
+    stopping = Event()
+    stopping.set()
+    with pytest.raises(CancelledError):
+        camera_keypoints([scene(0)], stopping=stopping)
+
+
+def test_an_interruption_is_heard_between_two_pictures() -> None:
+    looked: list[str] = []
+
+    class Interrupting(list[np.ndarray]):
+        def __getitem__(self, number: object) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
+            looked.append("one")
+            raise KeyboardInterrupt
+
+    class Slow(list[np.ndarray]):
+        def __getitem__(self, number: object) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
+            looked.append("two")
+            return scene(0)
+
+    pictures = {"one": Interrupting([scene(0)] * 3), "two": Slow([scene(0)] * 3)}
+    with pytest.raises(KeyboardInterrupt):
+        all_keypoints(pictures, None, workers=2)
+    assert looked.count("one") == 1
+    assert looked.count("two") < 3

@@ -7,8 +7,9 @@ instants it was seen, because keypoints of two cameras can only be of one point 
 """
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,9 @@ class KeypointConfig:
         peak_threshold: least contrast of a keypoint, of the range of the picture.
         same_pixels: keypoints of two instants are one if they lie as close as this and look alike.
         same_similarity: least cosine of their descriptors.
+        instants: how many pictures of a camera are looked at before they are counted, and then again.
+        enough: keypoints of a camera, in the median over cameras, beyond which no further pictures are looked at. Where
+            little has texture, people who move about add them.
     """
 
     count: int = 6000
@@ -36,6 +40,8 @@ class KeypointConfig:
     peak_threshold: float = 0.004
     same_pixels: float = 1.0
     same_similarity: float = 0.85
+    instants: int = 3
+    enough: int = 6000
 
 
 @dataclass(frozen=True)
@@ -61,30 +67,51 @@ def camera_keypoints(
     masks: Sequence[NDArray[np.bool_]] | None = None,
     *,
     config: KeypointConfig = KeypointConfig(),
+    instants: Sequence[int] | None = None,
+    known: Keypoints | None = None,
+    stopping: Event | None = None,
 ) -> Keypoints:
     """Covariant SIFT keypoints with domain-size pooling of a still camera's ``pictures [H, W, 3]``, merged.
 
     Affine shapes and pooled descriptors (Mikolajczyk and Schmid, IJCV 2004; Dong and Soatto, CVPR 2015) match over
     wider baselines than plain SIFT. ``masks [H, W]`` are True where a picture counts.
 
+    Args:
+        instants: which of the pictures are looked at; all by default.
+        known: what others of them gave.
+        stopping: when it is set, no further picture is looked at.
+
     Raises:
+        CancelledError: ``stopping`` was set.
         MissingExtraError: cv2 or pycolmap is not installed.
     """
     extractor = _extractor(config)
-    pixels, descriptors = np.empty((0, 2)), np.empty((0, 128), np.float32)
-    seen = np.zeros((0, len(pictures)), bool)
-    for instant, picture in enumerate(pictures):
+    count = len(pictures)
+    found = known or Keypoints(np.empty((0, 2)), np.empty((0, 128), np.float32), np.zeros((0, count), bool))
+    for instant in range(count) if instants is None else instants:
+        if stopping is not None and stopping.is_set():
+            raise CancelledError
         mask = None if masks is None else masks[instant]
-        found, looks = _extracted(extractor, picture, mask, longest_side=config.longest_side)
-        known = _repeated(pixels, descriptors, found, looks, config=config)
-        seen[known[known >= 0], instant] = True
-        fresh = known < 0
-        pixels = np.concatenate([pixels, found[fresh]])
-        descriptors = np.concatenate([descriptors, looks[fresh]])
-        now = np.zeros((int(fresh.sum()), len(pictures)), bool)
-        now[:, instant] = True
-        seen = np.concatenate([seen, now])
-    return Keypoints(pixels, descriptors, seen)
+        now = _extracted(extractor, pictures[instant], mask, longest_side=config.longest_side)
+        found = _merged(found, instant, *now, config=config)
+    return found
+
+
+def _merged(
+    known: Keypoints, instant: int, found: Floats, looks: NDArray[np.float32], *, config: KeypointConfig
+) -> Keypoints:
+    """What is known, and the keypoints of one more instant; those that repeat known ones are kept once."""
+    which = _repeated(known.pixels, known.descriptors, found, looks, config=config)
+    seen = known.seen.copy()
+    seen[which[which >= 0], instant] = True
+    fresh = which < 0
+    now = np.zeros((int(fresh.sum()), seen.shape[1]), bool)
+    now[:, instant] = True
+    return Keypoints(
+        np.concatenate([known.pixels, found[fresh]]),
+        np.concatenate([known.descriptors, looks[fresh]]),
+        np.concatenate([seen, now]),
+    )
 
 
 def all_keypoints(
@@ -94,13 +121,52 @@ def all_keypoints(
     workers: int,
     config: KeypointConfig = KeypointConfig(),
 ) -> dict[str, Keypoints]:
-    """:func:`camera_keypoints` of every camera; ``masks`` may lack cameras."""
+    """:func:`camera_keypoints` of every camera, from as many instants as give enough; ``masks`` may lack cameras.
+
+    An interruption is heard between two pictures.
+    """
+    order = spread_order(min(map(len, pictures.values()), default=0))
+    found: dict[str, Keypoints] = {}
+    for start in range(0, len(order), config.instants):
+        instants = sorted(order[start : start + config.instants])
+        found = _each(pictures, masks, found, instants, workers=workers, config=config)
+        if np.median([len(own) for own in found.values()]) >= config.enough:
+            break
+    return found
+
+
+def _each(
+    pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
+    masks: Mapping[str, Sequence[NDArray[np.bool_]]] | None,
+    known: Mapping[str, Keypoints],
+    instants: Sequence[int],
+    *,
+    workers: int,
+    config: KeypointConfig,
+) -> dict[str, Keypoints]:
+    stopping = Event()
 
     def one(name: str) -> Keypoints:
-        return camera_keypoints(pictures[name], None if masks is None else masks.get(name), config=config)
+        own = None if masks is None else masks.get(name)
+        return camera_keypoints(
+            pictures[name], own, config=config, instants=instants, known=known.get(name), stopping=stopping
+        )
 
     with ThreadPoolExecutor(workers) as pool:
-        return dict(zip(pictures, pool.map(one, pictures), strict=True))
+        try:
+            return dict(zip(pictures, pool.map(one, pictures), strict=True))
+        except BaseException:
+            stopping.set()  # the pool waits for its threads, which would go on for minutes
+            raise
+
+
+def spread_order(count: int) -> list[int]:
+    """Numbers below ``count`` in an order of which every beginning is spread: the first, the last, the middle."""
+    order = [0, count - 1][:count]
+    while len(order) < count:
+        distance = np.abs(np.arange(count)[:, None] - order).min(1)
+        order.append(int(distance.argmax()))
+    return order
 
 
 def _extractor(config: KeypointConfig) -> Any:

@@ -11,6 +11,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +39,7 @@ from structgstream.preparation.calibration.mapping import (
     size_of,
 )
 from structgstream.preparation.calibration.pictures import checked_pictures
+from structgstream.preparation.calibration.rematching import RematchConfig, rematched
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.view_graph import (
     Matches,
@@ -74,11 +76,13 @@ class StructureConfig:
         pixels: largest reprojection error of the observations that remain, for pictures of 1000 pixels on the longer
             side; never under 1.
         degrees: least angle between the rays of a point.
+        rematching: how matches are found again with the first solution.
     """
 
     keypoints: KeypointConfig = field(default_factory=KeypointConfig)
     matching: KeypointMatchConfig = field(default_factory=KeypointMatchConfig)
     pairs: PairConfig = field(default_factory=PairConfig)
+    rematching: RematchConfig = field(default_factory=RematchConfig)
     pixels: float = 3.0
     degrees: float = 1.5
 
@@ -136,7 +140,7 @@ def solve_structure(
     assert best is not None
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
-    solved = _finished(best, keypoints, pictures, lens=lens, centers=centers, config=config)
+    solved = _finished(best, keypoints, pictures, lens=lens, centers=centers, workers=workers, config=config)
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
     return solved
@@ -245,9 +249,10 @@ def _finished(
     *,
     lens: LensModel,
     centers: bool,
+    workers: int,
     config: StructureConfig,
 ) -> SolvedCalibration:
-    """The model with all intrinsics adjusted, without outliers, in normalised coordinates."""
+    """The model with all intrinsics adjusted, matched again, without outliers, in normalised coordinates."""
     model = attempt.model
     assert model is not None
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
@@ -262,13 +267,22 @@ def _finished(
     rough = SolvedCalibration(cameras, points, observations, missing)
     numbers = {image.name: image.camera_id for image in map(model.image, model.reg_image_ids())}
     lenses = sorted(set(numbers.values()))
+    limits = Limits(limit, config.degrees)
+    adjusted = partial(
+        adjust_together,
+        lens=[lenses.index(numbers[name]) for name in cameras],
+        free=_free_terms(lens, freedom=attempt.freedom, centers=centers),
+        held=np.array([number in attempt.fixed for number in lenses]),
+        limits=limits,
+    )
     return normalized(
-        adjust_together(
-            rough,
-            lens=[lenses.index(numbers[name]) for name in cameras],
-            free=_free_terms(lens, freedom=attempt.freedom, centers=centers),
-            held=np.array([number in attempt.fixed for number in lenses]),
-            limits=Limits(limit, config.degrees),
+        rematched(
+            normalized(adjusted(rough)),
+            keypoints,
+            limits=limits,
+            adjust=adjusted,
+            workers=workers,
+            config=config.rematching,
         )
     )
 
