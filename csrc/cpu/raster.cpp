@@ -224,8 +224,8 @@ void blend_backward(
             rest[i] += (color[k][i] - behind) * gradient[k][i];
         }
     }
-    const int end = raster.starts[index + 1];
-    int n = raster.starts[index];
+    int n = raster.starts[index], end = raster.starts[index + 1];
+    while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Nothing reads what these would leave.
     for (; n < end && front.live > 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
         const bool trained = raster.pairs[n] < raster.trained;

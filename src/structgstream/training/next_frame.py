@@ -2,7 +2,7 @@
 """Iterations of a frame after the first: loss with the price of bits, patching, early stopping."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
+from structgstream.training.mean_of_steps import MeanOfSteps
 from structgstream.training.optimize import Hooks
 from structgstream.training.parameters import Parameters
 from structgstream.training.partition import Partition
@@ -66,6 +67,9 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
         last_pass: gets the result of each view.
         backend: the compute back-end.
         watch: seconds by stage.
+        rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
+        visits: by view index, how often it was drawn.
+        average: gets the leaves of each iteration; None for none.
     """
 
     start: StartingPoint
@@ -79,9 +83,13 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
     last_pass: LastPass
     backend: Backend
     watch: Stopwatch
+    rest_every: int = 1
+    visits: dict[int, int] = field(default_factory=dict)
+    average: MeanOfSteps | None = None
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
         patching, focuses = self.population.config, self.start.focuses
+        focus = None if focuses is None else focuses[sample.index]
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
@@ -90,8 +98,9 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             voxel_size=0.0,
             track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
             watch=self.watch,
-            focus=None if focuses is None else focuses[sample.index],
+            focus=None if focus is None else self._drawn_now(focus, sample),
         )
+        loss = replace(loss, focus=focus)  # Tiles that are not drawn now hold their last drawing.
         self.early_stopping.add(sample.index, loss.total)
         if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
@@ -102,6 +111,11 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             else replace(loss, total=loss.total + self.bit_price.price(self.parameters.values))
         )
 
+    def _drawn_now(self, focus: Focus, sample: View) -> Focus:
+        """``focus``, in most visits of a view without the tiles in which nothing has changed."""
+        visit = self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
+        return focus if focus.changed is None or visit % self.rest_every == 0 else replace(focus, tiles=focus.changed)
+
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
         if screen_gradient is not None:
             self.population.statistics.add(loss.rendering, screen_gradient)
@@ -110,6 +124,8 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
                 survivors = self.population.patch(sample)
                 self.bit_price = None if self.bit_price is None else self.bit_price.after_pruning(survivors)
             self.early_stopping.reset()
+        if self.average is not None:
+            self.average.add(iteration, self.parameters.values)
 
     def finished(self, iteration: int) -> bool:
         return iteration > self.patch_at and self.early_stopping.should_stop

@@ -78,7 +78,11 @@ def focus_views(
             view.index: _focus(still, moving, segmentation.visible[view.index][rows], view.camera, config, backend)
             for view in views
         }
-    return {index: focus for index, focus in found.items() if focus is not None}
+    return {
+        index: replace(focus, changed=changed_tiles(focus.tiles, segmentation.changed.get(index)))
+        for index, focus in found.items()
+        if focus is not None
+    }
 
 
 def _focus(
@@ -104,6 +108,18 @@ def _focus(
     rendering = draw(drawn, camera, backend, focus=Focus(ring, empty, nothing), background=behind)
     # Anchors were culled as a whole; Gaussians that reach no tile are dropped.
     return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
+
+
+def changed_tiles(tiles: TileSelection, changed: Tensor | None) -> TileSelection:
+    """Those of ``tiles`` that hold pixels of the mask ``changed`` ``[h, w]``, or all if none do or it is None."""
+    if changed is None:
+        return tiles
+    rows, columns = tiles.mask.shape
+    size = (rows * TILE_PIXELS, columns * TILE_PIXELS)
+    large = torch.nn.functional.interpolate(changed[None, None].float(), size=(tiles.height, tiles.width))
+    padded = torch.nn.functional.pad(large, (0, size[1] - tiles.width, 0, size[0] - tiles.height))
+    mask = tiles.mask & (torch.nn.functional.max_pool2d(padded, TILE_PIXELS)[0, 0] > 0.0)
+    return replace(tiles, mask=mask) if mask.any() else tiles
 
 
 def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
