@@ -137,13 +137,13 @@ FOLLOWING = replace(
 )
 
 
-def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None):
+def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None, backend: Backend | None = None):
     return fit_next_frame(
         scene,
         world.frames[index],
         world.rig,
         config=config,
-        backend=quickest_backend(),
+        backend=backend or quickest_backend(),
         seed=seed,
         before=world.frames[index - 1],
         older=older,
@@ -210,6 +210,44 @@ def test_whole_pictures_give_the_same_quality_as_tiles() -> None:
         for c in (FOLLOWING, whole)
     ]
     assert abs(values[0] - values[1]) < 0.2
+
+
+def test_tiles_near_change_suffice() -> None:
+    """Fewer tiles are drawn, by far, and the held-out picture is as good."""
+    world = moving_world(2, speed=0.06, movers=4, width=128, height=96)
+    truth, drawn = world.frames[1].images["cam00"], []
+
+    def counting(*arguments, tiles=None, trained=None, **keywords):
+        if trained is not None:
+            drawn[-1] += int(tiles.mask.sum())
+        return quickest_backend().rasterize(*arguments, tiles=tiles, trained=trained, **keywords)
+
+    def quality(**motion) -> float:
+        drawn.append(0)
+        config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, **motion))
+        backend = replace(quickest_backend(), rasterize=counting)
+        return psnr(
+            rendered(followed(world.scene, world, 1, config=config, backend=backend).scene, world, "cam00"), truth
+        )
+
+    unfitted = psnr(rendered(world.scene, world, "cam00"), truth)
+    everywhere, near, rarely = quality(), quality(tiles_around=0), quality(rest_every=3)
+    assert drawn[0] > 1.2 * drawn[2] > 1.2 * drawn[1] > 0
+    assert min(everywhere, near, rarely) > unfitted + 2.0
+    assert min(near, rarely) > everywhere - 0.2
+
+
+def test_the_mean_of_the_last_iterations_can_be_the_result() -> None:
+    world = moving_world(2, speed=0.06, movers=20)
+    truth = world.frames[1].images["cam00"]
+    last, mean, again = (
+        followed(world.scene, world, 1, config=replace(FOLLOWING, mean_of_last=share)).scene
+        for share in (0.0, 0.25, 0.25)
+    )
+    assert not torch.equal(last.anchors.positions, mean.anchors.positions)
+    assert torch.equal(mean.anchors.positions, again.anchors.positions)
+    before, after = (psnr(rendered(scene, world, "cam00"), truth) for scene in (world.scene, mean))
+    assert after > before + 2.0
 
 
 def test_a_frame_like_the_last_one_costs_no_iteration_and_changes_no_bit() -> None:

@@ -59,6 +59,9 @@ class MotionConfig:
     """Interval in frames at which everything is trained, to follow slow changes. 0: never."""
     rest_every: int = 1
     """Tiles in which nothing has changed are drawn only every this many times that a view is. 1: always."""
+    tiles_around: int = -1
+    """Tiles farther than this many tiles from one in which something has changed are not drawn, though moving Gaussians
+    reach them. -1: all are."""
     tiles: bool = True
     """Draw only the tiles that moving Gaussians reach. False: whole pictures, with the same result."""
 
