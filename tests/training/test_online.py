@@ -11,6 +11,7 @@ from backends import quickest_backend
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
+from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
@@ -235,6 +236,18 @@ def test_tiles_near_change_suffice() -> None:
     assert drawn[0] > 1.2 * drawn[2] > 1.2 * drawn[1] > 0
     assert min(everywhere, near, rarely) > unfitted + 2.0
     assert min(near, rarely) > everywhere - 0.2
+
+
+def test_losses_over_all_tiles_are_not_compared_with_those_near_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a frame whose tiles are drawn by turns would seem to have settled, or not to."""
+    compared: list[int] = []
+    monkeypatch.setattr(EarlyStopping, "add", lambda self, view_index, loss: compared.append(view_index))
+    world = moving_world(2, speed=0.06, movers=20)
+    for rest_every, share in ((1, 1.0), (2, 0.5), (3, 2 / 3)):
+        compared.clear()
+        config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, rest_every=rest_every))
+        assert followed(world.scene, world, 1, config=config).iterations == 24  # Six visits of each of four views.
+        assert len(compared) == round(24 * share)
 
 
 def test_the_mean_of_the_last_iterations_can_be_the_result() -> None:

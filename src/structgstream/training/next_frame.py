@@ -90,6 +90,7 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
     def loss(self, iteration: int, sample: View) -> SceneLoss:
         patching, focuses = self.population.config, self.start.focuses
         focus = None if focuses is None else focuses[sample.index]
+        drawn, comparable = self._drawn_now(focus, sample)
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
@@ -98,10 +99,11 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             voxel_size=0.0,
             track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
             watch=self.watch,
-            focus=None if focus is None else self._drawn_now(focus, sample),
+            focus=drawn,
         )
         loss = replace(loss, focus=focus)  # Tiles that are not drawn now hold their last drawing.
-        self.early_stopping.add(sample.index, loss.total)
+        if comparable:
+            self.early_stopping.add(sample.index, loss.total)
         if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
         self.last_pass.add(iteration, loss, sample)
@@ -111,10 +113,15 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             else replace(loss, total=loss.total + self.bit_price.price(self.parameters.values))
         )
 
-    def _drawn_now(self, focus: Focus, sample: View) -> Focus:
-        """``focus``, in most visits of a view without the tiles in which nothing has changed."""
+    def _drawn_now(self, focus: Focus | None, sample: View) -> tuple[Focus | None, bool]:
+        """``focus``, in most visits of a view without the tiles in which nothing has changed; and whether the loss can
+        be compared with that of the view's other visits."""
+        if focus is None or focus.changed is None or self.rest_every == 1:
+            return focus, True
         visit = self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
-        return focus if focus.changed is None or visit % self.rest_every == 0 else replace(focus, tiles=focus.changed)
+        if visit % self.rest_every == 0:
+            return focus, False
+        return replace(focus, tiles=focus.changed), True
 
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
         if screen_gradient is not None:
