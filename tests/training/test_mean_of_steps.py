@@ -5,7 +5,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from structgstream.scene.state import ParameterName
 from structgstream.training.mean_of_steps import MeanOfSteps
+
+Leaves = dict[ParameterName, torch.Tensor]
 
 
 def leaf(*rows: float) -> torch.Tensor:
@@ -14,7 +17,8 @@ def leaf(*rows: float) -> torch.Tensor:
 
 @given(st.integers(0, 6), st.lists(st.floats(-4.0, 4.0, width=32), min_size=7, max_size=12))
 def test_it_is_the_mean_of_the_iterations_after_the_first_ones(after: int, path: list[float]) -> None:
-    mean, values = MeanOfSteps(after), {"anchor_positions": leaf(0.0)}
+    mean = MeanOfSteps(after)
+    values: Leaves = {"anchor_positions": leaf(0.0)}
     for iteration, value in enumerate(path, start=1):
         values["anchor_positions"].data.fill_(value)
         mean.add(iteration, values)
@@ -29,7 +33,7 @@ def test_rows_that_come_and_go_start_again_and_what_is_not_trained_stays() -> No
     mean, fixed = MeanOfSteps(0), torch.tensor([[5.0]])
     mean.add(1, {"free_means": leaf(100.0, 200.0), "free_colors": fixed})
     mean.add(2, {"free_means": leaf(1.0, 2.0, 3.0), "free_colors": fixed})
-    values = {"free_means": leaf(3.0, 4.0, 5.0), "free_colors": fixed}
+    values: Leaves = {"free_means": leaf(3.0, 4.0, 5.0), "free_colors": fixed}
     mean.add(3, values)
     mean.apply(values)
     assert values["free_means"].flatten().tolist() == [2.0, 3.0, 4.0]
@@ -37,7 +41,8 @@ def test_rows_that_come_and_go_start_again_and_what_is_not_trained_stays() -> No
 
 
 def test_without_iterations_nothing_changes() -> None:
-    mean, values = MeanOfSteps(3), {"anchor_positions": leaf(1.0)}
+    mean = MeanOfSteps(3)
+    values: Leaves = {"anchor_positions": leaf(1.0)}
     mean.add(3, values)
     mean.apply(values)
     assert values["anchor_positions"].item() == 1.0

@@ -219,7 +219,7 @@ def test_tiles_near_change_suffice() -> None:
     truth, drawn = world.frames[1].images["cam00"], []
 
     def counting(*arguments, tiles=None, trained=None, **keywords):
-        if trained is not None:
+        if tiles is not None and trained is not None:
             drawn[-1] += int(tiles.mask.sum())
         return quickest_backend().rasterize(*arguments, tiles=tiles, trained=trained, **keywords)
 
