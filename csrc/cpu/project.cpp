@@ -14,6 +14,7 @@ namespace {
 
 constexpr float kLog2E = 1.44269504f;
 constexpr float kBoxSlack = 0.01f;  // pixels
+constexpr float kBlockSlack = 1e-4f;
 constexpr float kFar = 1e7f;        // pixels: beyond it integers would overflow
 
 // `Width` numbers of each Gaussian of a block as rows of lanes. Lanes beyond the end repeat the last Gaussian.
@@ -176,11 +177,15 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
     store(box[1], at_least_zero(ceiling(tame(y - half_y) - (0.5f + kBoxSlack))));
     store(box[2], at_most(floored(tame(x + half_x) + (0.5f + kBoxSlack)), c.width));
     store(box[3], at_most(floored(tame(y + half_y) + (0.5f + kBoxSlack)), c.height));
-    alignas(kAlignment) float out[8][kLanes];
+    alignas(kAlignment) float out[9][kLanes];
     const vf scale = (0.5f * kLog2E) / determinant;
-    const vf results[8] = {x, y, yy * scale, -2.0f * xy * scale, xx * scale, log2_opacity, f.point[2],
-                           keep(seen, largest(half_x, half_y))};
-    for (int j = 0; j < 8; ++j) store(out[j], results[j]);
+    const vf to_x = yy * scale, to_xy = -2.0f * xy * scale, to_y = xx * scale;
+    // From a block's centre no pixel's centre is farther than 1.5 pixels along x and y: the triangle inequality.
+    const vf within = square_root(largest(splat(0.0f), log2_opacity - kLog2MinAlpha)) +
+                      1.5f * square_root(to_x + to_y + absolute(to_xy));
+    const vf results[9] = {x, y, to_x, to_xy, to_y, log2_opacity, f.point[2], keep(seen, largest(half_x, half_y)),
+                           within * within * (1.0f + kBlockSlack) + kBlockSlack};
+    for (int j = 0; j < 9; ++j) store(out[j], results[j]);
     alignas(kAlignment) float live[kLanes];
     store(live, keep(seen, splat(1.0f)));
     for (int l = 0; l < kLanes && begin + l < in.count; ++l) {
@@ -193,7 +198,7 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
         radii[begin + l] = out[7][l];
         if (between_centres) continue;
         s.x = out[0][l], s.y = out[1][l], s.xx = out[2][l], s.xy = out[3][l], s.yy = out[4][l];
-        s.log2_opacity = out[5][l], s.depth = out[6][l];
+        s.log2_opacity = out[5][l], s.depth = out[6][l], s.near_block = out[8][l];
         colors.write(l, s.color);
         for (int j = 0; j < 4; ++j) s.box[j] = box[j][l];
     }

@@ -24,18 +24,19 @@ constexpr int kBlocks = kBlocksX * kBlocksY;
 constexpr int kAhead = 4;  // splats
 constexpr int kMapsAtOnce = 8;
 
-// The sums over the lanes of each moment, for all of them at once where there are as many lanes.
-inline void store_sums(const vf (&m)[kMomentCount], float* out) {
-    constexpr int kGroups = (kMomentCount + kLanes - 1) / kLanes;
+// The sums over the lanes of each of `Count` vectors, for all of them at once where there are as many lanes.
+template <int Count>
+inline void store_sums(const vf (&m)[Count], float* out) {
+    constexpr int kGroups = (Count + kLanes - 1) / kLanes;
     float sums[kGroups * kLanes];
 #pragma GCC unroll 4
     for (int g = 0; g < kGroups; ++g) {
         vf rows[kLanes];
 #pragma GCC unroll 16
-        for (int i = 0; i < kLanes; ++i) rows[i] = g * kLanes + i < kMomentCount ? m[g * kLanes + i] : splat(0.0f);
+        for (int i = 0; i < kLanes; ++i) rows[i] = g * kLanes + i < Count ? m[g * kLanes + i] : splat(0.0f);
         store(sums + g * kLanes, sums_of_lanes(rows));
     }
-    std::memcpy(out, sums, sizeof(float) * kMomentCount);
+    std::memcpy(out, sums, sizeof(float) * Count);
 }
 
 // 2^x for x in [-8, 0.1]: the rounding splits off the integer, a polynomial fitted around zero does the rest.
@@ -60,15 +61,34 @@ struct Lanes {
     }
 };
 
-// The blocks of a tile that a splat's box touches.
-struct Blocks {
-    int x0, x1, y0, y1;
-    Blocks(const Splat& s, int left, int top)
-        : x0(std::max(0, s.box[0] - left) / kBlockX),
-          x1((std::min(kTile, s.box[2] - left) + kBlockX - 1) / kBlockX),
-          y0(std::max(0, s.box[1] - top) / kBlockY),
-          y1((std::min(kTile, s.box[3] - top) + kBlockY - 1) / kBlockY) {}
+// The centres of a tile's blocks, where there are as many blocks as lanes.
+struct BlockCentres {
+    vf x, y;
+    BlockCentres() {
+        for (int i = 0; i < kLanes; ++i)
+            x[i] = (i % kBlocksX + 0.5f) * kBlockX, y[i] = (i / kBlocksX + 0.5f) * kBlockY;
+    }
 };
+
+// A bit for each block of a tile that a splat may cover: by its ellipse where one vector holds all blocks, by its box
+// elsewhere. The quadratic form is rounded in proportion to its two squares, which a part of them allows for.
+inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int left, int top) {
+#if defined(__AVX512F__)
+    static_assert(kBlocks == kLanes);
+    const vf dx = centres.x + (left - s.x), dy = centres.y + (top - s.y);
+    const vf squares = dx * dx * s.xx + dy * dy * s.yy;
+    return at_least(splat(s.near_block), squares * (1.0f - 1e-5f) + dx * dy * s.xy);
+#else
+    const int x0 = std::max(0, s.box[0] - left) / kBlockX;
+    const int x1 = (std::min(kTile, s.box[2] - left) + kBlockX - 1) / kBlockX;
+    const int y0 = std::max(0, s.box[1] - top) / kBlockY;
+    const int y1 = (std::min(kTile, s.box[3] - top) + kBlockY - 1) / kBlockY;
+    const uint64_t row = ((uint64_t{1} << (x1 - x0)) - 1) << x0;
+    uint64_t found = 0;
+    for (int y = y0; y < y1; ++y) found |= row << (y * kBlocksX);
+    return found;
+#endif
+}
 
 // One splat over one block of pixels whose transmittance is T. Positive T is live; a pixel that has stopped keeps its
 // transmittance with a minus sign.
@@ -90,11 +110,10 @@ struct Coverage {
     }
 };
 
-// How much light still passes each pixel of a tile. A block whose pixels have all stopped is done.
+// How much light still passes each pixel of a tile. A block whose pixels have all stopped loses its bit in `live`.
 struct Front {
     alignas(kAlignment) float T[kTilePixels];
-    bool done[kBlocks] = {};
-    int live = kBlocks;
+    uint64_t live = ~uint64_t{0} >> (64 - kBlocks);
     Front() {
         for (float& t : T) t = 1.0f;
     }
@@ -105,7 +124,7 @@ struct Front {
         store(t, after);
         if (!any(c.stopped)) return;
         store(t, choose(c.stopped, -before, after));
-        if (!any(above(load(t), splat(0.0f)))) done[block] = true, --live;
+        if (!any(above(load(t), splat(0.0f)))) live &= ~(uint64_t{1} << block);
     }
 };
 
@@ -163,29 +182,28 @@ void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float
 // in the tile, transmittance before, coverage).
 template <typename Visit>
 [[gnu::always_inline]] inline void for_covered(
-    const Splat& s, const Tile& tile, const Lanes& lanes, Front& front, Visit visit) {
-    const Blocks blocks(s, tile.left, tile.top);
-    for (int by = blocks.y0; by < blocks.y1; ++by)
-        for (int bx = blocks.x0; bx < blocks.x1; ++bx) {
-            const int block = by * kBlocksX + bx, at = block * kLanes;
-            if (front.done[block]) continue;
-            const vf before = load(front.T + at);
-            Coverage c;
-            if (!c.of(s, lanes, tile.left + bx * kBlockX, tile.top + by * kBlockY, before)) continue;
-            visit(at, before, c);
-            front.pass(block, before, c);
-        }
+    const Splat& s, const Tile& tile, const Lanes& lanes, const BlockCentres& centres, Front& front, Visit visit) {
+    for (uint64_t rest = front.live & near_blocks(s, centres, tile.left, tile.top); rest != 0; rest &= rest - 1) {
+        const int block = __builtin_ctzll(rest), at = block * kLanes;
+        const vf before = load(front.T + at);
+        Coverage c;
+        const float left = tile.left + block % kBlocksX * kBlockX, top = tile.top + block / kBlocksX * kBlockY;
+        if (!c.of(s, lanes, left, top, before)) continue;
+        visit(at, before, c);
+        front.pass(block, before, c);
+    }
 }
 
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
     const Tile tile(raster, index);
     const Lanes lanes;
+    const BlockCentres centres;
     alignas(kAlignment) float color[3][kTilePixels] = {};
     Front front;
     const int end = raster.starts[index + 1];
-    for (int n = raster.starts[index]; n < end && front.live > 0; ++n) {
+    for (int n = raster.starts[index]; n < end && front.live != 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
-        for_covered(s, tile, lanes, front, [&](int at, vf before, const Coverage& c) {
+        for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
             for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
         });
@@ -205,6 +223,7 @@ void blend_backward(
     const float* grad_image, const float* grad_alpha, float* moments) {
     const Tile tile(raster, index);
     const Lanes lanes;
+    const BlockCentres centres;
     const int width = raster.camera.width;
     alignas(kAlignment) float rest[kTilePixels];
     Front front;
@@ -224,16 +243,16 @@ void blend_backward(
             rest[i] += (color[k][i] - behind) * gradient[k][i];
         }
     }
-    const int end = raster.starts[index + 1];
-    int n = raster.starts[index];
-    for (; n < end && front.live > 0; ++n) {
+    int n = raster.starts[index], end = raster.starts[index + 1];
+    while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Nothing reads what these would leave.
+    for (; n < end && front.live != 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
         const bool trained = raster.pairs[n] < raster.trained;
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
-        for_covered(s, tile, lanes, front, [&](int at, vf before, const Coverage& c) {
+        for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
             hit = true;
             const vf weight = c.alpha * before;
             const vf g0 = load(gradient[0] + at), g1 = load(gradient[1] + at), g2 = load(gradient[2] + at);
@@ -265,6 +284,7 @@ template <int Maps>
 void weigh(const Raster& raster, int index, const float* maps, int stride, float* sums) {
     const Tile tile(raster, index);
     const Lanes lanes;
+    const BlockCentres centres;
     alignas(kAlignment) float values[Maps][kTilePixels] = {};
     Front front;
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int at) {
@@ -274,22 +294,19 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
     const int end = raster.starts[index + 1];
     for (int n = raster.starts[index]; n < end; ++n) {
         float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
-        std::fill_n(out, Maps, 0.0f);
-        if (front.live == 0) continue;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
-        for_covered(splat_of(raster, n, end), tile, lanes, front, [&](int at, vf before, const Coverage& c) {
+        bool hit = false;
+        for_covered(splat_of(raster, n, end), tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
+            hit = true;
             const vf weight = c.alpha * before;
 #pragma GCC unroll 8
             for (int k = 0; k < Maps; ++k) m[k] += weight * load(values[k] + at);
         });
-#pragma GCC unroll 8
-        for (int k = 0; k < Maps; ++k) {
-            float parts[kLanes];
-            store(parts, m[k]);
-            for (int step = kLanes / 2; step > 0; step /= 2)
-                for (int l = 0; l < step; ++l) parts[l] += parts[l + step];
-            out[k] = parts[0];
+        if (hit) {
+            store_sums(m, out);
+        } else {
+            std::fill_n(out, Maps, 0.0f);
         }
     }
 }

@@ -25,12 +25,13 @@ struct Pinhole {
 };
 
 // alpha = 2^(log2_opacity - (xx dx^2 + xy dx dy + yy dy^2)), the conic scaled by log2(e) / 2 (xy by log2(e)).
-struct Splat {
+struct alignas(64) Splat {
     float x, y;
     float xx, xy, yy;
     float log2_opacity;
     float color[3];
     float depth;
+    float near_block;          // the quadratic form at the centre of 4 x 4 pixels that reach alpha = 1/255 is at most this
     int32_t box[4];            // pixels x0, y0, x1, y1 (half open) that can reach alpha = 1/255
 };
 

@@ -11,6 +11,7 @@ from backends import quickest_backend
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
+from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
@@ -137,13 +138,13 @@ FOLLOWING = replace(
 )
 
 
-def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None):
+def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None, backend: Backend | None = None):
     return fit_next_frame(
         scene,
         world.frames[index],
         world.rig,
         config=config,
-        backend=quickest_backend(),
+        backend=backend or quickest_backend(),
         seed=seed,
         before=world.frames[index - 1],
         older=older,
@@ -210,6 +211,56 @@ def test_whole_pictures_give_the_same_quality_as_tiles() -> None:
         for c in (FOLLOWING, whole)
     ]
     assert abs(values[0] - values[1]) < 0.2
+
+
+def test_tiles_near_change_suffice() -> None:
+    """Fewer tiles are drawn, by far, and the held-out picture is as good."""
+    world = moving_world(2, speed=0.06, movers=4, width=128, height=96)
+    truth, drawn = world.frames[1].images["cam00"], []
+
+    def counting(*arguments, tiles=None, trained=None, **keywords):
+        if tiles is not None and trained is not None:
+            drawn[-1] += int(tiles.mask.sum())
+        return quickest_backend().rasterize(*arguments, tiles=tiles, trained=trained, **keywords)
+
+    def quality(**motion) -> float:
+        drawn.append(0)
+        config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, **motion))
+        backend = replace(quickest_backend(), rasterize=counting)
+        return psnr(
+            rendered(followed(world.scene, world, 1, config=config, backend=backend).scene, world, "cam00"), truth
+        )
+
+    unfitted = psnr(rendered(world.scene, world, "cam00"), truth)
+    everywhere, near, rarely = quality(), quality(tiles_around=0), quality(rest_every=3)
+    assert drawn[0] > 1.2 * drawn[2] > 1.2 * drawn[1] > 0
+    assert min(everywhere, near, rarely) > unfitted + 2.0
+    assert min(near, rarely) > everywhere - 0.2
+
+
+def test_losses_over_all_tiles_are_not_compared_with_those_near_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a frame whose tiles are drawn by turns would seem to have settled, or not to."""
+    compared: list[int] = []
+    monkeypatch.setattr(EarlyStopping, "add", lambda self, view_index, loss: compared.append(view_index))
+    world = moving_world(2, speed=0.06, movers=20)
+    for rest_every, share in ((1, 1.0), (2, 0.5), (3, 2 / 3)):
+        compared.clear()
+        config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, rest_every=rest_every))
+        assert followed(world.scene, world, 1, config=config).iterations == 24  # Six visits of each of four views.
+        assert len(compared) == round(24 * share)
+
+
+def test_the_mean_of_the_last_iterations_can_be_the_result() -> None:
+    world = moving_world(2, speed=0.06, movers=20)
+    truth = world.frames[1].images["cam00"]
+    last, mean, again = (
+        followed(world.scene, world, 1, config=replace(FOLLOWING, mean_of_last=share)).scene
+        for share in (0.0, 0.25, 0.25)
+    )
+    assert not torch.equal(last.anchors.positions, mean.anchors.positions)
+    assert torch.equal(mean.anchors.positions, again.anchors.positions)
+    before, after = (psnr(rendered(scene, world, "cam00"), truth) for scene in (world.scene, mean))
+    assert after > before + 2.0
 
 
 def test_a_frame_like_the_last_one_costs_no_iteration_and_changes_no_bit() -> None:

@@ -10,6 +10,7 @@ import torch
 from rigs import random_scene
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -17,7 +18,7 @@ from structgstream.training.losses import LossWeights
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, MotionSegmentation
 from structgstream.training.optimize import gradients_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
-from structgstream.training.partition import Partition, focus_views
+from structgstream.training.partition import Partition, changed_tiles, focus_views
 from structgstream.training.step import view_loss
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import training_views
@@ -105,3 +106,13 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
             ours = found[0][name][rows]
             assert (ours - theirs).norm() <= 1e-4 * ours.norm(), name
     assert max(shares) == 1.0 if not tiles else max(shares) < 0.9
+
+
+def test_changed_tiles_are_those_that_hold_a_changed_pixel() -> None:
+    """40 x 24 pixels are three by two tiles of 16, the last ones partial; the mask is at half the size."""
+    tiles = TileSelection(torch.tensor([[True, True, True], [True, True, False]]), 40, 24)
+    changed = torch.zeros(12, 20, dtype=torch.bool)
+    assert changed_tiles(tiles, None) == tiles
+    assert changed_tiles(tiles, changed) == tiles  # Nothing changed: all of them, since none would teach nothing.
+    changed[3, 9] = changed[9, 1] = changed[10, 18] = True  # The last one lies in a tile that is not among them.
+    assert changed_tiles(tiles, changed).mask.tolist() == [[False, True, False], [True, False, False]]

@@ -21,8 +21,10 @@ class Focus:
         picture: ``[H, W, 3]`` the full picture outside the tiles, at least as far as the loss window reads beyond them.
             Drawn into in place: its tiles hold the last drawing.
         still: Gaussians that reach the tiles and do not move; without gradient.
+        changed: those of the tiles in which something has changed; None if that is not known.
     """
 
     tiles: TileSelection
     picture: Tensor
     still: Gaussians
+    changed: TileSelection | None = None

@@ -8,8 +8,8 @@ slow between two frames, and errors that earlier frames left behind. Cameras tha
 not vote, and shares are of the views that can.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -57,6 +57,11 @@ class MotionConfig:
     """Tiles within this many pixels of moving Gaussians are drawn too, so that these get gradients where they move."""
     full_every_frames: int = 0
     """Interval in frames at which everything is trained, to follow slow changes. 0: never."""
+    rest_every: int = 1
+    """Tiles in which nothing has changed are drawn only every this many times that a view is. 1: always."""
+    tiles_around: int = -1
+    """Tiles farther than this many tiles from one in which something has changed are not drawn, though moving Gaussians
+    reach them. -1: all are."""
     tiles: bool = True
     """Draw only the tiles that moving Gaussians reach. False: whole pictures, with the same result."""
 
@@ -81,6 +86,8 @@ class MotionSegmentation:
         evidence: optical flow of all movers, if it was estimated.
         views_with_flow: indices of the views with flow.
         centers: ``[M + F, 3]`` visible centres of all movers, if flow was estimated.
+        changed: by index of each trusted view that is compared with an earlier picture, mask ``[h, w]`` of its changed
+            pixels at ``MotionConfig.picture_scale``.
     """
 
     anchors: Tensor
@@ -92,6 +99,7 @@ class MotionSegmentation:
     evidence: MotionEvidence | None = None
     views_with_flow: tuple[int, ...] = ()
     centers: Tensor | None = None
+    changed: Mapping[int, Tensor] = field(default_factory=dict)
 
     @property
     def movers(self) -> Tensor:
@@ -181,6 +189,7 @@ def segment_motion(
         visible={views[n].index: view_evidence[n].coverage > config.least_pixels for n in trusted},
         trusted=tuple(trusted),
         scene_cut=is_scene_cut(view_changes),
+        changed={views[n].index: changed for n in trusted if (changed := view_evidence[n].changed) is not None},
     )
     views_with_flow = [n for n in trusted if getattr(changes[n], "flow", None) is not None]
     if not views_with_flow or found.scene_cut:
@@ -196,13 +205,15 @@ def segment_motion(
 
 @dataclass(frozen=True)
 class _ViewEvidence:
-    """One view's measurements: masks ``[E]`` of visible movers and of votes, coverage by id, and flow sums."""
+    """One view's measurements: masks ``[E]`` of visible movers and of votes, coverage by id, flow sums, and the mask
+    ``[h, w]`` of changed pixels."""
 
     seen: Tensor
     votes: Tensor
     coverage: Tensor
     flows: Tensor
     change: ViewChange
+    changed: Tensor | None = None
 
 
 def _view_evidence(
@@ -244,4 +255,5 @@ def _view_evidence(
         coverage=sums[:, 0],
         flows=sum_by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if change.flow is not None else total,
         change=ViewChange(difference, wrong_share, identical=change.identical),
+        changed=part[0, 0] > 0.0,
     )

@@ -2,7 +2,7 @@
 """Iterations of a frame after the first: loss with the price of bits, patching, early stopping."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
+from structgstream.training.mean_of_steps import MeanOfSteps
 from structgstream.training.optimize import Hooks
 from structgstream.training.parameters import Parameters
 from structgstream.training.partition import Partition
@@ -69,6 +70,9 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
         last_pass: gets the result of each view.
         backend: the compute back-end.
         watch: seconds by stage.
+        rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
+        visits: by view index, how often it was drawn.
+        average: gets the leaves of each iteration; None for none.
     """
 
     start: StartingPoint
@@ -82,9 +86,14 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
     last_pass: LastPass
     backend: Backend
     watch: Stopwatch
+    rest_every: int = 1
+    visits: dict[int, int] = field(default_factory=dict)
+    average: MeanOfSteps | None = None
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
         patching, focuses = self.population.config, self.start.focuses
+        focus = None if focuses is None else focuses[sample.index]
+        drawn, comparable = self._drawn_now(focus, sample)
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
@@ -93,9 +102,11 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             voxel_size=0.0,
             track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
             watch=self.watch,
-            focus=None if focuses is None else focuses[sample.index],
+            focus=drawn,
         )
-        self.early_stopping.add(sample.index, loss.total)
+        loss = replace(loss, focus=focus)  # Tiles that are not drawn now hold their last drawing.
+        if comparable:
+            self.early_stopping.add(sample.index, loss.total)
         if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
         self.last_pass.add(iteration, loss, sample)
@@ -105,6 +116,16 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             else replace(loss, total=loss.total + self.bit_price.price(self.parameters.values))
         )
 
+    def _drawn_now(self, focus: Focus | None, sample: View) -> tuple[Focus | None, bool]:
+        """``focus``, in most visits of a view without the tiles in which nothing has changed; and whether the loss can
+        be compared with that of the view's other visits."""
+        if focus is None or focus.changed is None or self.rest_every == 1:
+            return focus, True
+        visit = self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
+        if visit % self.rest_every == 0:
+            return focus, False
+        return replace(focus, tiles=focus.changed), True
+
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
         if screen_gradient is not None:
             self.population.statistics.add(loss.rendering, screen_gradient)
@@ -113,6 +134,8 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
                 survivors = self.population.patch(sample)
                 self.bit_price = None if self.bit_price is None else self.bit_price.after_pruning(survivors)
             self.early_stopping.reset()
+        if self.average is not None:
+            self.average.add(iteration, self.parameters.values)
 
     def finished(self, iteration: int) -> bool:
         return iteration > self.patch_at and self.early_stopping.should_stop

@@ -25,6 +25,7 @@ from structgstream.training.births import BirthConfig
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
+from structgstream.training.mean_of_steps import MeanOfSteps
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, segment_motion
 from structgstream.training.motion_start import MotionStartConfig, estimate_initial_motion, with_displacements
 from structgstream.training.next_frame import NextFrameHooks, StartingPoint
@@ -90,6 +91,8 @@ class OnlineConfig:
     """Births of free Gaussians from geometry, and removal of outliers; only with ``motion``."""
     motion_prior: float = 0.0
     """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
+    mean_of_last: float = 0.0
+    """The result is the mean of this share of the iterations, the last ones (paper: 0, the last step)."""
     least_gain: float = 0.0
     """Early stopping (and early patching): when ``iterations`` steps at the present rate would lower the loss by less
     than this share (paper: 0, never)."""
@@ -218,6 +221,8 @@ class FrameFit:
         schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
         population, last_pass = hooks.population, hooks.last_pass
         done = optimize(population.adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step)
+        if hooks.average is not None:
+            hooks.average.apply(hooks.parameters.values)
         return FitResult(
             scene=detached(hooks.parameters.scene(start.scene)),
             iterations=done,
@@ -261,6 +266,8 @@ class FrameFit:
             last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
             backend=self.iteration_backend,
             watch=self.watch,
+            rest_every=config.motion.rest_every,
+            average=MeanOfSteps(math.floor(iterations * (1.0 - config.mean_of_last))) if config.mean_of_last else None,
         )
 
     def _parameters(self, start: StartingPoint) -> tuple[Parameters, BitPrice | None]:

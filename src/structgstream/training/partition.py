@@ -75,14 +75,28 @@ def focus_views(
     rows = torch.cat([segmentation.anchors.repeat_interleave(k), segmentation.free])  # of the whole scene's Gaussians
     with torch.no_grad():
         found = {
-            view.index: _focus(still, moving, segmentation.visible[view.index][rows], view.camera, config, backend)
+            view.index: _focus(
+                still,
+                moving,
+                segmentation.visible[view.index][rows],
+                segmentation.changed.get(view.index),
+                view.camera,
+                config,
+                backend,
+            )
             for view in views
         }
     return {index: focus for index, focus in found.items() if focus is not None}
 
 
 def _focus(
-    still: Scene, moving: Scene, visible: Tensor, camera: Camera, config: MotionConfig, backend: Backend
+    still: Scene,
+    moving: Scene,
+    visible: Tensor,
+    changed: Tensor | None,
+    camera: Camera,
+    config: MotionConfig,
+    backend: Backend,
 ) -> Focus | None:
     in_motion = moving.gaussians(camera, backend)
     # Extents of Gaussians are measured on a reduced picture, which costs a sixteenth.
@@ -94,16 +108,35 @@ def _focus(
         return None
     if not config.tiles:
         tiles = replace(tiles, mask=torch.ones_like(tiles.mask))
+    tiles_of_change = changed_tiles(tiles, changed)
+    if config.tiles and config.tiles_around >= 0:
+        tiles = replace(tiles, mask=tiles.mask & _grown(tiles_of_change.mask, config.tiles_around))
     # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
-    around = torch.nn.functional.max_pool2d(tiles.mask[None].float(), 3, stride=1, padding=1)[0] > 0
-    ring = replace(tiles, mask=around)
+    ring = replace(tiles, mask=_grown(tiles.mask, 1))
     at_rest = still.with_free_gaussians(still.structured(camera, backend, tiles=ring))
-    nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=around.device))
+    nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.mask.device))
     empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
     drawn, behind = concatenate(in_motion, at_rest), still.background(camera)
     rendering = draw(drawn, camera, backend, focus=Focus(ring, empty, nothing), background=behind)
     # Anchors were culled as a whole; Gaussians that reach no tile are dropped.
-    return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0))
+    return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0), tiles_of_change)
+
+
+def _grown(mask: Tensor, by: int) -> Tensor:
+    """The mask ``[rows, columns]``, dilated by ``by`` tiles."""
+    return torch.nn.functional.max_pool2d(mask[None].float(), 2 * by + 1, stride=1, padding=by)[0] > 0
+
+
+def changed_tiles(tiles: TileSelection, changed: Tensor | None) -> TileSelection:
+    """Those of ``tiles`` that hold pixels of the mask ``changed`` ``[h, w]``, or all if none do or it is None."""
+    if changed is None:
+        return tiles
+    rows, columns = tiles.mask.shape
+    size = (rows * TILE_PIXELS, columns * TILE_PIXELS)
+    large = torch.nn.functional.interpolate(changed[None, None].float(), size=(tiles.height, tiles.width))
+    padded = torch.nn.functional.pad(large, (0, size[1] - tiles.width, 0, size[0] - tiles.height))
+    mask = tiles.mask & (torch.nn.functional.max_pool2d(padded, TILE_PIXELS)[0, 0] > 0.0)
+    return replace(tiles, mask=mask) if mask.any() else tiles
 
 
 def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
