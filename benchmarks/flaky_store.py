@@ -35,7 +35,7 @@ class Refusing:
 def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
     """The URL of an empty bucket, which this process and those that it begins find by their environment."""
     import s3fs
-    from moto.server import DomainDispatcherApplication, create_backend_app
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import make_server
 
     application = Refusing(DomainDispatcherApplication(create_backend_app), every=0)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Generic
 
+from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
@@ -190,14 +191,14 @@ class Session(Generic[State, Memory]):
 
     def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
         """The state from which the next frame is fitted."""
-        method, begins = self._pipeline.method, past is None or task.begins is not None
-        if begins:
-            self._plan.begin(task.frame.index, task.frame.pts_seconds)
-            keep_frames(self._source, task.frame.index, last=self._plan.remembered)
+        method = self._pipeline.method
+        if past is not None and task.begins is None:
+            self._measure(state, task)
+            return Past(state, past.memory, past.state if method.needs_older else None)
+        self._plan.begin(task.frame.index, task.frame.pts_seconds)
+        keep_frames(self._source, task.frame.index, last=self._plan.remembered)
         self._measure(state, task)
-        if begins:
-            return Past(state, method.prepare(state, lambda: task))
-        return Past(state, past.memory, past.state if method.needs_older else None)
+        return Past(state, method.prepare(state, lambda: task))
 
     def _measure(self, state: State, task: FrameTask) -> None:
         """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
@@ -222,11 +223,17 @@ class Session(Generic[State, Memory]):
         period = resumed.period(count - 1)
         first = period.first_frame
         older = resumed.scene(count - 2) if method.needs_older and count - 1 > first else None
-        self._plan.begin(first, resumed.packets[first].pts_seconds, number=period.number)
         keep_frames(self._source, first, last=self._plan.remembered)
-        for index in self._plan.needed([info.pts_seconds for info in resumed.packets], self._keys):
-            self._measure(resumed.scene(index), self._task_again(index))
+        if self._pipeline.period.enabled:
+            self._restore_plan(resumed, period)
         return Past(state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older)
+
+    def _restore_plan(self, resumed: StoredStream[State], period: Period) -> None:
+        """What the plan of periods knew: when the last period began, and residuals measured again."""
+        seconds = [info.pts_seconds for info in resumed.packets]
+        self._plan.begin(period.first_frame, seconds[period.first_frame], number=period.number)
+        for index in self._plan.needed(seconds, self._keys):
+            self._measure(resumed.scene(index), self._task_again(index))
 
     def _task_again(self, index: int) -> FrameTask:
         """The task of an existing frame, whose pictures are read again."""

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
-from structgstream.codec.container.records import CHECKSUM, RECORD, packed, read_head, read_record
+from structgstream.codec.container.records import RECORD, packed, read_head, read_record
 from structgstream.errors import StreamError
 from structgstream.groups.growing_file import GrowingFile, partial_path
 
@@ -149,9 +149,8 @@ class TrackFile:
     def _scan(self, offset: int) -> int:
         # Heads only: a start's checksum is verified when it is read.
         while (found := read_head(self._data, offset)) is not None:
-            kind, length = found
-            after = offset + RECORD.size + length + CHECKSUM.size
-            if kind == TrackRecord.START and length >= START.size:
+            kind, after = found.type, offset + found.bytes
+            if kind == TrackRecord.START and found.length >= START.size:
                 frame = START.unpack(self._data[offset + RECORD.size : offset + RECORD.size + START.size])[0]
                 self._offsets[frame] = offset
             elif kind == TrackRecord.END and (record := read_record(self._data, offset)) is not None:

@@ -36,6 +36,10 @@ class Taken:
         return None
 
     @property
+    def taken(self) -> None:
+        return None
+
+    @property
     def status(self) -> QueueStatus:
         return QueueStatus(self.waiting, 0, 0)
 

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from structgstream.data.live.outlets import QueueStatus
-from structgstream.data.live.status import CameraStatus, LiveStatus
+from structgstream.data.live.status import CameraStatus, LiveStatus, SetAges
 
+AGES = SetAges(0.25, 0.5, 0.75)
 FAULTS = {"a": {"stuck": 2}}
 ARRIVALS: Any = SimpleNamespace(
     present=["a"],
@@ -18,7 +19,7 @@ ARRIVALS: Any = SimpleNamespace(
 
 
 def status(arrivals: Any, queue: QueueStatus | None) -> LiveStatus:
-    return LiveStatus.of(arrivals, queue, faults=FAULTS, cameras=("a", "b"), handed_per_second=2.5, delay_seconds=0.75)
+    return LiveStatus.of(arrivals, queue, faults=FAULTS, cameras=("a", "b"), handed_per_second=2.5, ages=AGES)
 
 
 def test_before_cameras_are_opened_only_their_faults_are_known() -> None:
@@ -36,5 +37,7 @@ def test_every_number_stands_under_its_name() -> None:
         waiting_sets=5,
         waiting_bytes=900,
         handed_per_second=2.5,
+        arrived_seconds=0.25,
+        matched_seconds=0.5,
         delay_seconds=0.75,
     )
