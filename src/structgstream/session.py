@@ -184,14 +184,14 @@ class Session(Generic[State, Memory]):
 
     def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
         """The state from which the next frame is fitted."""
-        method, begins = self._pipeline.method, past is None or task.begins is not None
-        if begins:
-            self._plan.begin(task.frame.index, task.frame.pts_seconds)
-            keep_frames(self._source, task.frame.index, last=self._plan.remembered)
+        method = self._pipeline.method
+        if past is not None and task.begins is None:
+            self._measure(state, task)
+            return Past(state, past.memory, past.state if method.needs_older else None)
+        self._plan.begin(task.frame.index, task.frame.pts_seconds)
+        keep_frames(self._source, task.frame.index, last=self._plan.remembered)
         self._measure(state, task)
-        if begins:
-            return Past(state, method.prepare(state, lambda: task))
-        return Past(state, past.memory, past.state if method.needs_older else None)
+        return Past(state, method.prepare(state, lambda: task))
 
     def _measure(self, state: State, task: FrameTask) -> None:
         """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
