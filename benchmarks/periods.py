@@ -40,7 +40,7 @@ from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.initial import fit_first_frame
 from structgstream.training.result import FitResult
 
-FRAMES, CHANGE, KEY_EVERY = 16, 5, 4
+FRAMES, CHANGE, KEY_EVERY = 12, 5, 4
 DEGREES = 70.0
 VARIANTS = {
     "none": PeriodConfig(),

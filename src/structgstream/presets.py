@@ -71,7 +71,7 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
         return value
 
     found = plain(asdict(config))
-    if config.period == PeriodConfig():
+    if found.get("period") == asdict(PeriodConfig()):
         del found["period"]
     return found
 
