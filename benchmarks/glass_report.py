@@ -38,7 +38,7 @@ def plot(run: Run, path: Path) -> None:
     """Delay and memory over the minutes of a run."""
     figure = figure_of(8, 6)
     axes = figure.subplots(3, sharex=True)
-    frames = _shown(run)
+    frames = [one for one in _shown(run) if one["frame"]]  # frame 0 takes ten times as long
     begun = frames[0]["filmed"]
     minutes = [(one["filmed"] - begun) / 60 for one in frames]
     for color, stage in zip(COLORS, ("handed over", "written", "shown"), strict=False):
@@ -55,7 +55,7 @@ def plot(run: Run, path: Path) -> None:
         )
         axis.set_title(f"memory of the {name}, MB", loc="left", fontsize=9)
     for axis in axes:
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.15 * axis.get_ylim()[1])
         without_frame(axis)
     axes[-1].set_xlabel("minutes", fontsize=9)
     save_figure(figure, path)

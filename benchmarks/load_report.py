@@ -31,12 +31,14 @@ def table(result: dict[str, Any]) -> str:
 
 def _span(one: dict[str, Any]) -> str:
     fit, busy = _median(one["fit_seconds"]), _median(one["busy_seconds"])
-    write, waited = _median(one["write_seconds"]), _median(one["waited_seconds"])
-    busy_of = one["processor_seconds"]
+    # Results before both were measured lack them.
+    write, waited = _median(one["write_seconds"]), _median(one.get("waited_seconds", []))
+    busy_of = one.get("processor_seconds")
+    others = "-" if busy_of is None else f"{busy_of['server']:.1f}, {busy_of['players']:.1f}"
     return (
         f"| {one['players']} | {_shown(fit)} ({len(one['fit_seconds'])}) | {_shown(busy)} | {_shown(waited)} | "
         f"{_shown(None if write is None else 1000 * write)} | {one['server_bytes'] / 1e6:.0f} | "
-        f"{busy_of['server']:.1f}, {busy_of['players']:.1f} |"
+        f"{others} |"
     )
 
 
