@@ -122,6 +122,7 @@ def test_ranges_that_are_none_are_refused(tmp_path: Path) -> None:
 
 
 def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    group = task(made(), LENGTH)  # Made before memory is short.
     asked, real = [], method.fit_group_start
 
     def short(*arguments, **options):
@@ -131,7 +132,7 @@ def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest
         return real(*arguments, **options)
 
     monkeypatch.setattr(method, "fit_group_start", short)
-    assert fit(tmp_path / "g.sgs", task(made(), LENGTH)) == LENGTH
+    assert fit(tmp_path / "g.sgs", group) == LENGTH
     assert [births for births, _ in asked] == [50, 12]
     assert asked[1][1] == asked[0][1] // 2
     assert '"lowered budgets": 1' in (tmp_path / "g.log.jsonl").read_text().splitlines()[0]
@@ -141,4 +142,4 @@ def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(method, "fit_group_start", none)
     with pytest.raises(OutOfMemoryError):
-        fit(tmp_path / "h.sgs", task(made(), LENGTH))
+        fit(tmp_path / "h.sgs", group)
