@@ -18,7 +18,7 @@ FlowSearch = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32
 picture corresponds to ``p + flow[p]`` in the second."""
 
 
-def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
+def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> FlowSearch:
     """Flow by dense inverse search (Kroeger et al., 2016) on grey pictures.
 
     Args:
@@ -26,6 +26,7 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
         refined: OpenCV's preset "medium". False: preset "fast", stopped at half resolution and without variational
             refinement; it takes two fifths of the time and is as accurate at consistent
             pixels (:func:`consistency_mask`).
+        finest_level: of the pyramid, if not refined: 1 is half resolution, 0 full.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -37,7 +38,7 @@ def dis_search(extra: str, *, refined: bool = True) -> FlowSearch:
     preset = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if refined else cv2.DISOPTICAL_FLOW_PRESET_FAST
     search = cv2.DISOpticalFlow.create(preset)
     if not refined:
-        search.setFinestScale(1)
+        search.setFinestScale(finest_level)
         search.setVariationalRefinementIterations(0)
 
     def flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:

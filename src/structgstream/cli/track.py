@@ -48,8 +48,11 @@ class Track:
     """Allow an N that is no multiple of the interval of key packets; each group then costs a key packet more."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
-    cameras: int = 8
-    """Most cameras to track with."""
+    after: Annotated[Path | None, tyro.conf.arg(metavar="SEGMENT", help_behavior_hint="")] = None
+    """Begin at the end of this finished group, where things are as it has fitted them: starts for the groups after it,
+    without what tracking lost before."""
+    cameras: int = 14
+    """Most cameras to track with in a frame; of more, every second or third, in turn."""
     device: Device = "auto"
     """Compute back-end."""
     overwrite: bool = False
@@ -64,6 +67,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.groups.boundaries import check_length
     from structgstream.groups.growing_file import partial_path
     from structgstream.groups.pictures import open_for
+    from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_pass import TrackOptions, groups_path
     from structgstream.kernels.backend import select_backend
     from structgstream.training.tracking import TrackConfig
@@ -81,16 +85,20 @@ def main(arguments: list[str]) -> None:
         for path in (options.output, partial_path(options.output), groups_path(options.output)):
             path.unlink(missing_ok=True)
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    chosen = TrackOptions(length, options.quiet, TrackConfig(cameras=options.cameras))
-    _track(options.output, source, base, chosen, backend)
-    _say(options.output, len(source))
+    after = None if options.after is None else open_segment(options.after)
+    chosen = TrackOptions(length, options.quiet, after, TrackConfig(cameras=options.cameras))
+    spent = _track(options.output, source, base, chosen, backend)
+    _say(options.output, len(source), spent)
 
 
-def _track(path: Path, source: "FrameSource", base: "GroupBase", options: "TrackOptions", backend: "Backend") -> None:
+def _track(
+    path: Path, source: "FrameSource", base: "GroupBase", options: "TrackOptions", backend: "Backend"
+) -> float | None:
+    """Tracks what is missing; mean processor time of a frame in seconds, None if nothing was."""
     from structgstream.groups.track_pass import track_capture
 
     columns = [TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TimeElapsedColumn()]
-    done = 0
+    done, spent = 0, list[float]()
     try:
         with (
             Termination() as ending,
@@ -100,6 +108,7 @@ def _track(path: Path, source: "FrameSource", base: "GroupBase", options: "Track
             task = bars.add_task("tracking", total=len(source) - 1)
             for progress in frames:
                 done = progress.frame
+                spent.append(progress.cpu_seconds)
                 bars.update(task, completed=done)
                 if ending.asked and done + 1 < len(source):
                     raise Terminated
@@ -108,9 +117,10 @@ def _track(path: Path, source: "FrameSource", base: "GroupBase", options: "Track
         raise ended(
             f"Frame {done} of {len(source) - 1} was tracked; give the same command to go on from the last start."
         ) from None
+    return sum(spent) / len(spent) if spent else None
 
 
-def _say(path: Path, frames: int) -> None:
+def _say(path: Path, frames: int, spent: float | None) -> None:
     from structgstream.groups.track_file import open_track
 
     groups = open_track(path).groups or []
@@ -118,7 +128,8 @@ def _say(path: Path, frames: int) -> None:
     Console().print(
         f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
         + " ".join(f"{first}:{end}" for first, end in groups[:8])
-        + (" ..." if len(groups) > 8 else ""),
+        + (" ..." if len(groups) > 8 else "")
+        + ("" if spent is None else f"; {spent:.2f} core-seconds a frame"),
         highlight=False,
         markup=False,
         soft_wrap=True,

@@ -112,8 +112,8 @@ class GroupMethod:
             self.lowered, self.start = True, lowered_start(self.start)
             self.config = replace(self.config, online=lowered_budget(self.config.online))
             _log.warning(
-                "Frame %d: not enough memory. From here on coverage is computed at half the size, flow in half of the "
-                "views, and a quarter of the births may come; results differ a little.",
+                "Frame %d: not enough memory. From here on flow is estimated in half of the views, and a quarter of "
+                "the births may come; results differ a little.",
                 task.frame.index,
             )
         found = self._fit(past, task)
@@ -146,10 +146,9 @@ class GroupMethod:
 
 
 def lowered_budget(online: OnlineConfig) -> OnlineConfig:
-    """``online`` with less memory: coverage at half the size, flow in half of the views, a quarter of the births."""
+    """``online`` with less memory: flow in half of the views, a quarter of the births."""
     return replace(
         online,
-        motion=replace(online.motion, picture_scale=online.motion.picture_scale / 2),
         start=replace(online.start, views=max(2, online.start.views // 2)),
         births=replace(online.births, most=online.births.most // 4),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import StreamHeader
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig
+from structgstream.data.wrappers import WithRig, section
 from structgstream.errors import CaptureError
 from structgstream.evaluation.capture import capture_of
 
@@ -25,7 +25,7 @@ def open_for(header: StreamHeader, folder: Path, *, frames: int | None) -> Frame
     source = capture_of(header, folder, frames=None)
     if frames is not None and frames > len(source):
         raise CaptureError(f"The capture {source.name} has {len(source)} frames; frames up to {frames} were asked for.")
-    source = capture_of(header, folder, frames=frames)
+    source = section(source, frames=frames)
     if differing := _differing(source.rig, header.rig):
         raise CaptureError(
             f"The capture {source.name} is not the one of the header: {', '.join(differing[:5])} "

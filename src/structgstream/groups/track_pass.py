@@ -15,28 +15,20 @@ import torch
 
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
-from structgstream.errors import ConfigError
+from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.boundaries import equal_groups, quiet_groups
 from structgstream.groups.growing_file import partial_path, write_whole
 from structgstream.groups.pictures import fingerprint
+from structgstream.groups.segment_file import Segment
+from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import TrackFile, TrackHead, TrackStart, TrackWriter, open_track
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.training.motion_start import with_displacements
-from structgstream.training.residuals import ResidualFloor, residual_floor
-from structgstream.training.tracking import (
-    TrackConfig,
-    Tracked,
-    Tracker,
-    TrackPictures,
-    spread_cameras,
-    track_frame,
-)
-from structgstream.training.views import View
+from structgstream.training.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
 
 
 @dataclass(frozen=True)
@@ -46,12 +38,19 @@ class TrackOptions:
     Args:
         length: frames of a group.
         quiet: whether groups begin where little moves, rather than at equal distances.
+        after: a finished group, from whose last frame on is tracked, which corrects what tracking has lost before.
         tracking: how movers are followed.
     """
 
     length: int
     quiet: bool = False
+    after: Segment | None = None
     tracking: TrackConfig = field(default_factory=TrackConfig)
+
+    @property
+    def first(self) -> int:
+        """The first frame of the first group."""
+        return 0 if self.after is None else self.after.identity.end
 
 
 @dataclass(frozen=True)
@@ -99,27 +98,66 @@ def track_capture(
         step=base.position_step,
         movers=len(base.scene().anchors) + len(base.scene().free),
         every=every,
-        config=asdict(options.tracking) | {"length": options.length, "quiet": options.quiet, "frames": len(source)},
+        config=asdict(options.tracking)
+        | {"length": options.length, "quiet": options.quiet, "frames": len(source)}
+        | ({} if options.after is None else {"after": options.after.identity.sha256}),
     )
     found = _existing(path, head)
     if found is not None and found.groups is not None:
         return
     if not options.quiet:
-        _write_groups(path, equal_groups(len(source), options.length))
+        _write_groups(path, _groups(options, len(source), {}))
     done = [] if found is None else [*found.whole_starts()]
-    last = done[-1][0] if done else None
     writer = TrackWriter(path, head, keep=done[-1][1] if done else 0)
     try:
-        past = Pass.at(base, source, options.tracking, backend, last)
-        changed = {start.frame: float(start.changed[-1]) for start, _ in done}
-        yield from _frames(past, source, writer, every=every, changed=changed)
-        frames = len(source)
-        quiet = options.quiet
-        groups = quiet_groups(frames, options.length, changed) if quiet else equal_groups(frames, options.length)
+        last = done[-1][0] if done else None
+        if last is None and options.after is not None:
+            last = start_after(options.after, base)
+            writer.write(last)
+        changed = {start.frame: float(start.changed[-1]) for start, _ in done if len(start.changed)}
+        past = Pass.at(base, options.tracking, backend, last)
+        yield from _frames(past, source, writer, first=options.first, every=every, changed=changed)
+        groups = _groups(options, len(source), changed)
         _write_groups(path, groups)
-        writer.finish(frames, groups)
+        writer.finish(len(source), groups)
     finally:
         writer.close()
+
+
+def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
+    """The groups of a capture of ``frames`` frames, those after ``options.after`` only."""
+    first = options.first
+    if options.quiet:
+        later = {frame - first: share for frame, share in changed.items() if frame > first}
+        found = quiet_groups(frames - first, options.length, later)
+    else:
+        found = equal_groups(frames - first, options.length)
+    return [(first + begin, first + end) for begin, end in found]
+
+
+def start_after(group: Segment, base: GroupBase) -> TrackStart:
+    """Where the movers of frame 0 are in the last frame of a finished group, whose births are not among them.
+
+    Raises:
+        ConfigError: the group is not finished, or has another header.
+    """
+    if not group.complete or group.init != base.init:
+        what = "is not finished" if not group.complete else "has another header"
+        raise ConfigError(f"{group.name} {what}; track on from a finished group of the same header.")
+    identity, first = group.identity, base.scene()
+    so_far = GroupSoFar(base, identity.first, [group.record(number) for number in range(len(group.entries))])
+    last, before = so_far.scene(identity.end - 1), so_far.scene(max(identity.end - 2, identity.first))
+    at, then, z = (scene.anchors.positions for scene in (last, before, first))
+    displacements = ((at - z) / base.position_step).round().to(torch.int32)
+    velocities = ((at - then) / base.position_step).round().to(torch.int32)
+    rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
+    return TrackStart(
+        identity.end - 1,
+        rows.to(torch.int32).numpy(),
+        displacements[rows].numpy(),
+        velocities[rows].numpy(),
+        np.zeros(0, np.float32),
+    )
 
 
 def _existing(path: Path, head: TrackHead) -> TrackFile | None:
@@ -127,10 +165,16 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
 
     Raises:
         ConfigError: it is another track.
+        StreamError: it is finished, and damaged.
     """
-    if not path.exists() and (not partial_path(path).exists() or partial_path(path).stat().st_size < 64):
+    if not path.exists() and not partial_path(path).exists():
         return None
-    found = open_track(path)
+    try:
+        found = open_track(path)
+    except StreamError:
+        if path.exists():
+            raise
+        return None  # A pass that was interrupted before its first start.
     if vars(found.head) != vars(head):
         differing = [name for name, value in vars(head).items() if getattr(found.head, name) != value]
         raise ConfigError(
@@ -151,7 +195,6 @@ class Pass:
     Args:
         first: frame 0.
         tracker: how movers are followed.
-        floor: residuals of frame 0.
         step: of positions.
         tracked: where movers are in the last frame.
         index: the last frame.
@@ -159,25 +202,19 @@ class Pass:
 
     first: Scene
     tracker: Tracker
-    floor: ResidualFloor
     step: float
     tracked: Tracked
     index: int
 
     @classmethod
-    def at(
-        cls, base: GroupBase, source: FrameSource, config: TrackConfig, backend: Backend, start: TrackStart | None
-    ) -> "Pass":
+    def at(cls, base: GroupBase, config: TrackConfig, backend: Backend, start: TrackStart | None) -> "Pass":
         """The state at ``start``, or at frame 0."""
         online, scene = base.config.online, on_device(base.scene(), backend.device)
         rig = base.header.similarity.rig(base.header.rig)
-        tracker = Tracker.of(config, online.motion, online.start, rig=rig, backend=backend)
-        views = tracker.views(next(_cameras(source, config).frames(0)))
-        floor = residual_floor(scene, views, scale=tracker.motion.picture_scale, backend=backend)
-        tracked, index = Tracked.at_rest(scene), 0
-        if start is not None:
-            tracked, index = tracked_at(scene, start, step=base.position_step), start.frame
-        return cls(scene, tracker, floor, base.position_step, tracked, index)
+        tracker = Tracker(config, online.motion, online.start.lift, rig, backend)
+        if start is None:
+            return cls(scene, tracker, base.position_step, Tracked.at_rest(scene), 0)
+        return cls(scene, tracker, base.position_step, tracked_at(scene, start, step=base.position_step), start.frame)
 
     def start(self, changed: list[float]) -> TrackStart:
         """The start record of the last frame; the state is rounded to it."""
@@ -186,13 +223,14 @@ class Pass:
         displacements = ((now - z) / self.step).round().to(torch.int32).cpu()
         velocities = (self.tracked.velocities / self.step).round().to(torch.int32).cpu()
         rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
-        stored = TrackStart(
+        found = TrackStart(
             self.index,
             rows.to(torch.int32).numpy(),
             displacements[rows].numpy(),
             velocities[rows].numpy(),
             np.asarray(changed, np.float32),
         )
+        stored = TrackStart.unpacked(found.packed())  # What a pass that goes on from here reads.
         self.tracked = tracked_at(self.first, stored, step=self.step)
         return stored
 
@@ -214,24 +252,23 @@ def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor
     return found[0], found[1]
 
 
-def _cameras(source: FrameSource, config: TrackConfig) -> FrameSource:
-    """The capture of the cameras that are tracked with, so that no other pictures are decoded."""
-    return select_cameras(source, spread_cameras(source.rig, config.cameras))
-
-
 def _frames(
-    past: Pass, source: FrameSource, writer: TrackWriter, *, every: int, changed: dict[int, float]
+    past: Pass, source: FrameSource, writer: TrackWriter, *, first: int, every: int, changed: dict[int, float]
 ) -> Generator[TrackProgress, None, None]:
-    """Tracks from the frame after ``past`` to the end; ``changed`` gets the change at each start."""
+    """Tracks from the frame after ``past`` to the end, with a start at ``first`` and every so many frames after it.
+
+    ``changed`` gets the change at each start.
+    """
     shares: list[float] = []
     began = time.process_time()
     with Lookahead(_observed(past, source)) as observed:
-        for index, pictures in observed:
-            past.tracked = track_frame(past.tracker, past.tracked, pictures, past.floor)
-            past.index, seconds = index, past.tracked.seconds
+        for pictures in observed:
+            past.tracked = track_frame(past.tracker, past.tracked, pictures)
+            past.index = index = pictures.index
+            seconds = past.tracked.seconds
             moved, stored = past.tracked.moved, 0
             shares.append(pictures.changed_share)
-            if index % every == 0:
+            if index >= first and (index - first) % every == 0:
                 start = past.start(shares)
                 stored, changed[index], shares = writer.write(start), float(start.changed[-1]), []
             share, now = pictures.changed_share, time.process_time()
@@ -239,12 +276,11 @@ def _frames(
             began = now
 
 
-def _observed(past: Pass, source: FrameSource) -> Generator[tuple[int, TrackPictures], None, None]:
-    """Every frame after that of ``past`` with its reduced pictures and what changed, made while another is tracked."""
-    chosen = _cameras(source, TrackConfig(cameras=past.tracker.start.views))
-    frames = read_ahead(chosen).frames(past.index)
-    before: list[View] = past.tracker.views(next(frames))
+def _observed(past: Pass, source: FrameSource) -> Generator[TrackPictures, None, None]:
+    """Reduced pictures of every frame after that of ``past``, and what changed, made while another is tracked."""
+    frames = read_ahead(source).frames(past.index)
+    before = past.tracker.pictures(next(frames), None).views
     for frame in frames:
-        pictures = past.tracker.pictures(frame, before)
-        before = pictures.views
-        yield frame.index, pictures
+        found = past.tracker.pictures(frame, before)
+        before = found.views
+        yield found

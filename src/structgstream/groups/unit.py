@@ -27,6 +27,9 @@ from structgstream.training.group_start import GroupStartConfig
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import StepListener
 
+LEAST_PIXELS = 0.5
+"""A mover that was tracked no further than this, pixels of a median camera, is where frame 0 has it."""
+
 
 @dataclass(frozen=True)
 class SegmentTask:
@@ -144,8 +147,10 @@ def _run(
 
 
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
-    scene = base.scene()
-    displacements, velocities = dense(scene, start, step=base.position_step)
+    displacements, velocities = dense(base.scene(), start, step=base.position_step)
+    # Tracking is not as exact as that: what it moved by less has probably not moved, and keeps frame 0's bits.
+    least = LEAST_PIXELS / base.config.online.rounding.resolved().position_pixels * base.position_step
+    displacements[(displacements.abs() <= least).all(1)] = 0.0
 
     @cache
     def first_pictures() -> MultiViewFrame:

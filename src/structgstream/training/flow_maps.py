@@ -13,7 +13,13 @@ CONTEXT_PIXELS = 16
 
 
 def flow_map(
-    first: Tensor, second: Tensor, changed: Tensor, size: tuple[int, int], *, mask: Tensor | None = None
+    first: Tensor,
+    second: Tensor,
+    changed: Tensor,
+    size: tuple[int, int],
+    *,
+    mask: Tensor | None = None,
+    finest_level: int = 1,
 ) -> Tensor:
     """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
 
@@ -26,13 +32,14 @@ def flow_map(
         changed: ``[H, W]`` bool, where the two differ.
         size: h and w of the maps; flow is in pixels of the pictures.
         mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
+        finest_level: of the flow search's pyramid (``flow.dis_search``).
     """
     height, width = changed.shape
     maps = torch.zeros(height, width, 3)
     box = _box(changed)
     if box is not None:
         rows, columns = box
-        search = dis_search("capture", refined=False)
+        search = dis_search("capture", refined=False, finest_level=finest_level)
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
         forward, backward = search(earlier, later), search(later, earlier)
         confidence = consistency_mask(forward, backward).astype(np.float32)[..., None]

@@ -40,6 +40,7 @@ def detect_picture_changes(
     scale: float,
     backend: Backend,
     flow_from: Collection[int] = (),
+    finest_level: int = 1,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -54,6 +55,7 @@ def detect_picture_changes(
         scale: of the maps of flow, relative to the pictures.
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
+        finest_level: of the flow search's pyramid (``flow.dis_search``).
     """
     changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
@@ -69,7 +71,7 @@ def detect_picture_changes(
             changed = changed if both is None else changed & both
             small, flow = view.reduced(scale).camera, None
             if view.index in flow_from:
-                maps = flow_map(then, now, changed, (small.height, small.width), mask=both)
+                maps = flow_map(then, now, changed, (small.height, small.width), mask=both, finest_level=finest_level)
                 flow = torch.cat([maps, last.reduced(scale).colors], dim=-1)
             changes.append(PictureChange(changed, torch.equal(then, now), flow))
     return changes

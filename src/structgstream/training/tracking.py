@@ -2,8 +2,10 @@
 """Tracking: movers follow lifted flow through every frame, without an iteration.
 
 What carries a sequential run through large motion is its motion start (``motion_start``), not its iterations. Tracking
-is that alone, on reduced pictures of some of the cameras: the change gate, flow from the last pictures to these, and
-flow from the rendering to these, which bounds drift, because renderings do not forget what things look like.
+is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed, and sums of flow at
+a quarter of the size. Flow from the last pictures to these displaces the movers, then flow from the rendering to these,
+which bounds drift, because renderings do not forget what things look like. Gaussians are generated once a camera and
+frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,41 +16,38 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
+from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, detect_changes, segment_motion
-from structgstream.training.motion_start import MotionStartConfig, estimate_initial_motion, with_displacements
-from structgstream.training.partition import Partition
-from structgstream.training.picture_change import PictureChange
-from structgstream.training.residuals import ResidualFloor
+from structgstream.training.flow_maps import flow_map
+from structgstream.training.lifting import LiftConfig, lift_motion
+from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
+from structgstream.training.motion_start import with_displacements
+from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
+from structgstream.training.picture_change import PictureChange, detect_picture_changes
+from structgstream.training.residuals import apply_camera_color
 from structgstream.training.stopwatch import Stopwatch
-from structgstream.training.views import View, reduced, training_views
+from structgstream.training.trust import ViewChange, trusted_views
+from structgstream.training.views import View, area_mean, reduced, training_views
 
 
 @dataclass(frozen=True)
 class TrackConfig:
     """Tracking; not in the paper."""
 
-    scale: float = 0.5
+    scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
-    cameras: int = 12
-    """Largest number of cameras, chosen to be far from each other."""
-    picture_scale: float = 0.5
+    cameras: int = 14
+    """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
+    picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
+    finest_level: int = 1
+    """Of the flow search's pyramid: 0 is the size of these pictures, 1 half of it."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
-
-
-def spread_cameras(rig: CameraRig, count: int) -> tuple[str, ...]:
-    """``count`` (or all) training cameras of ``rig`` in its order, each next one the farthest from those before it."""
-    names = rig.training
-    centers = torch.stack([rig[name].center for name in names])
-    chosen = [int((centers - centers.mean(0)).norm(dim=1).argmin())]
-    distances = (centers - centers[chosen[0]]).norm(dim=1)
-    while len(chosen) < min(count, len(names)):
-        chosen.append(int(distances.argmax()))
-        distances = torch.minimum(distances, (centers - centers[chosen[-1]]).norm(dim=1))
-    return tuple(names[row] for row in sorted(chosen))
+    correct_every: int = 1
+    """Flow from the rendering in every frame of so many."""
 
 
 @dataclass(frozen=True)
@@ -56,66 +55,60 @@ class TrackPictures:
     """Reduced pictures of one frame.
 
     Args:
-        views: of the cameras that are tracked with.
-        changes: of each since the frame before, with flow; None without one.
+        index: of the frame.
+        views: of all cameras.
+        changes: by position in ``views``, of those that are tracked with: since the frame before, with flow.
     """
 
+    index: int
     views: list[View]
-    changes: list[PictureChange | None] | None
+    changes: Mapping[int, PictureChange] = field(default_factory=dict)
 
     @property
     def changed_share(self) -> float:
         """Mean share of pixels that changed since the frame before; 0 without one."""
-        shares = [float(change.changed.float().mean()) for change in self.changes or () if change is not None]
+        shares = [float(change.changed.float().mean()) for change in self.changes.values()]
         return sum(shares) / len(shares) if shares else 0.0
 
 
 @dataclass(frozen=True)
 class Tracker:
-    """Follows the movers of a scene; all pictures are reduced.
+    """Follows the movers of a scene.
 
     Args:
-        motion: thresholds of the change gate.
-        start: of the motion start.
-        prior: share of the last displacement that is expected again.
+        config: sizes and cameras.
+        motion: thresholds of the change gate, for pictures of the stream.
+        lift: of the fit of displacements.
         rig: of the stream, in the units of the scene.
         backend: the compute back-end.
     """
 
+    config: TrackConfig
     motion: MotionConfig
-    start: MotionStartConfig
-    prior: float
-    scale: float
+    lift: LiftConfig
     rig: CameraRig
     backend: Backend
 
-    @classmethod
-    def of(
-        cls, config: TrackConfig, motion: MotionConfig, start: MotionStartConfig, *, rig: CameraRig, backend: Backend
-    ) -> "Tracker":
-        """A tracker with the thresholds of a stream's online frames, for ``config.cameras`` of its cameras."""
-        # Distances in pixels and sums of pixels are of the stream's pictures, so that they shrink with these.
-        reach = max(1, round(motion.reach_pixels * config.scale))
-        gate = replace(
-            motion,
-            picture_scale=config.picture_scale,
-            reach_pixels=reach,
-            margin_pixels=max(4, round(motion.margin_pixels * config.scale)),
-            least_pixels=motion.least_pixels * config.scale**2,
-            moved_ease=1.0,
-        )
-        return cls(gate, replace(start, views=config.cameras), config.prior, config.scale, rig, backend)
-
-    def views(self, frame: MultiViewFrame) -> list[View]:
-        """The reduced pictures of ``frame``."""
-        return [reduced(view, self.scale) for view in training_views(frame, self.rig, self.backend.device)]
-
-    def pictures(self, frame: MultiViewFrame, before: Sequence[View]) -> TrackPictures:
+    def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
         """The reduced pictures of ``frame`` and what changed since those before, independent of the scene."""
-        views = self.views(frame)
-        every = {view.index for view in views}
-        changes = detect_changes(views, before, config=self.motion, backend=self.backend, flow_from=every)
-        return TrackPictures(views, changes)
+        views = [reduced(view, self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
+        if before is None:
+            return TrackPictures(frame.index, views)
+        stride = -(-len(views) // max(self.config.cameras, 2))
+        chosen = [n for n in range(len(views)) if n % stride == frame.index % stride]
+        taken = [views[n] for n in chosen]
+        found = detect_picture_changes(
+            taken,
+            before,
+            threshold=self.motion.change_threshold,
+            reach_pixels=max(1, round(self.motion.reach_pixels * self.config.scale)),
+            scale=self.config.picture_scale,
+            backend=self.backend,
+            flow_from=[view.index for view in taken],
+            finest_level=self.config.finest_level,
+        )
+        changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
+        return TrackPictures(frame.index, views, changes)
 
 
 @dataclass(frozen=True)
@@ -140,32 +133,128 @@ class Tracked:
         return cls(scene, torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions))
 
 
-def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures, floor: ResidualFloor | None) -> Tracked:
+def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tracked:
     """Where the movers of ``past`` are one frame later.
 
     Args:
         tracker: thresholds and cameras.
         past: one frame before.
         pictures: of this frame.
-        floor: residuals of frame 0 in such pictures, for ``motion.residual_threshold``.
     """
-    assert pictures.changes is not None, "frames after the first have a frame before"
-    watch, backend = Stopwatch(tracker.backend.device), tracker.backend
-    with watch.stage("find motion"):
-        found = segment_motion(
-            past.scene, pictures.views, pictures.changes, config=tracker.motion, backend=backend, floor=floor
-        )
-        partition = Partition.of(past.scene, found)
-        trusted = [pictures.views[number] for number in found.trusted]
-    with watch.stage("start motion"):
-        start = estimate_initial_motion(
-            partition,
-            trusted,
-            tracker.prior * past.velocities[found.movers],
-            config=tracker.start,
-            motion=tracker.motion,
-            backend=backend,
-        )
-    velocities = torch.zeros_like(past.velocities)
-    velocities[found.movers] = start.displacements
-    return Tracked(with_displacements(past.scene, velocities), velocities, watch.seconds, len(found.movers))
+    watch, velocities = Stopwatch(tracker.backend.device), torch.zeros_like(past.velocities)
+    scene = past.scene.with_folded_appearance()
+    with torch.no_grad():
+        with watch.stage("gate"):
+            seen = [_seen(tracker, scene, pictures.views[n], change) for n, change in pictures.changes.items()]
+            trusted = trusted_views([entry.change for entry in seen]) if seen else []
+            seen = [entry for entry, good in zip(seen, trusted, strict=True) if good]
+            if not seen:
+                return Tracked(past.scene, velocities, watch.seconds)
+            votes = torch.stack([entry.votes for entry in seen]).sum(0)
+            movers = (votes >= tracker.motion.least_views).nonzero()[:, 0]
+        with watch.stage("flow between pictures"):
+            views = [entry.view for entry in seen]
+            evidence = _evidence([entry.flows for entry in seen])
+            centers = mover_centers(scene, torch.stack([entry.coverage for entry in seen]).sum(0))
+            priors, lift = tracker.config.prior * past.velocities[movers], tracker.lift
+            found = lift_motion(
+                evidence.select(movers), centers[movers], priors, views, config=lift, backend=tracker.backend
+            )
+            velocities[movers] = found.displacements
+        if len(movers) and pictures.index % tracker.config.correct_every == 0:
+            with watch.stage("flow from the rendering"):
+                evidence = _evidence([_rendered_flow(tracker, scene, entry, velocities) for entry in seen])
+                again = lift_motion(
+                    evidence.select(movers),
+                    (centers + velocities)[movers],
+                    torch.zeros_like(priors),
+                    views,
+                    config=lift,
+                    backend=tracker.backend,
+                )
+                velocities[movers] += again.displacements
+    return Tracked(with_displacements(past.scene, velocities), velocities, watch.seconds, len(movers))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What one camera tells: its Gaussians in changed tiles, votes ``[E]``, coverage by id, and sums of flow."""
+
+    view: View
+    tiles: TileSelection
+    gaussians: Gaussians
+    votes: Tensor
+    coverage: Tensor
+    flows: Tensor
+    change: ViewChange
+
+
+def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> _Seen:
+    backend, motion = tracker.backend, tracker.motion
+    tiles = _changed_tiles(change.changed)
+    gaussians = scene.with_free_gaussians(scene.structured(view.camera, backend, tiles=tiles))
+    small = view.reduced(tracker.config.picture_scale)
+    size = (small.camera.height, small.camera.width)
+    inside = area_mean(_counting(tiles, view)[None, None].float(), size)[0, 0]
+    part = area_mean(change.changed[None, None].float(), size)[0, 0]
+    assert change.flow is not None, "estimated for all that are tracked with"
+    maps = torch.cat([inside[..., None], part[..., None], change.flow], dim=-1)
+    sums = gather_maps(gaussians, scene, small.camera, maps, backend) * _enlarged(tracker, view, size)
+    moved = sum_by_mover(sums, scene)
+    total, changed = moved[:, 0], moved[:, 1]
+    votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
+    share = float(change.changed.float().mean())
+    of_view = ViewChange(share, 0.0, identical=change.identical)
+    return _Seen(view, tiles, gaussians, votes, sums[:, 0], moved[:, [2, 3, 4, 0, 5, 6, 7]], of_view)
+
+
+def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tensor) -> Tensor:
+    """Sums ``[E, 7]`` of the flow from the rendering of the displaced movers to the picture."""
+    view, backend, gaussians = seen.view, tracker.backend, seen.gaussians
+    moved = replace(gaussians, means=gaussians.means + velocities[_movers_of(gaussians, scene)])
+    drawn = backend.rasterize(
+        moved, view.camera.viewport(moved.means), background=scene.background(view.camera), tiles=seen.tiles
+    )
+    image = apply_camera_color(drawn.image, scene.camera_color, view.index)
+    counting = _counting(seen.tiles, view)
+    # Outside the tiles nothing was drawn: there the picture replaces the rendering.
+    rendered = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    picture = torch.where(counting[..., None], rendered, view.image)
+    small = view.reduced(tracker.config.picture_scale)
+    size = (small.camera.height, small.camera.width)
+    level = tracker.config.finest_level
+    flow = flow_map(picture, view.image, counting, size, mask=counting, finest_level=level)
+    inside = area_mean(counting[None, None].float(), size)[0, 0]
+    maps = torch.cat([flow, inside[..., None], small.colors], dim=-1)
+    sums = gather_maps(moved, scene, small.camera, maps, backend) * _enlarged(tracker, view, size)
+    return sum_by_mover(sums, scene)
+
+
+def _movers_of(gaussians: Gaussians, scene: Scene) -> Tensor:
+    """Row of each Gaussian's mover (Note [Movers])."""
+    m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
+    return torch.where(gaussians.ids < m * k, gaussians.ids // k, gaussians.ids - m * k + m)
+
+
+def _evidence(sums: Sequence[Tensor]) -> MotionEvidence:
+    return flow_evidence(sums, least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS)
+
+
+def _enlarged(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
+    """Pixels of the stream's pictures for a pixel of the maps, so that thresholds mean what they mean there."""
+    return view.camera.height * view.camera.width / (size[0] * size[1]) / tracker.config.scale**2
+
+
+def _counting(tiles: TileSelection, view: View) -> Tensor:
+    """Mask ``[H, W]`` of the pixels in the tiles that count."""
+    return tiles.pixels() if view.mask is None else tiles.pixels() & view.mask
+
+
+def _changed_tiles(changed: Tensor) -> TileSelection:
+    """The tiles with changed pixels of the mask ``[H, W]``."""
+    height, width = changed.shape
+    rows, columns = tile_grid(width, height)
+    padded = changed.new_zeros(rows * TILE_PIXELS, columns * TILE_PIXELS)
+    padded[:height, :width] = changed
+    hit = padded.reshape(rows, TILE_PIXELS, columns, TILE_PIXELS).any(3).any(1)
+    return TileSelection(hit, width, height)

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Groups of the bundled clip in pictures of 80x60 pixels, made once for all tests."""
+
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+from backends import quickest_backend
+from small_presets import QUICK
+from structgstream.api import reconstruct
+from structgstream.data.clip import bundled_clip_path
+from structgstream.groups.base import GroupBase
+from structgstream.groups.pictures import open_for
+from structgstream.groups.track_pass import TrackOptions, track_capture
+from structgstream.groups.unit import SegmentTask, fit_segment
+from structgstream.training.group_start import GroupStartConfig
+from structgstream.training.tracking import TrackConfig
+
+FRAMES, LENGTH = 6, 2
+START = GroupStartConfig(iterations=6, rounds=2, births=50)
+OPTIONS = TrackOptions(LENGTH, tracking=TrackConfig(scale=1.0, cameras=9, picture_scale=1.0))
+CAPTURE = bundled_clip_path()
+
+
+@dataclass(frozen=True)
+class Made:
+    """A header, a track, and the segments of three groups."""
+
+    header: Path
+    track: Path
+    segments: list[Path]
+
+
+def track(path: Path, header: Path, *, options: TrackOptions = OPTIONS, stop_after: int = FRAMES) -> int:
+    """Tracks into ``path``, at most ``stop_after`` frames; returns how many."""
+    base = GroupBase.read(header)
+    source, count = open_for(base.header, CAPTURE, frames=FRAMES), 0
+    with closing(track_capture(path, source, base, options, quickest_backend())) as frames:
+        for count, _ in enumerate(frames, 1):
+            if count == stop_after:
+                break
+    return count
+
+
+def task(made: Made, first: int, *, end: int | None = None) -> SegmentTask:
+    """The group that begins at ``first``."""
+    return SegmentTask(CAPTURE, made.header, made.track, first, first + LENGTH if end is None else end, START)
+
+
+def fit(path: Path, group: SegmentTask, *, stop_after: int = FRAMES, overwrite: bool = False) -> int | None:
+    """Fits a group, at most ``stop_after`` frames; returns how many, None if it is finished."""
+    run = fit_segment(path, group, quickest_backend(), overwrite=overwrite)
+    if run is None:
+        return None
+    count = 0
+    with closing(run.reports) as reports:
+        for count, _ in enumerate(reports, 1):
+            if count == stop_after:
+                break
+    return count
+
+
+@cache
+def made() -> Made:
+    """All of it, in a folder of its own; not to be changed."""
+    folder = Path(mkdtemp(prefix="structgstream-groups-"))
+    header, path = folder / "header.sgs", folder / "track"
+    reconstruct(CAPTURE, header, preset=QUICK, scale=0.25, frames=1, backend=quickest_backend())
+    track(path, header)
+    found = Made(header, path, [folder / f"g{first}.sgs" for first in range(0, FRAMES, LENGTH)])
+    for number, segment in enumerate(found.segments):
+        fit(segment, task(found, number * LENGTH))
+    return found

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A group of frames is fitted into a segment, whatever interrupts it."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from backends import quickest_backend
+from clip_groups import CAPTURE, LENGTH, fit, made, task
+from small_presets import QUICK
+from structgstream.api import reconstruct
+from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
+from structgstream.groups import method
+from structgstream.groups.base import GroupBase
+from structgstream.groups.growing_file import GrowingFile, partial_path
+from structgstream.groups.segment_file import inspect_segment, open_segment
+from structgstream.groups.segment_sink import GroupSoFar
+from structgstream.scene.state import state_of
+
+
+def test_a_segment_is_finished_when_it_has_its_name() -> None:
+    for number, path in enumerate(made().segments):
+        facts = inspect_segment(path)
+        assert (facts.first, facts.end, facts.frames) == (number * LENGTH, (number + 1) * LENGTH, LENGTH)
+        assert facts.complete
+        assert not partial_path(path).exists()
+
+
+def test_a_finished_segment_is_left_as_it_is() -> None:
+    path = made().segments[1]
+    before = path.stat()
+    assert fit(path, task(made(), LENGTH)) is None
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+
+
+def test_interrupted_anywhere_it_is_the_same_file(tmp_path: Path) -> None:
+    whole = made().segments[1].read_bytes()
+    found = open_segment(made().segments[1])
+    path = tmp_path / "g.sgs"
+    for cut in (0, 10, found.entries[0][2] - 1, found.entries[0][2], found.entries[1][2] + 3, found.end, found.end + 9):
+        partial_path(path).write_bytes(whole[:cut])
+        done = sum(cut >= end for end in (found.entries[1][2], found.end))
+        assert fit(path, task(made(), LENGTH)) == LENGTH - done, cut
+        assert path.read_bytes() == whole, cut
+        path.unlink()
+
+
+def test_stopped_between_frames_it_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "g.sgs"
+    assert fit(path, task(made(), LENGTH), stop_after=1) == 1
+    assert not path.exists()
+    assert inspect_segment(partial_path(path)).frames == 1
+    assert fit(path, task(made(), LENGTH)) == 1
+    assert path.read_bytes() == made().segments[1].read_bytes()
+
+
+def test_a_flipped_byte_or_a_cut_end_is_repaired(tmp_path: Path) -> None:
+    whole, path = made().segments[1].read_bytes(), tmp_path / "g.sgs"
+    second = open_segment(made().segments[1]).entries[1][2]
+    for damaged in (
+        whole[: second + 20] + bytes([whole[second + 20] ^ 1]) + whole[second + 21 :],
+        whole[:-1] + b"?",
+        whole[:-3],
+        whole + b"more",
+    ):
+        path.write_bytes(damaged)
+        assert not inspect_segment(path).complete
+        fit(path, task(made(), LENGTH))
+        assert path.read_bytes() == whole
+
+
+def test_the_group_of_frame_0_is_that_of_any_stream(tmp_path: Path) -> None:
+    path = tmp_path / "a.sgs"
+    reconstruct(CAPTURE, path, preset=QUICK, scale=0.25, frames=LENGTH, backend=quickest_backend())
+    data, found = path.read_bytes(), open_segment(made().segments[0])
+    for number in range(LENGTH):
+        assert found.record(number) in data
+
+
+def test_what_does_not_move_keeps_the_bits_of_frame_0() -> None:
+    base = GroupBase.read(made().header)
+    found = open_segment(made().segments[2])
+    scene = GroupSoFar(base, 2 * LENGTH, [found.record(0)]).scene(2 * LENGTH)
+    first, then = state_of(base.scene()), state_of(scene)
+    still = (first["anchor_positions"] == then["anchor_positions"]).all(1)
+    assert 0.3 < still.float().mean() < 1.0
+    rows = (first["appearance"] == then["appearance"]).all(1) & still
+    assert rows.float().mean() > 0.2
+
+
+def test_another_group_is_not_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "g.sgs"
+    shutil.copy(made().segments[1], path)
+    with pytest.raises(ConfigError, match="another track and first and end"):
+        fit(path, task(made(), 2 * LENGTH))
+    with pytest.raises(ConfigError, match="another options"):
+        fit(path, replace(task(made(), LENGTH), start=replace(task(made(), 0).start, iterations=8)))
+    assert path.read_bytes() == made().segments[1].read_bytes()
+    assert fit(path, task(made(), 2 * LENGTH), overwrite=True) == LENGTH
+    assert path.read_bytes() == made().segments[2].read_bytes()
+
+
+def test_one_process_writes_a_segment(tmp_path: Path) -> None:
+    other = GrowingFile(tmp_path / "g.sgs")
+    with pytest.raises(StorageError, match="Another process writes"):
+        fit(tmp_path / "g.sgs", task(made(), LENGTH))
+    other.close()
+
+
+def test_ranges_that_are_none_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "g.sgs"
+    with pytest.raises(ConfigError, match="from 0 to before the end"):
+        fit(path, task(made(), 4, end=4))
+    with pytest.raises(ConfigError, match="needs a track"):
+        fit(path, replace(task(made(), 2), track=None))
+    with pytest.raises(StreamError, match="no start at frame 3"):
+        fit(path, task(made(), 3))
+    with pytest.raises(CaptureError, match="has 12 frames"):
+        fit(path, task(made(), 2, end=13))
+
+
+def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, real = [], method.fit_group_start
+
+    def short(*arguments, **options):
+        asked.append((options["start"].births, options["config"].start.views))
+        if len(asked) == 1:
+            raise OutOfMemoryError("to test")
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(method, "fit_group_start", short)
+    assert fit(tmp_path / "g.sgs", task(made(), LENGTH)) == LENGTH
+    assert [births for births, _ in asked] == [50, 12]
+    assert asked[1][1] == asked[0][1] // 2
+    assert '"lowered budgets": 1' in (tmp_path / "g.log.jsonl").read_text().splitlines()[0]
+
+    def none(*arguments, **options):
+        raise OutOfMemoryError("to test")
+
+    monkeypatch.setattr(method, "fit_group_start", none)
+    with pytest.raises(OutOfMemoryError):
+        fit(tmp_path / "h.sgs", task(made(), LENGTH))

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A far frame is fitted from frame 0 and tracked positions, in a world whose motion is known."""
+
+from dataclasses import replace
+
+import torch
+
+from backends import quickest_backend
+from structgstream.scene.state import state_of
+from structgstream.training.births import BirthConfig
+from structgstream.training.group_start import GroupStartConfig, fit_group_start
+from structgstream.training.motion import MotionConfig, detect_changes
+from structgstream.training.motion_start import MotionStartConfig
+from structgstream.training.online import OnlineConfig, OnlineRates
+from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
+from structgstream.training.residuals import residual_floor
+from structgstream.training.rounding import RoundingConfig
+from structgstream.training.views import training_views
+from worlds import World, moving_world, psnr, rendered
+
+SPEED, FRAME = 0.06, 4
+MOTION = MotionConfig(enabled=True, picture_scale=0.5, residual_threshold=0.05)
+CONFIG = OnlineConfig(
+    rates=OnlineRates(anchor_positions=1e-3),
+    motion=MOTION,
+    start=MotionStartConfig(enabled=True),
+    births=BirthConfig(enabled=True, picture_width=128),
+    patching=PatchingConfig(spawn="off", iteration=4),
+)
+START = GroupStartConfig(iterations=16, rounds=2, births=40)
+STEPS = {"anchor_positions": 0.004}
+
+
+def scenery(*, movers: int = 60, emerges_at: int | None = None) -> World:
+    made = moving_world(FRAME + 1, cameras=6, movers=movers, speed=SPEED, width=128, height=96, emerges_at=emerges_at)
+    step, anchors = STEPS["anchor_positions"], made.scene.anchors
+    on_grid = replace(anchors, positions=(anchors.positions / step).round() * step)  # As a decoded frame 0 is.
+    return replace(made, scene=replace(made.scene, anchors=on_grid))
+
+
+def fit(world: World, displacements: torch.Tensor, *, start: GroupStartConfig = START, config: OnlineConfig = CONFIG):
+    backend = quickest_backend()
+    first, views = (training_views(world.frames[t], world.rig, backend.device) for t in (0, FRAME))
+    return fit_group_start(
+        world.scene,
+        displacements,
+        views,
+        detect_changes(views, first, config=config.motion, backend=backend),
+        frame_index=FRAME,
+        config=config,
+        start=start,
+        backend=backend,
+        seed=1,
+        steps=STEPS,
+        floor=residual_floor(world.scene, first, scale=config.motion.picture_scale, backend=backend),
+    )
+
+
+def truth(world: World, movers: int = 60) -> torch.Tensor:
+    shift = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
+    shift[:movers, 0] = FRAME * SPEED
+    return shift
+
+
+def test_tracked_positions_and_two_rounds_reach_the_far_frame() -> None:
+    world = scenery()
+    picture = world.frames[FRAME].images["cam00"]  # Held out.
+    rough = truth(world) * 0.85
+    tracked = fit(world, rough)
+    jumped = fit(world, torch.zeros_like(rough))
+    assert (
+        psnr(rendered(tracked.scene, world, "cam00"), picture)
+        > psnr(rendered(jumped.scene, world, "cam00"), picture) + 2
+    )
+    assert tracked.iterations == 16
+    assert tracked.counts["corrected"] > 0
+
+
+def test_what_does_not_change_keeps_the_bits_of_frame_0() -> None:
+    world = scenery(movers=0)
+    found = fit(world, truth(world, 0))
+    before, after = state_of(world.scene), state_of(found.scene)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+def test_changes_are_priced_against_frame_0() -> None:
+    """With a price that forbids everything, anchors return to frame 0 although they begin elsewhere."""
+    world = scenery(movers=20)
+    dear = replace(CONFIG, rounding=RoundingConfig(rate_weight=50.0))
+    away = truth(world, 20) * 0.02  # Few bins.
+    cheap, paid = (fit(world, away, config=config).scene.anchors.positions for config in (CONFIG, dear))
+    first = world.scene.anchors.positions
+    assert (paid - first).abs().mean() < (cheap - first).abs().mean()
+
+
+def test_births_of_several_rounds_have_identities_of_their_own() -> None:
+    world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
+    none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
+    motion = MotionConfig(enabled=True, picture_scale=1.0)
+    config = replace(CONFIG, motion=motion, births=BirthConfig(enabled=True, least_hits=2))
+    found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
+    births = found.scene.free.births
+    assert len(births) > 0
+    assert len(births.unique()) == len(births)
+    assert (births // BIRTHS_PER_FRAME == FRAME).all()
+
+
+def test_it_is_repeatable() -> None:
+    world = scenery(movers=20)
+    one, other = (state_of(fit(world, truth(world, 20)).scene) for _ in range(2))
+    assert all(torch.equal(one[name], other[name]) for name in one)

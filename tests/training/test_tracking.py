@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Movers are followed through frames without an iteration, in a world whose motion is known."""
+
+from dataclasses import replace
+
+import torch
+
+from backends import quickest_backend
+from structgstream.training.lifting import LiftConfig
+from structgstream.training.motion import MotionConfig
+from structgstream.training.tracking import TrackConfig, Tracked, Tracker, track_frame
+from worlds import World, moving_world
+
+SPEED, FRAMES = 0.06, 5
+CONFIG = TrackConfig(scale=1.0, cameras=8, picture_scale=0.5)
+
+
+def world(*, speed: float = SPEED, movers: int = 60) -> World:
+    return moving_world(FRAMES, cameras=6, movers=movers, speed=speed, width=128, height=96)
+
+
+def tracker(scenery: World, config: TrackConfig = CONFIG) -> Tracker:
+    return Tracker(config, MotionConfig(enabled=True), LiftConfig(), scenery.rig, quickest_backend())
+
+
+def tracked(scenery: World, config: TrackConfig = CONFIG, *, frames: int = FRAMES) -> Tracked:
+    chosen, past = tracker(scenery, config), Tracked.at_rest(scenery.scene)
+    before = chosen.pictures(scenery.frames[0], None).views
+    for frame in scenery.frames[1:frames]:
+        pictures = chosen.pictures(frame, before)
+        before, past = pictures.views, track_frame(chosen, past, pictures)
+    return past
+
+
+def test_movers_are_followed_over_many_frames() -> None:
+    scenery = world()
+    found = tracked(scenery)
+    moved = (found.scene.anchors.positions - scenery.scene.anchors.positions)[:, 0].median()
+    assert abs(float(moved) - (FRAMES - 1) * SPEED) < 0.3 * (FRAMES - 1) * SPEED
+    assert abs(float(found.velocities[:, 0].median()) - SPEED) < 0.4 * SPEED
+    assert found.moved > 30
+
+
+def test_flow_from_the_rendering_corrects_drift() -> None:
+    scenery, errors = world(), []
+    truth = (FRAMES - 1) * SPEED
+    for every in (1, 1000):
+        found = tracked(scenery, replace(CONFIG, correct_every=every))
+        errors.append(
+            float(((found.scene.anchors.positions - scenery.scene.anchors.positions)[:, 0] - truth).abs().mean())
+        )
+    assert errors[0] < errors[1]
+
+
+def test_what_stands_still_keeps_its_bits() -> None:
+    scenery = world(speed=0.0)
+    found = tracked(scenery)
+    assert torch.equal(found.scene.anchors.positions, scenery.scene.anchors.positions)
+    assert (found.moved, float(found.velocities.abs().max())) == (0, 0.0)
+
+
+def test_cameras_are_taken_in_turn_and_the_change_is_told() -> None:
+    scenery = world()
+    chosen = tracker(scenery, replace(CONFIG, cameras=3))
+    first = chosen.pictures(scenery.frames[0], None)
+    assert (len(first.views), dict(first.changes), first.changed_share) == (5, {}, 0.0)
+    second, third = (
+        chosen.pictures(scenery.frames[t], chosen.pictures(scenery.frames[t - 1], None).views) for t in (1, 2)
+    )
+    assert (sorted(second.changes), sorted(third.changes)) == ([1, 3], [0, 2, 4])
+    assert second.changed_share > 0.05
+
+
+def test_a_frame_without_a_known_picture_moves_nothing() -> None:
+    scenery = world()
+    chosen = tracker(scenery)
+    nothing = chosen.pictures(scenery.frames[1], [])
+    found = track_frame(chosen, Tracked.at_rest(scenery.scene), nothing)
+    assert torch.equal(found.scene.anchors.positions, scenery.scene.anchors.positions)
