@@ -2,6 +2,7 @@
 """An S3 on this machine's loopback address that refuses every n-th request."""
 
 import itertools
+import logging
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -38,6 +39,7 @@ def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import make_server
 
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # Not a line for each request.
     application = Refusing(DomainDispatcherApplication(create_backend_app), every=0)
     server = make_server("127.0.0.1", 0, application, threaded=True)
     threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -23,7 +23,8 @@ COSTS = Costs(
     header_seconds=100.0,
     track_start_seconds=5.0,
     track_seconds=0.5,
-    start_seconds=10.0,
+    process_seconds=4.0,
+    first_seconds=6.0,
     frame_seconds=4.0,
     join_start_seconds=2.0,
     join_seconds=0.01,
@@ -37,10 +38,10 @@ WORK = Work(frames=60, group=20, key_interval=10)
 
 
 def test_one_worker_does_all_in_turn() -> None:
-    """Frame 0, then the track, then 10 + 19 * 4, 10 + 20 * 4 twice, then joining."""
+    """Frame 0, then the track, then 4 + 19 * 4, 4 + 6 + 20 * 4 twice, then joining."""
     found = estimate(COSTS, WORK, 1)
-    assert found.seconds == pytest.approx(100 + (5 + 30) + 86 + 90 + 90 + 2.6)
-    assert found.tail_seconds == pytest.approx(86 + 90 + 90)
+    assert found.seconds == pytest.approx(100 + (5 + 30) + 80 + 90 + 90 + 2.6)
+    assert found.tail_seconds == pytest.approx(80 + 90 + 90)
     assert (found.header_seconds, found.join_seconds) == (100.0, pytest.approx(2.6))
 
 

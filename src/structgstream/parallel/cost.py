@@ -22,7 +22,8 @@ class Costs:
         header_seconds: frame 0, with the start of its process.
         track_start_seconds: of the tracking pass, until its first frame.
         track_seconds: of a tracked frame.
-        start_seconds: of a group: process, header, and what its first frame takes longer than others.
+        process_seconds: of a group, until its first frame begins.
+        first_seconds: what the first frame of a group takes longer than others; not that of frame 0's group.
         frame_seconds: of a frame fitted after another.
         join_start_seconds: until joining begins.
         join_seconds: of a joined frame.
@@ -36,7 +37,8 @@ class Costs:
     header_seconds: float
     track_start_seconds: float
     track_seconds: float
-    start_seconds: float
+    process_seconds: float
+    first_seconds: float
     frame_seconds: float
     join_start_seconds: float
     join_seconds: float
@@ -128,8 +130,8 @@ def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
     first, end = 0, tracking
     for length in work.groups:
         tracked = begin if not first else begin + costs.track_start_seconds + (first + 1) * costs.track_seconds
-        fitted = length - 1 if not first else length  # Frame 0 is in the header.
-        done = max(heapq.heappop(free), tracked) + costs.start_seconds + fitted * costs.frame_seconds
+        fitting = length * costs.frame_seconds + (costs.first_seconds if first else -costs.frame_seconds)
+        done = max(heapq.heappop(free), tracked) + costs.process_seconds + fitting  # Frame 0 is in the header.
         heapq.heappush(free, done)
         end, first = max(end, done), first + length
     joining = _joining(costs, work)

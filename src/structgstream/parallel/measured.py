@@ -34,7 +34,7 @@ def measured_in(folder: Path) -> Measured:
     """The costs of the run whose parts are in ``folder``.
 
     A group's process takes longer than its frames: that time is counted as the start of every process, of the tracking
-    pass and of joining, too. What the first frame of a group takes longer than others is part of its start.
+    pass and of joining, too.
 
     Raises:
         ConfigError: there is no finished run, or none with a group that begins after frame 0.
@@ -60,7 +60,8 @@ def measured_in(folder: Path) -> Measured:
         header_seconds=header.seconds,
         track_start_seconds=_start(track, process),
         track_seconds=(track.seconds - _start(track, process)) / max(track.frames - 1, 1),
-        start_seconds=process + max(first_seconds - frame_seconds, 0.0),
+        process_seconds=process,
+        first_seconds=max(first_seconds - frame_seconds, 0.0),
         frame_seconds=frame_seconds,
         join_start_seconds=_start(join, process),
         join_seconds=(join.seconds - _start(join, process)) / join.frames,
