@@ -66,7 +66,7 @@ class GroupBase:
         """The configuration of the stream, which is that of every group.
 
         Raises:
-            ConfigError: it is of another version, or has no motion start, without which a group cannot begin.
+            ConfigError: it is of another version, or has no motion start, without which a group cannot begin, or has periods.
         """
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.start.enabled):
@@ -74,6 +74,10 @@ class GroupBase:
                 f"{self.name} was made with codec {config.codec} and motion start "
                 f"{'on' if config.online.start.enabled else 'off'}; groups need the codec compact and the motion "
                 "start, as the presets compact and fast have them."
+            )
+        if config.period.enabled:
+            raise ConfigError(
+                f"{self.name} may begin other periods, and groups share one header; make it without them."
             )
         return config
 

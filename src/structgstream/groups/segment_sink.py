@@ -8,7 +8,8 @@ from pathlib import Path
 from structgstream.codec.container.disk_room import check_room, free_bytes
 from structgstream.codec.container.index import INDEX_ENTRY, pack_index
 from structgstream.codec.container.payload import parse_packet
-from structgstream.codec.container.records import RecordType, packed, read_record
+from structgstream.codec.container.periods import Period
+from structgstream.codec.container.records import PREFIX, RecordType, packed, read_record
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import PacketInfo
@@ -49,6 +50,14 @@ class SegmentSink:
     def open(self, header: StreamHeader) -> int:
         """The header is there already."""
         return 0
+
+    def begin(self, header: StreamHeader) -> int:
+        """Groups share one header.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("A group cannot begin another period; leave out --period.")
 
     def write(self, packet: Packet) -> int:
         """Appends one packet; returns the bytes it took.
@@ -96,6 +105,14 @@ class GroupSoFar:
     def header(self) -> StreamHeader:
         """Of the stream."""
         return self.base.header
+
+    def header_of(self, index: int) -> StreamHeader:
+        """Of the stream: there is one period."""
+        return self.base.header
+
+    def period(self, index: int) -> Period:
+        """The only one."""
+        return Period(0, 0, PREFIX.size, len(self.base.init) - PREFIX.size)
 
     @property
     def packets(self) -> list[PacketInfo]:

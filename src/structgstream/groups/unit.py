@@ -10,7 +10,6 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.groups.base import GroupBase
-from structgstream.groups.codec import GroupCodec
 from structgstream.groups.growing_file import partial_path
 from structgstream.groups.method import GroupEntry, GroupMethod
 from structgstream.groups.pictures import fingerprint, open_for
@@ -137,7 +136,7 @@ def _run(
     return record(
         path,
         source,
-        _pipeline(base, method, identity.first),
+        _pipeline(base, method),
         backend,
         storage=lambda _: (sink, so_far),
         metadata=base.header.metadata,
@@ -159,9 +158,9 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
     return GroupEntry(start.frame, displacements, velocities, first_pictures)
 
 
-def _pipeline(base: GroupBase, method: GroupMethod, first: int) -> Pipeline[Scene, ResidualFloor | None]:
+def _pipeline(base: GroupBase, method: GroupMethod) -> Pipeline[Scene, ResidualFloor | None]:
     """The pipeline of the stream with the group's method."""
-    return replace(stream_pipeline(base.config), method=method, codec=GroupCodec(base.config, first))
+    return replace(stream_pipeline(base.config), method=method)
 
 
 def _remove(path: Path) -> None:
