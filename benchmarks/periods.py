@@ -44,9 +44,9 @@ FRAMES, CHANGE, KEY_EVERY = 12, 5, 4
 DEGREES = 70.0
 VARIANTS = {
     "none": PeriodConfig(),
-    "scene": PeriodConfig(residual=1.5, frames=2),
-    "scene-all": PeriodConfig(residual=1.5, frames=2, share=1.0),
-    "points": PeriodConfig(residual=1.5, frames=2, start="points"),
+    "scene": PeriodConfig(residual=1.5, frames=2, start="scene"),
+    "scene-all": PeriodConfig(residual=1.5, frames=2, start="scene", share=1.0),
+    "points": PeriodConfig(residual=1.5, frames=2),
     "seconds": PeriodConfig(seconds=8 / 30),
 }
 CASES = ("recoloured", "turned", "unchanged")

@@ -23,7 +23,9 @@ from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
 
 RIG = arc_rig(4, width=40, height=30)
-PERIODS = replace(QUICK, key_interval_seconds=0.1, period=PeriodConfig(seconds=0.7, residual=9.0, frames=2, share=0.5))
+PERIODS = replace(
+    QUICK, key_interval_seconds=0.1, period=PeriodConfig(seconds=0.7, residual=9.0, frames=2, start="scene", share=0.5)
+)
 """Another period begins with frame 3."""
 
 

@@ -32,9 +32,11 @@ CHANGE = 3
 """From this frame on the cameras see other colours."""
 INITIAL = replace(COMPACT_CONFIG.initial, iterations=60, schedule_iterations=60, coarse_iterations=20)
 BASE = replace(COMPACT_CONFIG, initial=INITIAL)
-SCHEDULED = replace(BASE, period=PeriodConfig(seconds=4 / 30, share=0.3), rate=RateConfig(target_mbits=0.5))
-BY_RESIDUAL = replace(BASE, period=PeriodConfig(residual=1.3, frames=2, share=0.5))
-ANEW = replace(BASE, period=PeriodConfig(residual=1.3, frames=2, start="points"))
+SCHEDULED = replace(
+    BASE, period=PeriodConfig(seconds=4 / 30, start="scene", share=0.3), rate=RateConfig(target_mbits=0.5)
+)
+BY_RESIDUAL = replace(BASE, period=PeriodConfig(residual=1.3, frames=2, start="scene", share=0.5))
+ANEW = replace(BASE, period=PeriodConfig(residual=1.3, frames=2))
 CONFIGS = {"scheduled": (SCHEDULED, [0, 4]), "residual": (BY_RESIDUAL, [0, 6]), "points": (ANEW, [0, 6])}
 
 

@@ -35,11 +35,14 @@ def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -
 def initial_points_of(
     source: FrameStream, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
 ) -> torch.Tensor:
-    """Normalised points ``[P, 3]`` of the capture, or estimated from ``frame``, after checking the poses."""
+    """Normalised points ``[P, 3]`` of the capture, or estimated from ``frame``, after checking the poses.
+
+    A capture's points are those of its beginning: where another period begins they are estimated.
+    """
     from structgstream.data.pose_check import check_poses
 
     check_poses(frame, source.rig)
-    given = source.points
+    given = source.points if frame.index == 0 else None
     if given is None:
         given = initial_points(frame, source.rig, config=config, seed=seed).positions
     return similarity.points(torch.from_numpy(given))

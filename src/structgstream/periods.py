@@ -30,8 +30,9 @@ class PeriodConfig:
     the period's first frame, such as 1.3. None: not by residual."""
     frames: int = 3
     """As many frames in a row, the last before the key frame, must exceed it."""
-    start: Literal["scene", "points"] = "scene"
-    """The first frame of a period is fitted from the decoded scene before it, or from initial points, as frame 0 is."""
+    start: Literal["points", "scene"] = "points"
+    """The first frame of a period is fitted from initial points, as frame 0 is, or from the decoded scene before it,
+    which takes less time and serves a scene that has changed in part."""
     share: float = 0.35
     """From the scene, this share of frame 0's iterations is made, the last ones of its schedule."""
 
