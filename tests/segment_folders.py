@@ -7,6 +7,7 @@ from pathlib import Path
 from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import PREFIX, RecordType, read_record, scan_records
 from structgstream.codec.packets import PacketKind
+from structgstream.codec.segments.group import part_of, segment_of
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     Edge,
@@ -16,8 +17,6 @@ from structgstream.codec.segments.manifest import (
     SegmentEntry,
     Window,
     init_name,
-    part_name,
-    segment_name,
     sha256_of,
 )
 from structgstream.codec.segments.manifest_json import manifest_to_json
@@ -59,8 +58,7 @@ class GrowingFolder:
         if packet.kind is PacketKind.KEY and parts:
             segments, parts = (*segments, self._segment(segments, parts)), ()
         data = self._stream[record.offset : record.end]
-        digest = sha256_of(data)
-        part = PartEntry(part_name(frame, digest), frame, 0, packet.kind, packet.pts_seconds, len(data), digest)
+        part = part_of(data, period=0)
         self._store.put(part.file, data)
         return self._publish(
             Manifest(
@@ -94,19 +92,7 @@ class GrowingFolder:
 
     def _segment(self, before: tuple[SegmentEntry, ...], parts: tuple[PartEntry, ...]) -> SegmentEntry:
         data = b"".join(self._store.get(part.file) for part in parts)
-        digest = sha256_of(data)
-        entry = SegmentEntry(
-            segment=len(before),
-            file=segment_name(len(before), digest),
-            period=0,
-            first_frame=parts[0].frame,
-            frames=len(parts),
-            pts_seconds=(parts[0].pts_seconds, parts[-1].pts_seconds),
-            bytes=len(data),
-            key_bytes=parts[0].bytes,
-            frame_bytes=tuple(part.bytes for part in parts),
-            sha256=digest,
-        )
+        entry = segment_of(parts, data, segment=len(before))
         self._store.put(entry.file, data)
         return entry
 

@@ -115,6 +115,26 @@ def test_what_may_not_be_read_or_written(
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.parametrize(
+    ("board", "said"),
+    [
+        ("7x5:50mm:DICT_9X9_1", "'DICT_9X9_1' is no dictionary of OpenCV's"),
+        ("13x8:50mm:DICT_4X4_50", "needs 52 markers, DICT_4X4_50 has 50"),
+        ("7x5", "A board is COLUMNSxROWS:SQUARE"),
+    ],
+)
+def test_a_board_that_cannot_be_is_told_before_anything_takes_time(
+    tmp_path: Path, board: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_room(tmp_path / "videos")
+    command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--calibration", "board"]
+    capsys.readouterr()
+    assert main([*command, "--board", board]) in (1, 2)
+    told = capsys.readouterr()
+    assert said in told.err
+    assert "synchronize" not in told.out
+
+
 def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_room(tmp_path / "videos")
     command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]

@@ -11,14 +11,12 @@ import numpy as np
 import pytest
 
 from pictures import decoded_picture
-from rigs import random_scene
 from segment_folders import GrowingFolder
-from streams import compact_header, moved, write_stream
+from streams import splat_stream
 from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.manifest import MANIFEST, Manifest, Window
 from structgstream.codec.segments.manifest_json import manifest_to_json
-from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
 from structgstream.server import preview_picture
 from structgstream.server.catalog import Catalog, ServedStream
@@ -27,11 +25,7 @@ from structgstream.server.preview_picture import main, picture, preview
 
 @pytest.fixture(scope="module")
 def stream() -> bytes:
-    """Seven frames of some splats, a key packet at every third."""
-    sink = MemorySink()
-    scenes = [moved(random_scene(60, seed=4), step) for step in range(7)]
-    write_stream(sink, scenes, header=compact_header(scenes[0]))
-    return sink.data
+    return splat_stream()
 
 
 def test_the_picture_is_of_the_middle_key_frame_of_a_finished_file(tmp_path: Path, stream: bytes) -> None:

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigs import random_scene
-from streams import compact_header, moved, write_stream
-from structgstream.codec.sinks import MemorySink
+from streams import splat_stream
 from structgstream.server import preview_picture, previews
 from structgstream.server.catalog import Catalog, ServedStream
 from structgstream.server.previews import AGAIN_SECONDS, MOST_PICTURE_BYTES, Previews, picture_in, rendered_apart
@@ -18,11 +16,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def stream() -> bytes:
-    """Seven frames of some splats, a key packet at every third."""
-    sink = MemorySink()
-    scenes = [moved(random_scene(60, seed=4), step) for step in range(7)]
-    write_stream(sink, scenes, header=compact_header(scenes[0]))
-    return sink.data
+    return splat_stream()
 
 
 class Maker:

@@ -51,6 +51,16 @@ def check_tone(method: str | Calibration, options: PrepareOptions) -> None:
         )
 
 
+def check_board(method: str | Calibration, options: PrepareOptions) -> None:
+    """
+    Raises:
+        ConfigError: a board whose markers OpenCV does not have.
+        MissingExtraError: cv2 is not installed.
+    """
+    if method == "board":
+        options.board.opencv_board()
+
+
 def check_enough(footage: Footage) -> None:
     """
     Raises:

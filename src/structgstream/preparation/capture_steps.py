@@ -69,7 +69,8 @@ class CaptureSteps:
             for entry in sorted((self.videos / MASKS).iterdir()):
                 bring(entry, self.capture / MASKS / entry.name, link=self.options.link)
         write_prepared(self.capture, content)
-        self.listener.end("bring", f"{len(content.cameras)} cameras by {self.options.link} link or copy")
+        how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
+        self.listener.end("bring", f"{len(content.cameras)} cameras by {how}")
 
     def near(self, content: PreparedCapture) -> PreparedCapture:
         """With the near plane from the points that pictures confirm."""
