@@ -4,7 +4,8 @@ from dataclasses import fields, is_dataclass
 
 import pytest
 
-from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_METHOD_PRESET, PRESETS, to_json
+from structgstream.errors import ConfigError
+from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_METHOD_PRESET, PRESETS, from_json, to_json
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -37,3 +38,16 @@ def test_schedules_fit_their_length(name: str) -> None:
     assert initial.growth.collect_from <= initial.growth.start < initial.growth.last(initial.iterations)
     assert all(at < initial.iterations for at in initial.growth.contribution_at)
     assert online.patching.iteration < online.iterations
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_configuration_comes_back_from_a_header(name: str) -> None:
+    assert from_json(json.loads(json.dumps(to_json(PRESETS[name])))) == PRESETS[name]
+
+
+def test_configurations_of_other_versions_are_refused() -> None:
+    values = to_json(PRESETS["compact"])
+    lacking = {name: value for name, value in values.items() if name != "rate"}
+    for other in (values | {"later": 1}, lacking, {"seed": 0}, {"method": "another"}):
+        with pytest.raises(ConfigError, match="another version"):
+            from_json(other)

@@ -40,9 +40,9 @@ class ReconstructGroup:
     """The segment to write."""
     track: Annotated[Path | None, tyro.conf.arg(metavar="TRACK", help_behavior_hint="")] = None
     """The track of the capture; may be left out for A = 0 only."""
-    iterations: int = 150
+    iterations: int = 225
     """Optimisation steps of the group's first frame."""
-    rounds: int = 2
+    rounds: int = 3
     """Rounds of flow, births and iterations of the group's first frame."""
     device: Device = "auto"
     """Compute back-end."""

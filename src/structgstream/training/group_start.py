@@ -34,9 +34,9 @@ from structgstream.training.views import View
 class GroupStartConfig:
     """The fit of a group's first frame; not in the paper."""
 
-    iterations: int = 150
+    iterations: int = 225
     """Optimisation steps of all rounds together."""
-    rounds: int = 2
+    rounds: int = 3
     """Rounds of flow, births and iterations."""
     flow_rounds: int = 2
     """Displacements by flow from the rendering to the pictures before the iterations of a round."""
