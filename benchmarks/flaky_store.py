@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 BUCKET = "parts"
@@ -34,7 +34,7 @@ class Refusing:
 
 @contextmanager
 def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
-    """The URL of an empty bucket, which this process and those that it begins find by their environment."""
+    """The URL of a bucket, which this process and those that it begins find by their environment."""
     import s3fs
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import make_server
@@ -54,7 +54,8 @@ def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
     os.environ.update(variables)
     try:
         s3fs.S3FileSystem.clear_instance_cache()  # Those of an earlier server go to its address.
-        s3fs.S3FileSystem().mkdir(BUCKET)
+        with suppress(FileExistsError):  # What moto holds outlives its server.
+            s3fs.S3FileSystem().mkdir(BUCKET)
         application.every = every
         yield f"s3://{BUCKET}/run", application
     finally:

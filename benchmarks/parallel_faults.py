@@ -7,7 +7,7 @@
 
 Every run must end with the bytes of one that nothing happened to. The commands are those of ``benchmarks/stand_in.py``,
 which write, lock and go on as the real ones do; ``--real`` takes the real ones, on the bundled clip with the preset
-tiny in groups of 4. Moments are drawn with a seed; where in a write they fall is not.
+tiny at a quarter of its size in groups of 4. Moments are drawn with a seed; where in a write they fall is not.
 """
 
 import argparse
@@ -60,7 +60,12 @@ def job_in(folder: Path, *, real: bool) -> Job:
     folder.mkdir(parents=True, exist_ok=True)
     if real:
         track = ("--groups", "4", "--odd")
-        unit = Unit(str(bundled_clip_path()), header=("--preset", "tiny"), track=track, device=("--device", "cpu"))
+        unit = Unit(
+            str(bundled_clip_path()),
+            header=("--preset", "tiny", "--scale", "0.25"),
+            track=track,
+            device=("--device", "cpu"),
+        )
     else:
         track = ("--groups", "4")
         unit = Unit("capture", 80, track=track, program=STAND_IN, starts=stand_in.starts, cut=stand_in.cut)

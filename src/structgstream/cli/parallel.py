@@ -31,6 +31,9 @@ class WorkerOptions:
     """Groups at a time. Default: one a GPU, or one a core. A cluster that is joined has its own number."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Threads of each. Default: its share of the cores; one on a cluster."""
+    track_threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Threads of the tracking pass, which all groups wait for; more than a worker's are borrowed from the others.
+    Default: as a worker."""
     address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")] = None
     """Head of the Ray cluster to join. Default: one that is begun here, for this run."""
 
@@ -159,6 +162,7 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
         capture.frames,
         (*header, *rest),
         tuple(track),
+        options.run.track_threads,
         ("--device", options.device),
     )
     return Job(unit, options.output.absolute(), int(options.device == "cuda" or gpus_of(options.device) > 0))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from structgstream.errors import StreamError
+from structgstream.executors.places import thread_environment
 from structgstream.executors.task import PYTHON, Task
 from structgstream.parallel.parts import Parts, group_name
 
@@ -65,6 +66,7 @@ class Unit:
         frames: of the stream; None for all.
         header: further words for ``reconstruct`` when it fits frame 0: preset, scale, held-out cameras.
         track: further words for ``track``: length of groups.
+        track_threads: of the tracking pass, which all groups wait for; None for those of its place.
         device: further words for all of them: which back-end computes.
         program: what the commands are given to.
         starts: reads a track.
@@ -75,6 +77,7 @@ class Unit:
     frames: int | None = None
     header: tuple[str, ...] = ()
     track: tuple[str, ...] = ()
+    track_threads: int | None = None
     device: tuple[str, ...] = ()
     program: tuple[str, ...] = PROGRAM
     starts: ReadsTrack = field(default=starts_in, compare=False)
@@ -89,7 +92,9 @@ class Unit:
         """The serial pass."""
         words = (*self.program, "track", self.capture, "--init", str(parts.header), "-o", str(parts.track))
         count = () if self.frames is None else ("--frames", str(self.frames))
-        return Task(TRACK, (*words, *count, *self.track, *self.device), str(parts.track), parts.log(TRACK))
+        command = (*words, *count, *self.track, *self.device)
+        variables = {} if self.track_threads is None else thread_environment(self.track_threads)
+        return Task(TRACK, command, str(parts.track), parts.log(TRACK), variables)
 
     def group_task(self, parts: Parts, first: int, end: int) -> Task:
         """A segment."""
