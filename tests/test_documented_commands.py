@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from structgstream.cli import app, options
+from structgstream.cli import app, group_run, options
 from structgstream.cli.app import COMMANDS, STUDIES
 
 ROOT = Path(__file__).parents[1]
@@ -105,9 +105,10 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         options.parse_options(kind, name, arguments=arguments)
         raise Parsed
 
-    for name, replaced in (("parse_known_options", known), ("parse_options", whole)):
-        if hasattr(module, name):
-            monkeypatch.setattr(module, name, replaced)
+    for home in (module, group_run):  # which reads the command line of a group of frames
+        for name, replaced in (("parse_known_options", known), ("parse_options", whole)):
+            if hasattr(home, name):
+                monkeypatch.setattr(home, name, replaced)
     module.main(arguments)
 
 
