@@ -13,9 +13,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
 
-from benchmarks.load import digests
 from benchmarks.load_players import Got, follow
 
 EVERY_SECONDS = 0.02
@@ -63,12 +61,8 @@ class Players:
             time.sleep(EVERY_SECONDS)
         return self._found
 
-    @staticmethod
-    def digest_of(folder: Path, frames: int) -> str | None:
-        """What is right for so many frames."""
-        return digests(folder).get(frames)
-
     def _read(self) -> None:
+        assert self._running.poll() in (None, 0), "the players fail"
         assert self._running.stdout is not None
         try:
             while data := os.read(self._running.stdout.fileno(), 1 << 16):
@@ -90,6 +84,9 @@ async def play(address: str, count: int) -> None:
     playing = [asyncio.create_task(follow(address, one, slow=False)) for one in all_got]
     told = -1
     while not all(task.done() for task in playing):
+        for task in playing:
+            if task.done():
+                task.result()  # raises what ended it
         least = min(one.frames for one in all_got)
         if least != told:
             told = least

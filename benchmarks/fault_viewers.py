@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.fault_players import Players
+from benchmarks.load import digests
 from benchmarks.load_fetch import free_port
 from benchmarks.load_trainer import renumbered
 from benchmarks.outside import chromium
@@ -32,7 +33,7 @@ from structgstream.codec.stored_segments import resume_segments
 
 PACE_SECONDS = 0.1
 NAME = "live"
-PATIENCE_SECONDS = 60.0
+PATIENCE_SECONDS = 300.0  # many programs may share the machine
 NUMBER = struct.Struct("<I")
 LISTEN = """(() => {
   const player = document.querySelector("structgstream-player");
@@ -97,7 +98,7 @@ class Trainer:
             _write(folder, sent, writing)
         os.close(writing)
         os.set_blocking(reading, False)
-        self._reading, self._reported = reading, -1
+        self._reading, self._reported, self._ended = reading, -1, False
 
     def reported(self) -> int:
         """The last frame that it reported as written; -1 without any."""
@@ -109,12 +110,35 @@ class Trainer:
         return self._reported
 
     def end(self, how: signal.Signals) -> int:
-        """Ends it; the last frame that it reported."""
+        """Ends it, if it has not been; the last frame that it reported."""
+        if self._ended:
+            return self._reported
+        self._ended = True
         os.kill(self._process, how)
         os.waitpid(self._process, 0)
         found = self.reported()
         os.close(self._reading)
         return found
+
+
+class Trainers:
+    """One trainer after the other."""
+
+    def __init__(self, folder: Path, sent: Sent) -> None:
+        self._folder, self._sent = folder, sent
+        self._one = Trainer(folder, sent)
+
+    def start(self) -> None:
+        """Another one goes on with the stream."""
+        self._one = Trainer(self._folder, self._sent)
+
+    def reported(self) -> int:
+        """The last frame that the present one reported."""
+        return self._one.reported()
+
+    def end(self, how: signal.Signals) -> int:
+        """Ends the present one; the last frame that it reported."""
+        return self._one.end(how)
 
 
 def _write(folder: Path, sent: Sent, writing: int) -> None:
@@ -196,22 +220,24 @@ class Page:
 
 
 @contextmanager
-def watched(folder: Path, sent: Sent, *, players: int, page: bool) -> Iterator[tuple[Server, Trainer, Players, Any]]:
+def watched(folder: Path, sent: Sent, *, players: int, page: bool) -> Iterator[tuple[Server, Trainers, Players, Any]]:
     """A trainer at work, a server, and who watches."""
     stream = folder / "streams" / NAME
     FolderStore(stream).prepare()
     with ExitStack() as stack:
-        trainer = Trainer(stream, sent)
+        trainers = Trainers(stream, sent)
+        stack.callback(trainers.end, signal.SIGKILL)
         wait_until(lambda: (stream / "manifest.json").exists())
         server = Server(folder / "streams")
         stack.callback(server.close)
         address = server.start()
         watching = stack.enter_context(Players(f"{address}streams/{NAME}/", players))
+        wait_until(lambda: watching.least_frames() > 0)
         shown = None
         if page:
             (folder / "browser").mkdir()
             shown = Page(stack.enter_context(chromium().opened_browser(folder / "browser")), address)
-        yield server, trainer, watching, shown
+        yield server, trainers, watching, shown
 
 
 def killed_servers(
@@ -219,16 +245,16 @@ def killed_servers(
 ) -> ViewerRow:
     """The server is killed at random moments, and started again after up to ``down_seconds``."""
     row, rng = ViewerRow("server", seed=seed, players=players), random.Random(f"server {seed}")
-    with watched(folder, sent, players=players, page=page) as (server, trainer, watching, shown):
+    with watched(folder, sent, players=players, page=page) as (server, trainers, watching, shown):
         for _ in range(kills):
             time.sleep(rng.uniform(0.0, 1.0))
             server.kill()
-            edge = trainer.reported()
+            edge = trainers.reported()
             time.sleep(rng.uniform(0.0, down_seconds))
             server.start()
             began = time.monotonic()
             _wait_for_viewers(row, began, edge, watching, shown)
-        finish(row, trainer, sent, watching, shown, folder)
+        finish(row, trainers, sent, watching, shown, folder)
     return row
 
 
@@ -236,15 +262,15 @@ def killed_trainers(sent: Sent, *, kills: int, seed: int, folder: Path, players:
     """The trainer is killed at random moments, and another goes on at once."""
     row, rng = ViewerRow("trainer", seed=seed, players=players), random.Random(f"trainer {seed}")
     stream = folder / "streams" / NAME
-    with watched(folder, sent, players=players, page=page) as (_, trainer, watching, shown):
+    with watched(folder, sent, players=players, page=page) as (_, trainers, watching, shown):
         for _ in range(kills):
             time.sleep(rng.uniform(0.05, 1.0))
-            reported = trainer.end(signal.SIGKILL)
+            reported = trainers.end(signal.SIGKILL)
             began, edge = time.monotonic(), edge_of(stream)
             row.reported_frames_lost += max(reported - edge, 0)
-            trainer = Trainer(stream, sent)
+            trainers.start()
             _wait_for_viewers(row, began, edge, watching, shown)
-        finish(row, trainer, sent, watching, shown, folder)
+        finish(row, trainers, sent, watching, shown, folder)
     return row
 
 
@@ -258,9 +284,9 @@ def _wait_for_viewers(row: ViewerRow, began: float, edge: int, watching: Players
         row.page_seconds_until_normal.append(time.monotonic() - began)
 
 
-def finish(row: ViewerRow, trainer: Trainer, sent: Sent, watching: Players, shown: Page | None, folder: Path) -> None:
+def finish(row: ViewerRow, trainers: Trainers, sent: Sent, watching: Players, shown: Page | None, folder: Path) -> None:
     """The stream ends; compares it with one that was never interrupted, and with what the viewers have."""
-    row.frames = trainer.end(signal.SIGTERM) + 1
+    row.frames = trainers.end(signal.SIGTERM) + 1
     sink = MemorySink()
     sink.open(sent.header)
     for index in range(row.frames):
@@ -270,7 +296,7 @@ def finish(row: ViewerRow, trainer: Trainer, sent: Sent, watching: Players, show
     row.reported_frames_lost += max(row.frames - 1 - edge_of(stream), 0)
     row.equal = content(stream, beside=folder) == sink.data
     found = watching.ended(PATIENCE_SECONDS)
-    right = watching.digest_of(stream, row.frames)
+    right = digests(stream).get(row.frames)
     row.exact = sum(one.frames == row.frames and one.digest == right and not one.wrong for one in found)
     row.broken = sum(one.broken for one in found)
     if shown is not None:
