@@ -36,7 +36,7 @@ class Refusing:
 def flaky_store(every: int) -> Iterator[tuple[str, Refusing]]:
     """The URL of a bucket, which this process and those that it begins find by their environment."""
     import s3fs
-    from moto.server import DomainDispatcherApplication, create_backend_app
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
     from werkzeug.serving import make_server
 
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # Not a line for each request.
