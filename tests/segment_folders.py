@@ -58,7 +58,7 @@ class GrowingFolder:
         if packet.kind is PacketKind.KEY and parts:
             segments, parts = (*segments, self._segment(segments, parts)), ()
         data = self._stream[record.offset : record.end]
-        part = part_of(data, period=0)
+        part = part_of(data)
         self._store.put(part.file, data)
         return self._publish(
             Manifest(
