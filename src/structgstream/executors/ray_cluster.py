@@ -61,7 +61,11 @@ class RayEngine:
         _protect(begins_one=options.address is None)
         self._ray = _imported()
         self._folder = tempfile.TemporaryDirectory(prefix="structgstream-ray-", ignore_cleanup_errors=True)
-        _join(self._ray, options, Path(self._folder.name))
+        try:
+            _join(self._ray, options, Path(self._folder.name))
+        except ConfigError:
+            self._folder.cleanup()
+            raise
         self._pending: dict[Any, tuple[str, float]] = {}
         self._counted = (-COUNT_SECONDS, 0)
 
