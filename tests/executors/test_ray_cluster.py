@@ -85,11 +85,15 @@ def ray(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
 
 
 def test_a_cluster_that_is_begun_here_has_a_token_and_nothing_that_tells_or_listens(ray: FakeRay) -> None:
-    RayEngine(RayOptions(None, workers=2, cores=3))
+    begun = RayEngine(RayOptions(None, workers=2, cores=3))
     assert os.environ["RAY_AUTH_MODE"] == "token"
     assert len(os.environ["RAY_AUTH_TOKEN"]) == 64
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert (ray.given["num_cpus"], ray.given["include_dashboard"]) == (6, False)
+    folder = Path(ray.given["_temp_dir"])
+    assert folder.is_dir()
+    begun.stop()
+    assert not folder.exists()
 
 
 def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRay) -> None:
@@ -134,8 +138,9 @@ def test_a_cluster_without_a_token_is_not_joined(ray: FakeRay, monkeypatch: pyte
     with pytest.raises(ConfigError, match="RAY_AUTH_MODE is 'disabled'"):
         RayEngine(RayOptions("head:6379"))
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(tmp_path)}
-    RayEngine(RayOptions("head:6379"))
+    joined = RayEngine(RayOptions("head:6379"))
     assert ray.given["address"] == "head:6379"
+    joined.stop()
 
 
 def test_a_cluster_that_refuses_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,6 +151,8 @@ def test_a_cluster_that_refuses_is_told(ray: FakeRay, monkeypatch: pytest.Monkey
     monkeypatch.setattr(ray, "init", refused)
     with pytest.raises(ConfigError, match=r"head:6379 cannot be joined \(Failed to connect\)"):
         RayEngine(RayOptions("head:6379"))
+    with pytest.raises(ConfigError, match=r"cannot be begun here \(Failed to connect\)"):
+        RayEngine(RayOptions())
 
 
 def test_an_old_ray_or_none_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:

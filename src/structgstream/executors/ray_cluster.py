@@ -60,7 +60,12 @@ class RayEngine:
         self._options = options
         _protect(begins_one=options.address is None)
         self._ray = _imported()
-        _join(self._ray, options)
+        self._folder = tempfile.TemporaryDirectory(prefix="structgstream-ray-", ignore_cleanup_errors=True)
+        try:
+            _join(self._ray, options, Path(self._folder.name))
+        except ConfigError:
+            self._folder.cleanup()
+            raise
         self._pending: dict[Any, tuple[str, float]] = {}
         self._counted = (-COUNT_SECONDS, 0)
 
@@ -119,6 +124,7 @@ class RayEngine:
             self._ray.wait(list(self._pending), num_returns=len(self._pending), timeout=10.0)
         self._pending.clear()
         self._ray.shutdown()
+        self._folder.cleanup()
 
 
 def _protect(*, begins_one: bool) -> None:
@@ -156,26 +162,26 @@ def _imported() -> Any:
     return ray
 
 
-def _join(ray: Any, options: RayOptions) -> None:
+def _join(ray: Any, options: RayOptions, folder: Path) -> None:
     """Joins the cluster, or begins one.
 
     Raises:
-        ConfigError: it is not reached, or refuses the token.
+        ConfigError: it is not reached, refuses the token, or does not begin.
     """
+    given: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if options.address is None:
-        ray.init(
-            num_cpus=options.workers * options.cores,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            log_to_driver=False,
-            logging_level="ERROR",
-            _temp_dir=tempfile.mkdtemp(prefix="structgstream-ray-"),
-        )
-        return
+        given |= {"num_cpus": options.workers * options.cores, "include_dashboard": False}
+        given |= {"object_store_memory": OBJECT_STORE_BYTES, "_temp_dir": str(folder)}
+    else:
+        given["address"] = options.address
     try:
-        ray.init(address=options.address, log_to_driver=False, logging_level="ERROR")
+        ray.init(**given)
     except Exception as error:  # Ray has its own, RuntimeError and ConnectionError for what all means one thing.
         reason = " ".join(str(error).split())[:300] or type(error).__name__
+        if options.address is None:
+            raise ConfigError(
+                f"A Ray cluster cannot be begun here ({reason}); try again when the machine does less."
+            ) from error
         raise ConfigError(
             f"The Ray cluster at {options.address} cannot be joined ({reason}); is its head running, and is the token "
             "the one that it was begun with?"
