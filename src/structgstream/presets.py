@@ -275,9 +275,6 @@ COMPACT = replace(
         rates=replace(
             MOTION.online.rates,
             anchor_positions=4e-4,
-            offset_scales=1e-2,
-            base_scales=1e-2,
-            appearance=4e-2,
             final_share=0.4,
         ),
         patching=replace(MOTION.online.patching, spawn="off"),
