@@ -39,8 +39,9 @@ def numbers_of(camera: Camera) -> dict[str, Any]:
 
 def outputs_of(scene: Scene, camera: Camera, backend: Backend, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Ids ``[n]`` of up to ``most`` structured Gaussians that are drawn, and what the MLPs say of them ``[n, 11]``."""
-    generated, _ = scene.structured(camera, backend)
-    drawn = draw(scene.dressed(generated), camera, backend).radii[: len(generated.ids)].nonzero()[:, 0]
+    structured = scene.structured(camera, backend)
+    generated = structured.gaussians
+    drawn = draw(scene.with_free_gaussians(structured), camera, backend).radii[: len(generated.ids)].nonzero()[:, 0]
     rows = drawn[:: max(1, -(-len(drawn) // most))]
     ids = generated.ids[rows]
     shares = generated.scales[rows] / scene.anchors.log_base_scales[ids // scene.anchors.offsets_per_anchor].exp()
