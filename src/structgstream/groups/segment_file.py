@@ -192,12 +192,16 @@ def _packets(data: ByteSource, offset: int, identity: SegmentIdentity) -> Iterat
 def _identity(note: Record, name: str) -> SegmentIdentity:
     try:
         text = json.loads(note.payload)
+        if not isinstance(text, dict):
+            raise ValueError("it is no object")
         if (text.pop("format"), text.pop("version")) != (FORMAT, VERSION):
             raise ValueError("another format or version")
         stated = text.pop("sha256")
         found = SegmentIdentity(**text)
         if found.sha256 != stated:
             raise ValueError("a note that contradicts itself")
+        if not (isinstance(found.first, int) and isinstance(found.end, int) and 0 <= found.first < found.end):
+            raise ValueError(f"frames {found.first} to before {found.end}")
         return found
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise StreamError(f"The note of the segment {name} does not follow the format ({error}).") from error

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writing a segment stops anywhere and goes on to the same bytes; what is there of another group is not taken."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from properties import examples
+from small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
+from streams import same
+from structgstream.codec.container import disk_room
+from structgstream.codec.packets import PacketKind
+from structgstream.errors import ConfigError, StorageError
+from structgstream.groups import segment_sink
+from structgstream.groups.growing_file import partial_path
+from structgstream.groups.segment_file import inspect_segment, open_segment
+from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_segment
+
+COUNT = END - FIRST
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The bytes of a finished segment."""
+    return write(tmp_path_factory.mktemp("whole") / "g.sgs", encoded()[0]).read_bytes()
+
+
+def go_on(path: Path) -> int:
+    """Writes what is missing of a segment; returns how many packets that were."""
+    found = resume_segment(path, base(), IDENTITY)
+    if found is not None and found.complete:
+        found.close()
+        return 0
+    done = 0 if found is None else len(found.entries)
+    sink = SegmentSink(path, base(), IDENTITY, found)
+    if found is not None:
+        found.close()
+    for packet in encoded()[0][done:]:
+        sink.write(packet)
+    sink.close()
+    return COUNT - done
+
+
+def test_a_segment_has_its_name_when_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "g.sgs"
+    for number in range(COUNT):
+        write(path, encoded()[0][:number])
+        assert not path.exists()
+        assert inspect_segment(partial_path(path)).frames == number
+    write(path, encoded()[0])
+    assert inspect_segment(path).complete
+    assert not partial_path(path).exists()
+
+
+def test_each_write_says_what_it_took(tmp_path: Path) -> None:
+    path = tmp_path / "g.sgs"
+    sink = SegmentSink(path, base(), IDENTITY, None)
+    assert sink.open(base().header) == 0
+    before = partial_path(path).stat().st_size
+    took = [sink.write(packet) for packet in encoded()[0]]
+    assert partial_path(path).stat().st_size - before == sum(took)
+    sink.close()
+    sink.close()
+    assert inspect_segment(path).complete
+
+
+def test_the_segment_of_frame_0_begins_with_it(tmp_path: Path) -> None:
+    path = write(tmp_path / "g.sgs", encoded(1, FIRST)[0], identity=FROM_FRAME_0)
+    found = open_segment(path)
+    assert (found.complete, found.record(0)) == (True, base().first)
+    found.close()
+
+
+def test_a_group_has_no_other_period(tmp_path: Path) -> None:
+    sink = SegmentSink(tmp_path / "g.sgs", base(), IDENTITY, None)
+    with pytest.raises(ConfigError, match="cannot begin another period; leave out --period"):
+        sink.begin(base().header)
+    sink.close()
+
+
+@examples(80)
+@given(st.data())
+def test_cut_and_flipped_anywhere_it_goes_on_to_the_same_bytes(
+    whole: bytes, tmp_path_factory: pytest.TempPathFactory, choice: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / "g.sgs"
+    data = bytearray(whole[: choice.draw(st.integers(0, len(whole)))])
+    if data and choice.draw(st.booleans()):
+        data[choice.draw(st.integers(0, len(data) - 1))] ^= 1 << choice.draw(st.integers(0, 7))
+    finished = choice.draw(st.booleans())
+    (path if finished else partial_path(path)).write_bytes(data)
+    go_on(path)
+    assert path.read_bytes() == whole
+    assert not partial_path(path).exists()
+
+
+def test_a_finished_segment_is_left(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "g.sgs"
+    path.write_bytes(whole)
+    before = path.stat()
+    assert go_on(path) == 0
+    assert (path.stat().st_mtime_ns, path.stat().st_ino) == (before.st_mtime_ns, before.st_ino)
+
+
+def test_nothing_is_gone_on_with_where_nothing_is(tmp_path: Path) -> None:
+    assert resume_segment(tmp_path / "g.sgs", base(), IDENTITY) is None
+    partial_path(tmp_path / "g.sgs").touch()
+    assert resume_segment(tmp_path / "g.sgs", base(), IDENTITY) is None
+
+
+def test_the_same_note_after_other_bytes_of_the_header_counts_as_nothing(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "g.sgs"
+    path.write_bytes(whole[:10] + bytes([1]) + whole[11:])  # Another minor version.
+    assert resume_segment(path, base(), IDENTITY) is None
+
+
+@pytest.mark.parametrize("finished", [False, True])
+@pytest.mark.parametrize(
+    ("other", "names"),
+    [
+        (replace(IDENTITY, track="another"), "track"),
+        (replace(IDENTITY, first=FIRST - 1, capture="another"), "capture and first"),
+        (replace(IDENTITY, options={"iterations": 7, "births": 50}), "options"),
+    ],
+)
+def test_another_group_is_refused_and_kept(
+    tmp_path: Path, whole: bytes, other: segment_sink.SegmentIdentity, names: str, *, finished: bool
+) -> None:
+    path = tmp_path / "g.sgs"
+    there = path if finished else partial_path(path)
+    there.write_bytes(whole if finished else whole[:-30])
+    message = rf"is a group of another {names}; give the same header, track, capture and options"
+    with pytest.raises(ConfigError, match=message):
+        resume_segment(path, base(), other)
+    assert there.read_bytes() == (whole if finished else whole[:-30])
+
+
+def test_a_nearly_full_disk_keeps_the_packets_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "g.sgs"
+    sink = SegmentSink(path, base(), IDENTITY, None)
+    sink.write(encoded()[0][0])
+    monkeypatch.setattr(segment_sink, "free_bytes", lambda where: 10)
+    assert disk_room.check_room is segment_sink.check_room
+    with pytest.raises(StorageError, match=r"g\.sgs\.partial"):
+        sink.write(encoded()[0][1])
+    sink.close()
+    assert inspect_segment(partial_path(path)).frames == 1
+
+
+def so_far(count: int) -> GroupSoFar:
+    with_records = []
+    for packet in encoded()[0][:count]:
+        kind = segment_sink._TYPES[packet.kind]
+        with_records.append(segment_sink.packed(kind, packet.payload))
+    return GroupSoFar(base(), FIRST, with_records)
+
+
+def test_a_session_sees_a_stream_that_has_come_to_the_group() -> None:
+    found = so_far(3)
+    assert (len(found), found.complete, found.header) == (FIRST + 3, False, base().header)
+    assert found.header_of(FIRST) is base().header
+    assert [(info.index, info.kind) for info in found.packets] == [
+        (FIRST, PacketKind.KEY),
+        (FIRST + 1, PacketKind.DELTA),
+        (FIRST + 2, PacketKind.KEY),
+    ]
+    assert [info.bytes for info in found.packets] == [len(record) for record in found.records]
+    assert len(so_far(0)) == FIRST
+    period = found.period(5)
+    assert (period.number, period.offset + period.bytes) == (0, len(base().init))
+
+
+def test_a_frame_needs_the_packets_from_its_key_on() -> None:
+    found = so_far(4)
+    needed = [[packet.index for packet in found.group(frame)] for frame in range(FIRST - 1, END)]
+    assert needed == [[0], [FIRST], [FIRST, FIRST + 1], [FIRST + 2], [FIRST + 2, FIRST + 3]]
+
+
+def test_frames_are_those_that_the_encoder_saw() -> None:
+    found = so_far(4)
+    for number, scene in enumerate(encoded()[1]):
+        assert same(found.scene(FIRST + number), scene)
+    assert same(found.scene(FIRST - 1), base().scene())
