@@ -39,7 +39,7 @@ def plot(run: Run, path: Path) -> None:
     figure = figure_of(8, 6)
     axes = figure.subplots(3, sharex=True)
     frames = [one for one in _shown(run) if one["frame"]]  # frame 0 takes ten times as long
-    begun = frames[0]["filmed"]
+    begun = run["frames"][0]["filmed"]
     minutes = [(one["filmed"] - begun) / 60 for one in frames]
     for color, stage in zip(COLORS, ("handed over", "written", "shown"), strict=False):
         axes[0].plot(minutes, [one[stage] for one in frames], color=color, linewidth=1, label=f"until {stage}")

@@ -92,7 +92,7 @@ def test_a_folder_is_continued_without_saying_what_it_is(
 def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, status, message in (
         (["-o", str(tmp_path / "a.sgs"), "--window", "9"], 2, "--window is for --sink segments"),
-        (["-o", str(tmp_path / "a"), "--sink", "segments", "--window", "0"], 2, "--window must be positive"),
+        (["-o", str(tmp_path / "a"), "--sink", "segments", "--window", "0"], 2, "--window must be a positive number"),
         (["-o", str(tmp_path)], 1, "or add --sink segments"),
     ):
         assert main(["reconstruct", CLIP, *arguments]) == status
