@@ -109,14 +109,14 @@ def run(options: argparse.Namespace) -> int:
         staging.bring_growing(name)
     command = words(tuple(word.replace(HERE, str(staging.folder)) for word in options.command))
     process = subprocess.Popen(command)
-    have = 0
+    have = dict.fromkeys(options.grows, 0)
     while True:
         try:
             status = process.wait(LOOK_SECONDS)
         except subprocess.TimeoutExpired:
             status = None
         for name in options.grows:
-            have = staging.take_piece(name, have)
+            have[name] = staging.take_piece(name, have[name])
         for name in options.early:
             staging.take(name)
         if status is not None:

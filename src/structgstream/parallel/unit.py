@@ -49,10 +49,11 @@ def cut_track(track: Path, first: int) -> bytes:
     from structgstream.groups.track_file import TrackWriter, open_track
 
     found = open_track(track)
+    start = found.start(first)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "start"
         writer = TrackWriter(path, found.head)
-        writer.write(found.start(first))
+        writer.write(start)
         writer.close()
         return partial_path(path).read_bytes()
 
@@ -123,7 +124,7 @@ def groups_of(track: Path) -> Groups | None:
     """
     path = groups_path(track)
     try:
-        text = path.read_text()
+        text = path.read_text(errors="replace")
     except OSError:
         return None
     if not text.endswith("\n"):
@@ -133,6 +134,6 @@ def groups_of(track: Path) -> Groups | None:
     except ValueError:
         raise StreamError(f"{path} has no groups, 'first:end' a line.") from None
     borders = [0, *(end for _, end in groups)]
-    if [first for first, _ in groups] != borders[:-1] or borders != sorted(set(borders)):
+    if not groups or [first for first, _ in groups] != borders[:-1] or borders != sorted(set(borders)):
         raise StreamError(f"The groups in {path} do not follow each other from frame 0 on.")
     return groups

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A command as a process: its ending, its output, and that nothing of it is left."""
+
+import os
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from properties import examples
+from sleepers import PATIENCE_SECONDS
+from structgstream.executors import process
+from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
+from structgstream.executors.task import PYTHON, TAIL_BYTES, Ending, Task
+
+
+def begun(*command: str, log: Path | None = None, **variables: str) -> CommandProcess:
+    """A running command whose place has ``variables``."""
+    return CommandProcess(Task("task", command, log=log, environment={"OURS": "task"}), environment=variables)
+
+
+def ending_of(running: CommandProcess, **given: int) -> Ending:
+    assert waited_for([running], PATIENCE_SECONDS)
+    ending = running.ended(**given)
+    assert ending is not None
+    return ending
+
+
+def test_while_it_runs_it_has_no_ending() -> None:
+    running = begun("sleep", "60")
+    assert running.ended() is None
+    assert not waited_for([running], 0.0)
+    os.kill(running.pid, signal.SIGKILL)
+    ending = ending_of(running, attempts=4)
+    assert (ending.name, ending.status, ending.attempts, ending.killed) == ("task", -signal.SIGKILL, 4, True)
+
+
+def test_its_ending_says_what_it_took() -> None:
+    begin = time.monotonic()
+    ending = ending_of(begun("sh", "-c", "echo said; echo wrong >&2; exit 5"))
+    assert (ending.status, ending.output) == (5, "said\nwrong\n")
+    assert 0 < ending.seconds <= time.monotonic() - begin
+    assert 2**18 < ending.peak_bytes < 2**32, "bytes, not kilobytes"
+
+
+def test_nothing_comes_in_and_the_tasks_own_variables_come_last() -> None:
+    ending = ending_of(begun("sh", "-c", "cat; echo $OURS $THEIRS $HOME", OURS="place", THEIRS="place"))
+    assert ending.output == f"task place {os.environ['HOME']}\n"
+
+
+def test_python_is_the_interpreter_here() -> None:
+    ending = ending_of(begun(PYTHON, "-c", "import sys; print(sys.executable)"))
+    assert ending.output == f"{sys.executable}\n"
+
+
+def test_its_descriptor_is_closed_when_it_has_ended() -> None:
+    running = begun("true")
+    ending_of(running)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(running.descriptor)
+
+
+def test_what_it_leaves_behind_ends_with_it() -> None:
+    ending = ending_of(begun("sh", "-c", "sleep 60 & echo $!"))
+    pid = int(ending.output)
+    end = time.monotonic() + PATIENCE_SECONDS
+    while alive(pid):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_asked_it_may_end_by_itself(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    running = begun("sh", "-c", "trap 'echo bye; exit 7' TERM; echo ready; while :; do sleep 0.01; done", log=log)
+    wait_for(log, "ready\n")
+    running.ask()
+    ending = ending_of(running)
+    assert ending.status == 7
+    assert ending.output.endswith("bye\n")
+
+
+def test_one_that_does_not_listen_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "ENDING_SECONDS", 0.2)
+    log = tmp_path / "log"
+    running = begun("sh", "-c", "trap '' TERM; echo ready; while :; do sleep 0.01; done", log=log)
+    wait_for(log, "ready\n")
+    running.stop()
+    assert not alive(running.pid)
+
+
+def wait_for(path: Path, text: str) -> None:
+    end = time.monotonic() + PATIENCE_SECONDS
+    while not (path.exists() and path.read_text() == text):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_the_first_of_several_is_waited_for() -> None:
+    slow, quick = begun("sleep", "60"), begun("true")
+    assert waited_for([slow, quick], PATIENCE_SECONDS)
+    assert slow.ended() is None
+    assert ending_of(quick).done
+    slow.stop()
+
+
+def test_a_log_is_made_with_its_folder_and_gone_on_with(tmp_path: Path) -> None:
+    log = tmp_path / "logs" / "deep" / "a.txt"
+    for number in range(2):
+        assert ending_of(begun("echo", str(number), log=log)).output == f"{number}\n"
+    assert log.read_text() == "0\n1\n"
+    with opened_log(log) as file:
+        assert file.tell() == 4
+
+
+def test_what_is_no_text_is_no_error() -> None:
+    ending = ending_of(begun("printf", "\\377\\376 end"))
+    assert ending.output == "�� end"
+
+
+@examples(100)
+@given(st.integers(0, 3 * TAIL_BYTES), st.integers(0, TAIL_BYTES))
+def test_a_tail_is_the_end_of_what_was_written_since(length: int, begin: int) -> None:
+    begin = min(begin, length)
+    data = bytes(97 + i % 26 for i in range(length))
+    with tempfile.TemporaryFile() as file:
+        file.write(data)
+        found = tail_of(file, begin)
+    assert found == data[begin:][-TAIL_BYTES:].decode()

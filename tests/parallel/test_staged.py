@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of a command come from a store and go to it, also while they grow, and after the command was killed."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from properties import examples
+from structgstream.parallel import object_folder, staged
+from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.staged import Staging, assembled, pieces_of
+
+
+@pytest.fixture(autouse=True)
+def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_folder, "FIRST_DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(staged, "LOOK_SECONDS", 0.01)
+    monkeypatch.setenv(staged.SCRATCH, str(tmp_path / "scratch"))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> ObjectFolder:
+    return ObjectFolder(f"file://{tmp_path / 'store'}")
+
+
+@pytest.fixture
+def staging(store: ObjectFolder, tmp_path: Path) -> Staging:
+    return Staging(store, tmp_path / "here")
+
+
+def run(store: ObjectFolder, script: str, *flags: str) -> int:
+    """The status of a command whose first word is the folder of this machine."""
+    words = ["--store", store.url, "--name", "task", *flags, "--", "sh", "-c", script, staged.HERE]
+    return staged.run(staged.parsed(words))
+
+
+def scratch(tmp_path: Path) -> list[Path]:
+    return [*(tmp_path / "scratch").iterdir()] if (tmp_path / "scratch").exists() else []
+
+
+def test_needs_are_brought_and_results_taken(store: ObjectFolder, tmp_path: Path) -> None:
+    store.write("in/a", b"content")
+    flags = ("--needs", "in/a", "--needs", "absent", "--gives", "out/b")
+    assert run(store, 'mkdir -p "$0/out" && tr a-z A-Z < "$0/in/a" > "$0/out/b" && [ ! -e "$0/absent" ]', *flags) == 0
+    assert store.read("out/b") == b"CONTENT"
+    assert not scratch(tmp_path)
+
+
+def test_what_a_failing_command_has_left_is_not_taken_and_stays_here(store: ObjectFolder, tmp_path: Path) -> None:
+    store.write("a", b"a")
+    flags = ("--needs", "a", "--gives", "b")
+    assert run(store, 'echo half > "$0/b"; exit 3', *flags) == 3
+    assert store.read("b") is None
+    # The next attempt finds it.
+    assert run(store, 'grep -q half "$0/b"', *flags) == 0
+    assert store.read("b") == b"half\n"
+    assert not scratch(tmp_path)
+
+
+def test_an_earlier_attempt_here_is_not_replaced_by_the_store(staging: Staging) -> None:
+    staging.store.write("a", b"store")
+    staging.bring("a")
+    assert (staging.folder / "a").read_bytes() == b"store"
+    (staging.folder / "a").write_bytes(b"further")
+    staging.bring("a")
+    assert (staging.folder / "a").read_bytes() == b"further"
+    assert [path.name for path in staging.folder.iterdir()] == ["a"]
+
+
+def test_a_result_of_before_is_brought_to_be_checked(store: ObjectFolder) -> None:
+    store.write("b", b"before\n")
+    assert run(store, 'grep -q before "$0/b"', "--gives", "b") == 0
+
+
+def test_early_files_are_there_before_the_end_and_growing_ones_piece_by_piece(
+    store: ObjectFolder, tmp_path: Path
+) -> None:
+    """The command waits for what the store has of its files, so that it would not end otherwise."""
+    pieces = tmp_path / "store" / pieces_of("t")
+    script = f"""
+echo groups > "$0/t.groups"; printf abc > "$0/t.partial"
+until [ -e "{tmp_path}/store/t.groups" ] && [ "$(ls "{pieces}" | wc -l)" = 1 ]; do sleep 0.01; done
+printf de >> "$0/t.partial"
+until [ "$(ls "{pieces}" | wc -l)" = 2 ]; do sleep 0.01; done
+printf f >> "$0/t.partial"; mv "$0/t.partial" "$0/t"
+"""
+    store.write("unused", b"")
+    assert run(store, script, "--early", "t.groups", "--grows", "t") == 0
+    assert store.names(pieces_of("t")) == [f"{pieces_of('t')}/{have:015d}" for have in (0, 3, 5)]
+    assert (assembled(store, "t"), assembled(store, "t", have=4), store.read("t")) == (b"abcdef", b"ef", b"abcdef")
+
+
+def test_two_files_may_grow(store: ObjectFolder) -> None:
+    script = 'printf aaaa > "$0/a.partial"; printf b > "$0/b.partial"; sleep 0.1; printf b >> "$0/b.partial"'
+    assert run(store, script, "--grows", "a", "--grows", "b") == 0
+    assert (assembled(store, "a"), assembled(store, "b")) == (b"aaaa", b"bb")
+
+
+def test_on_another_machine_a_growing_file_goes_on(store: ObjectFolder, staging: Staging) -> None:
+    store.write(f"{pieces_of('t')}/{0:015d}", b"abc")
+    store.write(f"{pieces_of('t')}/{3:015d}", b"de")
+    staging.bring_growing("t")
+    assert (staging.folder / "t.partial").read_bytes() == b"abcde"
+    (staging.folder / "t.partial").write_bytes(b"abcdef")
+    staging.bring_growing("t")
+    assert (staging.folder / "t.partial").read_bytes() == b"abcdef"
+
+
+def test_a_finished_file_is_not_one_that_grows(store: ObjectFolder, staging: Staging) -> None:
+    store.write(f"{pieces_of('t')}/{0:015d}", b"abc")
+    store.write("t", b"abcdef")
+    staging.bring_growing("t")
+    assert [path.name for path in staging.folder.iterdir()] == ["t"]
+
+
+@examples(80)
+@given(st.binary(max_size=40), st.data())
+def test_pieces_that_overlap_or_lack_others_give_the_beginning(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, choice: st.DataObject
+) -> None:
+    store = ObjectFolder(f"file://{tmp_path_factory.mktemp('store')}")
+    cuts = choice.draw(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=6))
+    there = set()
+    for begin, length in cuts:
+        name = f"{pieces_of('t')}/{begin:015d}"
+        if begin < len(data) and (store.read(name) or b"") < data[begin : begin + length]:
+            store.write(name, data[begin : begin + length])
+            there |= {*range(begin, min(begin + length, len(data)))}
+    have = choice.draw(st.integers(0, len(data)))
+    reached = next((i for i in range(have, len(data)) if i not in there), len(data))
+    assert assembled(store, "t", have=have) == data[have:reached]
+
+
+def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:
+    words = ["--store", store.url, "--name", "task", "--grows", "t", "--", "sh", "-c"]
+    script = 'printf abc > "$0/t.partial"; kill -9 $$'
+    done = subprocess.run(
+        [sys.executable, "-m", "structgstream.parallel.staged", *words, script, staged.HERE],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert assembled(store, "t") == b"abc", "what had grown is in the store"
+    assert len(scratch(tmp_path)) == 1, "and here, for the next attempt"
+
+
+def test_a_store_that_cannot_be_used_is_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["staged", "--store", "nonsense://a", "--name", "task", "--", "true"])
+    assert staged.main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith("structgstream: nonsense://a cannot be used as a store (")
+    assert error.count("\n") == 1
+
+
+def test_without_a_command_nothing_is_run(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        staged.parsed(["--store", "file:///a", "--name", "task"])
+    assert "command" in capsys.readouterr().err

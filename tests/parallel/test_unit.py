@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of a parallel run, which the programs understand, and what is read of a track while it grows."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from properties import examples
+from structgstream.cli.group_run import ReconstructGroup
+from structgstream.cli.join import Join
+from structgstream.cli.options import parse_options
+from structgstream.cli.track import Track
+from structgstream.errors import StreamError
+from structgstream.executors.task import PYTHON
+from structgstream.groups.growing_file import partial_path
+from structgstream.groups.track_file import TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.parallel.parts import Parts
+from structgstream.parallel.unit import Unit, cut_track, groups_of, groups_path, starts_in
+
+HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Parts:
+    return Parts(tmp_path / "parts")
+
+
+def unit(folder: Path, **given: object) -> Unit:
+    (folder / "capture").mkdir()
+    return Unit(str(folder / "capture"), device=("--device", "cpu"), **given)  # type: ignore[arg-type]
+
+
+def after(command: tuple[str, ...], word: str) -> list[str]:
+    """What ``structgstream WORD`` is given."""
+    assert command[:4] == (PYTHON, "-m", "structgstream", word)
+    return [*command[4:]]
+
+
+def test_the_tracking_pass_is_what_was_asked_for(tmp_path: Path, parts: Parts) -> None:
+    task = unit(tmp_path, frames=40, track=("--groups", "8", "--quiet")).track_task(parts)
+    parts.header.parent.mkdir(parents=True)
+    parts.header.touch()
+    found = parse_options(Track, "track", arguments=after(task.command, "track"))
+    assert (found.scene, found.init, found.output) == (tmp_path / "capture", parts.header, parts.track)
+    assert (found.frames, found.groups, found.quiet, found.device) == (40, 8, True, "cpu")
+    assert (task.name, task.result, task.log) == ("track", str(parts.track), parts.log("track"))
+    assert not task.environment
+
+
+def test_a_group_is_what_was_asked_for(tmp_path: Path, parts: Parts) -> None:
+    task = unit(tmp_path).group_task(parts, 8, 16)
+    parts.header.parent.mkdir(parents=True)
+    parts.header.touch()
+    found = parse_options(ReconstructGroup, "reconstruct", arguments=after(task.command, "reconstruct"))
+    assert (found.scene, found.init, found.track) == (tmp_path / "capture", parts.header, parts.track)
+    assert (found.frames, found.output, found.device) == ("8:16", parts.segment(8, 16), "cpu")
+    assert task.result == str(parts.segment(8, 16))
+
+
+def test_frame_0_may_be_resumed_and_all_segments_are_joined(tmp_path: Path, parts: Parts) -> None:
+    given_unit = unit(tmp_path, header=("--preset", "tiny"))
+    words = after(given_unit.header_task(parts).command, "reconstruct")
+    assert words == [
+        str(tmp_path / "capture"), "-o", str(parts.header), "--frames", "1", "--resume", "--preset", "tiny",
+        "--device", "cpu",
+    ]  # fmt: skip
+    task = given_unit.join_task(parts, [(0, 8), (8, 16)], tmp_path / "out.sgs")
+    found = parse_options(Join, "join", arguments=after(task.command, "join"))
+    assert found.segments == (parts.segment(0, 8), parts.segment(8, 16))
+    assert (found.output, found.overwrite) == (tmp_path / "out.sgs", True)
+
+
+def test_without_a_number_all_frames_are_tracked_with_as_many_threads_as_asked(tmp_path: Path, parts: Parts) -> None:
+    task = unit(tmp_path, track_threads=3).track_task(parts)
+    assert "--frames" not in task.command
+    assert task.environment["OMP_NUM_THREADS"] == "3"
+
+
+def start(frame: int) -> TrackStart:
+    movers = np.arange(0, 35, 5, dtype=np.int32)
+    steps = np.full((7, 3), frame, dtype=np.int32)
+    return TrackStart(frame, movers, steps, -steps, np.zeros(4, dtype=np.float32))
+
+
+@pytest.fixture
+def growing(tmp_path: Path) -> Path:
+    """A track of which two starts are there."""
+    writer = TrackWriter(tmp_path / "track", HEAD)
+    writer.write(start(4))
+    writer.write(start(8))
+    writer.close()
+    return tmp_path / "track"
+
+
+def test_the_starts_of_a_growing_track_are_those_that_are_whole(growing: Path) -> None:
+    assert [*starts_in(growing)] == [4, 8]
+    data = partial_path(growing).read_bytes()
+    partial_path(growing).write_bytes(data[:-1])
+    assert [*starts_in(growing)] == [4]
+    partial_path(growing).write_bytes(data[:5])
+    assert not starts_in(growing)
+    partial_path(growing).unlink()
+    assert not starts_in(growing)
+
+
+def test_a_group_gets_the_one_start_that_it_needs(growing: Path, tmp_path: Path) -> None:
+    before = partial_path(growing).read_bytes()
+    path = tmp_path / "one"
+    partial_path(path).write_bytes(cut_track(growing, 8))
+    found = open_track(path)
+    assert (found.starts, found.head) == ([8], HEAD)
+    assert found.start(8).packed() == open_track(growing).start(8).packed()
+    with pytest.raises(StreamError, match="no start at frame 12"):
+        cut_track(growing, 12)
+    assert partial_path(growing).read_bytes() == before
+
+
+@examples(60)
+@given(st.lists(st.integers(1, 90), min_size=1, max_size=9), st.data())
+def test_groups_come_back_and_those_that_do_not_follow_each_other_do_not(
+    tmp_path_factory: pytest.TempPathFactory, lengths: list[int], choice: st.DataObject
+) -> None:
+    track = tmp_path_factory.mktemp("groups") / "track"
+    borders = [0, *(sum(lengths[: i + 1]) for i in range(len(lengths)))]
+    groups = [*pairwise(borders)]
+    groups_path(track).write_text("".join(f"{first}:{end}\n" for first, end in groups))
+    assert groups_of(track) == groups
+    number = choice.draw(st.integers(0, len(groups) - 1))
+    shift = choice.draw(st.integers(1, 5))
+    first, end = groups[number]
+    wrong = choice.draw(st.sampled_from([(first + shift, end), (first - shift, end), (first, first)]))
+    groups[number] = wrong
+    groups_path(track).write_text("".join(f"{first}:{end}\n" for first, end in groups))
+    with pytest.raises(StreamError, match="do not follow each other from frame 0 on"):
+        groups_of(track)
+
+
+def test_undecided_groups_are_none(tmp_path: Path) -> None:
+    assert groups_of(tmp_path / "track") is None
+    for text in ("", "0:4", "0:4\n4:"):
+        groups_path(tmp_path / "track").write_text(text)
+        assert groups_of(tmp_path / "track") is None
+
+
+@pytest.mark.parametrize("text", [b"\n", b"four\n", b"0:4 4\n", b"0-4\n", b"\xff\xfe\n", b"0:4\n8:12\n", b"4:8\n"])
+def test_what_are_no_groups_is_told(tmp_path: Path, text: bytes) -> None:
+    groups_path(tmp_path / "track").write_bytes(text)
+    with pytest.raises(StreamError, match=r"track\.groups"):
+        groups_of(tmp_path / "track")
