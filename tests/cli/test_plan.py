@@ -90,13 +90,13 @@ def test_a_probe_is_a_short_run_with_the_same_options(
         return 0
 
     monkeypatch.setattr(app, "main", command)
-    words = ["-o", str(tmp_path / "probe"), "--preset", "tiny", "--held-out", "1", "--scale", "0.5"]
+    words = ["-o", str(tmp_path / "probe"), "--preset", "tiny", "--held-out", "cam01", "--scale", "0.5"]
     assert real(["plan", CLIP, *words, "--online.iterations", "9"]) == 0
     capsys.readouterr()
     (asked,) = given
     assert asked[:4] == ["parallel", CLIP, "-o", str(tmp_path / "probe" / "probe.sgs")]
     text = " ".join(asked)
-    for part in (f"--frames {plan.PROBE_FRAMES}", "--preset tiny", "--held-out 1", "--scale 0.5", "--workers 1"):
+    for part in (f"--frames {plan.PROBE_FRAMES}", "--preset tiny", "--held-out cam01", "--scale 0.5", "--workers 1"):
         assert part in text
     assert text.endswith("--online.iterations 9")
 

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A group's frames: which of them are fitted how, from what, and what happens once when memory is short."""
+
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from rigs import random_scene
+from structgstream.errors import ConfigError, OutOfMemoryError
+from structgstream.groups import method
+from structgstream.groups.method import GroupEntry, GroupMethod, lowered_budget, lowered_start
+from structgstream.pipeline import Past
+from structgstream.presets import TINY
+from structgstream.training.group_start import GroupStartConfig
+from structgstream.training.result import FitResult
+
+FIRST = 6
+SCENE = random_scene(5, free=2)
+START = GroupStartConfig(births=40)
+
+
+@dataclass
+class Usual:
+    """The method of any stream, and the fit of a group's start, which keep what they are asked for."""
+
+    asked: list[tuple[str, Any]] = field(default_factory=list)
+    fails: int = 0
+
+    def __call__(self, config: object) -> "Usual":
+        return self
+
+    def observe(self, frame: Any, before: Any, **options: Any) -> str:
+        self.asked.append(("observe", before))
+        return "as usual"
+
+    def next(self, past: Any, task: Any) -> Any:
+        return self._fit("next", past)
+
+    def start(self, scene: Any, displacements: Any, views: Any, changes: Any, **options: Any) -> Any:
+        return self._fit("start", SimpleNamespace(changes=changes, displacements=displacements, **options))
+
+    def _fit(self, kind: str, given: Any) -> Any:
+        self.asked.append((kind, given))
+        if self.fails:
+            self.fails -= 1
+            raise OutOfMemoryError("to test")
+        return FitResult(SCENE, 1, 30.0, moving=0, counts={"jumps": 2})
+
+
+@pytest.fixture
+def usual(monkeypatch: pytest.MonkeyPatch) -> Usual:
+    made = Usual()
+    monkeypatch.setattr(method, "StructGStream", made)
+    monkeypatch.setattr(method, "fit_group_start", made.start)
+    monkeypatch.setattr(method, "pictures_of", lambda frame, rig, **options: options)
+    return made
+
+
+def group(*, first: int | None = FIRST) -> GroupMethod:
+    rows = torch.arange(21, dtype=torch.float32).reshape(7, 3)
+    entry = None if first is None else GroupEntry(first, rows, 0.5 * rows, lambda: "frame 0")  # type: ignore[arg-type]
+    return GroupMethod(TINY, START, entry)
+
+
+def task(index: int) -> Any:
+    backend = SimpleNamespace(device=torch.device("cpu"))
+    pictures = SimpleNamespace(views=["a", "b"], changes=None)
+    frame = SimpleNamespace(index=index)
+    return SimpleNamespace(
+        frame=frame, pictures=pictures, backend=backend, seed=3, steps={}, on_step=None, pressure=0.0
+    )
+
+
+def test_frame_0_is_the_headers() -> None:
+    with pytest.raises(ConfigError, match="a header that has frame 0; give one with --init"):
+        group().first(task(0))
+
+
+def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual) -> None:
+    found = group().next(Past(SCENE, None), task(FIRST))
+    ((kind, given),) = usual.asked
+    assert (kind, given.frame_index, given.seed, given.start) == ("start", FIRST, 3, START)
+    assert torch.equal(given.displacements, torch.arange(21, dtype=torch.float32).reshape(7, 3))
+    assert given.changes == [None, None], "a change for each view"
+    assert found.counts == {"jumps": 2}
+
+
+def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(usual: Usual) -> None:
+    made = group()
+    for index in (FIRST + 1, FIRST + 2):
+        made.next(Past(SCENE, None), task(index))
+    (_, second), (_, third) = usual.asked
+    assert third.older is None
+    moved = SCENE.anchors.positions - second.older.anchors.positions
+    torch.testing.assert_close(moved, 0.5 * torch.arange(15, dtype=torch.float32).reshape(5, 3))
+    assert len(second.older.free) == 0
+    assert second.state is SCENE
+
+
+def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
+    made = group(first=None)
+    past = Past(SCENE, None)
+    for index in (1, 2):
+        made.next(past, task(index))
+    assert usual.asked == [("next", past)] * 2
+
+
+def test_the_first_frame_is_compared_with_frame_0_and_others_with_the_one_before(usual: Usual) -> None:
+    made, before = group(), object()
+    options: Any = {"rig": None, "backend": None}
+    found: Any = made.observe(task(FIRST).frame, before, **options)  # type: ignore[arg-type]
+    assert (found["before"], found["start"].enabled, found["motion"].full_every_frames) == ("frame 0", False, 0)
+    assert made.observe(task(FIRST + 1).frame, before, **options) == "as usual"  # type: ignore[arg-type]
+    assert usual.asked == [("observe", before)]
+
+
+@pytest.mark.parametrize("index", [FIRST, FIRST + 2])
+def test_short_memory_lowers_the_budget_once_and_is_told(
+    usual: Usual, index: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    made, usual.fails = group(), 1
+    found = made.next(Past(SCENE, None), task(index))
+    assert found.counts == {"jumps": 2, "lowered budgets": 1}
+    assert (made.lowered, made.start, made.config.online) == (True, lowered_start(START), lowered_budget(TINY.online))
+    assert f"Frame {index}: not enough memory." in caplog.text
+    assert made.next(Past(SCENE, None), task(index)).counts == {"jumps": 2}
+    usual.fails = 1
+    with pytest.raises(OutOfMemoryError):
+        made.next(Past(SCENE, None), task(index))
+    assert made.start == lowered_start(START)
+
+
+def test_lower_is_half_of_the_views_and_a_quarter_of_the_births() -> None:
+    online = TINY.online
+    wide = replace(online, start=replace(online.start, views=9), births=replace(online.births, most=100))
+    assert (lowered_budget(wide).start.views, lowered_budget(wide).births.most) == (4, 25)
+    two = replace(wide, start=replace(online.start, views=2))
+    assert lowered_budget(two).start.views == 2, "flow needs two"
+    assert lowered_start(START) == replace(START, births=10)
