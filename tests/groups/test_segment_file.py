@@ -159,7 +159,7 @@ def test_everything_that_decides_the_bytes_is_in_the_hash(change: dict, name: st
 
 
 def test_the_order_of_options_is_not() -> None:
-    turned = replace(IDENTITY, options=dict(reversed(IDENTITY.options.items())))
+    turned = replace(IDENTITY, options={name: IDENTITY.options[name] for name in reversed([*IDENTITY.options])})
     assert [*turned.options] != [*IDENTITY.options]
     assert (turned.sha256, turned.record()) == (IDENTITY.sha256, IDENTITY.record())
 
