@@ -102,7 +102,7 @@ def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(u
 
 def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
     made = group(first=None)
-    past = Past(SCENE, None)
+    past: Past[Any, Any] = Past(SCENE, None)
     for index in (1, 2):
         made.next(past, task(index))
     assert usual.asked == [("next", past)] * 2
