@@ -153,7 +153,7 @@ def _protect(*, begins_one: bool) -> None:
 
 def _imported() -> Any:
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports] -- an extra that tests do without
     except ModuleNotFoundError:
         raise MissingExtraError("ray", "cluster") from None
     if tuple(int(part) for part in ray.__version__.split(".")[:2]) < OLDEST:
