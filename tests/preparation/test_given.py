@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrations import truths, write_anipose, write_transforms
+from calibrations import WRITERS, truths, write_anipose, write_transforms
 from captures import small_rig, write_immersive, write_text_model
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
@@ -94,3 +94,16 @@ def test_a_pickle_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cameras.pkl").write_bytes(b"")
     with pytest.raises(CalibrationError, match="is a pickle"):
         find_calibration(tmp_path / "cameras.pkl")
+
+
+@pytest.mark.parametrize("tool", ["anipose", "multical", "cmu_panoptic", "kalibr", "qualisys"])
+def test_the_named_one_of_several_files_of_a_tool_is_taken(tool: str, tmp_path: Path) -> None:
+    """Each of the files could be the one, and another one comes first in the folder."""
+    files = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        file = WRITERS[tool](tmp_path / name, truths())
+        files.append(file.rename(tmp_path / f"{name}-{file.name}"))
+    for file in files:
+        found = demand_calibration(file)
+        assert found.where == file

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures with a calibration file of another tool beside pictures or videos."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,9 +24,9 @@ PICKLES = (".pickle", ".pkl")
 
 
 class Converter(NamedTuple):
-    """``find`` says which files of a folder are a tool's, ``read`` what cameras they hold."""
+    """``find`` gives the sets of files in a folder that are a tool's calibrations, ``read`` the cameras of one."""
 
-    find: Callable[[Path], tuple[Path, ...]]
+    find: Callable[[Path], Iterator[tuple[Path, ...]]]
     read: Callable[[tuple[Path, ...]], Calibration]
 
 
@@ -66,9 +66,9 @@ def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
         CalibrationError: a broken file, or one that only running it could read.
     """
     for converter in CONVERTERS:
-        files = converter.find(path)
-        if files and (file is None or file in files):
-            return converter.read(files)
+        for files in converter.find(path):
+            if file is None or file in files:
+                return converter.read(files)
     pickles = [pickle for pickle in _pickles(path) if file in (None, pickle)]
     if pickles:
         raise _refused(pickles[0])
@@ -83,7 +83,7 @@ def _refused(pickle: Path) -> CalibrationError:
 
 
 def _found(path: Path) -> tuple[Converter, tuple[Path, ...]] | None:
-    return next(((converter, files) for converter in CONVERTERS if (files := converter.find(path))), None)
+    return next(((converter, files) for converter in CONVERTERS for files in converter.find(path)), None)
 
 
 def _pickles(path: Path) -> list[Path]:

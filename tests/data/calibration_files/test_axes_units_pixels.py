@@ -19,7 +19,8 @@ WITHOUT_SIZE = ("zju_mocap", "openpose")
 
 def converted(tool: str, folder: Path) -> Calibration:
     module = import_module(f"structgstream.data.calibration_files.{MODULES.get(tool, tool)}")
-    files = module.find(folder)
+    found = module.find(folder)
+    files = found if isinstance(found, tuple) else next(found)
     assert files
     return module.read(files)
 
@@ -54,4 +55,4 @@ def test_a_folder_without_such_a_file(tool: str, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "config.yaml").write_text("a: 1\n")
     (tmp_path / "layout.xml").write_text("<html/>")
-    assert module.find(tmp_path) == ()
+    assert not [*module.find(tmp_path)]

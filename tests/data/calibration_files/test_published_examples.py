@@ -36,7 +36,7 @@ cam1:
   - [0.0, 0.0, 0.0, 1.0]
   resolution: [752, 480]
 """)
-    first, second = kalibr.read(kalibr.find(tmp_path)).cameras
+    first, second = kalibr.read(next(kalibr.find(tmp_path))).cameras
     assert (first.name, first.size, first.K[0, 2]) == ("cam0", (752, 480), 363.18)
     assert first.lens == RadialTangential(-0.27695497, 0.06712482, 0.00087538, 0.00011556)
     assert second.center[0] == pytest.approx(0.11, abs=1e-3)
@@ -44,10 +44,10 @@ cam1:
     for old, new in (("pinhole", "omni"), ("radtan", "fov")):
         (tmp_path / "camchain.yaml").write_text(text.replace(old, new))
         with pytest.raises(CalibrationError, match=rf"'cam0' of .*camchain\.yaml is of the model .*{new}"):
-            kalibr.read(kalibr.find(tmp_path))
+            kalibr.read(next(kalibr.find(tmp_path)))
     (tmp_path / "camchain.yaml").write_text("cam0: [\n")
     with pytest.raises(CalibrationError, match=r"camchain\.yaml cannot be read"):
-        kalibr.read(kalibr.find(tmp_path))
+        kalibr.read(next(kalibr.find(tmp_path)))
 
 
 def test_a_long_chain_keeps_its_order(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_multicals_format_page(tmp_path: Path) -> None:
     first = {"R": np.eye(3).tolist(), "T": [0.0, 0.0, 0.0]}
     content = {"cameras": {"cam1": camera, "cam2": camera}, "camera_poses": {"cam1": first, "cam2_to_cam1": pose}}
     (tmp_path / "calibration.json").write_text(json.dumps(content))
-    one, two = multical.read(multical.find(tmp_path)).cameras
+    one, two = multical.read(next(multical.find(tmp_path))).cameras
     assert one.size == (2000, 1500)
     assert one.K[:2, 2].tolist() == pytest.approx([986.18, 763.5])
     np.testing.assert_allclose(two.center, [0.05, 0, 0])
@@ -104,20 +104,20 @@ def test_qualisys_sensor_units(tmp_path: Path) -> None:
  tangentalDistortion1="0.000615" tangentalDistortion2="-0.000391"/>
 </camera></cameras></calibration>"""
     (tmp_path / "take.qca.txt").write_text(text)
-    (camera,) = qualisys.read(qualisys.find(tmp_path)).cameras
+    (camera,) = qualisys.read(next(qualisys.find(tmp_path))).cameras
     assert (camera.name, camera.size) == ("26580", (1920, 1088))
     assert camera.K[0, 0] == pytest.approx(1685.51, abs=0.01)
     assert camera.lens == RadialTangential(-0.04545, 0.139604, 0.000615, -0.000391)
     np.testing.assert_allclose(camera.center, [4.2633, 2.2838, 1.7943])
     (tmp_path / "take.qca.txt").write_text(text.replace('viewrotation="0"', 'viewrotation="90"'))
     with pytest.raises(CalibrationError, match=r"'26580' of .*turned by 90 degrees.*set the view rotation to 0"):
-        qualisys.read(qualisys.find(tmp_path))
+        qualisys.read(next(qualisys.find(tmp_path)))
     (tmp_path / "take.qca.txt").write_text(text.replace("<intrinsic ", "<optics "))
     with pytest.raises(CalibrationError, match="'26580' of .*no 'intrinsic'"):
-        qualisys.read(qualisys.find(tmp_path))
+        qualisys.read(next(qualisys.find(tmp_path)))
     (tmp_path / "take.qca.txt").write_text(text[:80])
     with pytest.raises(CalibrationError, match=r"take\.qca\.txt cannot be read"):
-        qualisys.read(qualisys.find(tmp_path))
+        qualisys.read(next(qualisys.find(tmp_path)))
 
 
 def test_marker_cameras_of_qualisys_are_no_cameras(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_zju_names_cameras_by_folder(tmp_path: Path) -> None:
     assert [camera.name for camera in found.cameras] == [f"Camera_B{number}/000000.jpg" for number in (1, 2, 3)]
     np.save(tmp_path / "annots.npy", np.array({"cams": {}}, dtype=object))
     with pytest.raises(CalibrationError, match=r"annots\.npy cannot be read \(no 'ims'\); expected a dictionary"):
-        zju_mocap.read(zju_mocap.find(tmp_path))
+        zju_mocap.read(next(zju_mocap.find(tmp_path)))
 
 
 def test_opencv_files_without_a_pose(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_opencv_files_without_a_pose(tmp_path: Path) -> None:
     file = tmp_path / "cam01.yml"
     file.write_text(file.read_text().replace("R: !!", "unknown: !!"))
     with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read \(no 'R or rvec or rotation'\)"):
-        opencv_cameras.read(opencv_cameras.find(tmp_path))
+        opencv_cameras.read(next(opencv_cameras.find(tmp_path)))
     file.write_text("%YAML:1.0\n---\na: [\n")
     with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read"):
-        opencv_cameras.read(opencv_cameras.find(tmp_path))
+        opencv_cameras.read(next(opencv_cameras.find(tmp_path)))

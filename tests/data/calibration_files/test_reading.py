@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.data.calibration_files import reading
-from structgstream.data.calibration_files.reading import each_camera, first_json_with, readable, reason
+from structgstream.data.calibration_files.reading import each_camera, json_files_with, readable, reason
 from structgstream.data.posed import PosedCamera
 from structgstream.errors import CalibrationError
 
@@ -56,13 +56,13 @@ def test_a_broken_entry_names_its_camera() -> None:
 
 
 def test_the_first_file_with_a_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert first_json_with(tmp_path, "cams") == ()
+    assert [*json_files_with(tmp_path, "cams")] == []
     (tmp_path / "a.json").write_text('{"cameras": "cams"')
     (tmp_path / "b.txt").write_text('{"cams": 1}')
     (tmp_path / "c.json").write_text(json.dumps({"cams": 1}))
     (tmp_path / "d.json").write_text(json.dumps({"cams": 1}))
-    assert first_json_with(tmp_path, "cams") == (tmp_path / "a.json",)
+    assert next(json_files_with(tmp_path, "cams")) == (tmp_path / "a.json",)
     (tmp_path / "a.json").unlink()
-    assert first_json_with(tmp_path, "cams") == (tmp_path / "c.json",)
+    assert next(json_files_with(tmp_path, "cams")) == (tmp_path / "c.json",)
     monkeypatch.setattr(reading, "LARGEST_BYTES", 5)
-    assert first_json_with(tmp_path, "cams") == ()
+    assert [*json_files_with(tmp_path, "cams")] == []

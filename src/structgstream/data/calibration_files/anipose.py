@@ -6,6 +6,7 @@ A table per camera with ``name``, ``size`` (width, height), ``matrix``, ``distor
 """
 
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,15 @@ from structgstream.data.posed import Calibration, PosedCamera, rigid
 EXPECTED = "a table per camera with name, size, matrix, distortions, rotation and translation, as aniposelib writes it"
 
 
-def find(folder: Path) -> tuple[Path, ...]:
-    """The first TOML file that has tables of cameras, or is named as if it had."""
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+    """The TOML files that have tables of cameras, or are named as if they had."""
     for file in sorted(folder.glob("*.toml")):
         try:
             if _tables(tomllib.loads(file.read_text())):
-                return (file,)
+                yield (file,)
         except (OSError, ValueError):
             if "calib" in file.stem.lower():
-                return (file,)
-    return ()
+                yield (file,)
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

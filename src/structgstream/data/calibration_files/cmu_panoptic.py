@@ -7,12 +7,13 @@
 """
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration_files.reading import each_camera, first_json_with, readable
+from structgstream.data.calibration_files.reading import each_camera, json_files_with, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
 
@@ -20,9 +21,9 @@ EXPECTED = "a list of cameras with name, type, resolution, K, distCoef, R and t,
 METRES = 0.01
 
 
-def find(folder: Path) -> tuple[Path, ...]:
-    """The first JSON file with such cameras."""
-    return first_json_with(folder, "distCoef")
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+    """The JSON files with such cameras."""
+    return json_files_with(folder, "distCoef")
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

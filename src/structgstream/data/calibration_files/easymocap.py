@@ -5,6 +5,7 @@
 ``Rot_`` (matrix) and ``T_``, world to camera.
 """
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,10 @@ INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 EXPECTED = "names, K_NAME and D_NAME in intri.yml, and R_NAME or Rot_NAME and T_NAME in extri.yml"
 
 
-def find(folder: Path) -> tuple[Path, ...]:
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
     """The two files, when the first is there."""
-    return (folder / INTRINSICS, folder / EXTRINSICS) if (folder / INTRINSICS).is_file() else ()
+    if (folder / INTRINSICS).is_file():
+        yield (folder / INTRINSICS, folder / EXTRINSICS)
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

@@ -4,6 +4,7 @@
 ``T_cn_cnm1`` maps the axes of the camera before to this one's; the world is the first camera. Metres.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,10 @@ EXPECTED = (
 )
 
 
-def find(folder: Path) -> tuple[Path, ...]:
-    """The first YAML file named as a chain of cameras."""
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+    """The YAML files named as a chain of cameras."""
     named = (file for file in sorted(folder.iterdir()) if file.suffix in (".yaml", ".yml") and "chain" in file.stem)
-    return tuple(named)[:1]
+    return ((file,) for file in named)
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

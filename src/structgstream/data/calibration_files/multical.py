@@ -6,7 +6,7 @@
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.calibration_files.reading import each_camera, first_json_with, readable
+from structgstream.data.calibration_files.reading import each_camera, json_files_with, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
 
 EXPECTED = "cameras with image_size, K and dist, and camera_poses with R and T, as multical writes it"
 
 
-def find(folder: Path) -> tuple[Path, ...]:
-    """The first JSON file with camera poses."""
-    return first_json_with(folder, "camera_poses")
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+    """The JSON files with camera poses."""
+    return json_files_with(folder, "camera_poses")
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

@@ -6,6 +6,7 @@ OpenPose: ``CameraMatrix`` (3x4, world to camera), ``Intrinsics``, ``Distortion`
 ``fisheye_model``.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,11 @@ DISTORTION = ("Distortion", "distortion_coefficients", "dist_coeffs", "distCoeff
 ROTATION, TRANSLATION = ("R", "rvec", "rotation"), ("T", "t", "tvec", "translation")
 
 
-def find(folder: Path) -> tuple[Path, ...]:
-    """Every such file of the folder."""
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+    """Every such file of the folder, together."""
     files = (file for file in sorted(folder.iterdir()) if file.suffix.lower() in (".xml", ".yml", ".yaml"))
-    return tuple(file for file in files if file.is_file() and is_storage(file))
+    if found := tuple(file for file in files if file.is_file() and is_storage(file)):
+        yield found
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

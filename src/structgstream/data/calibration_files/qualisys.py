@@ -7,6 +7,7 @@ without a unit.
 """
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,9 @@ SUBPIXELS = 64
 VIDEO_MODELS = ("video", "none")
 
 
-def find(folder: Path) -> tuple[Path, ...]:
-    """The first such file."""
-    return tuple(sorted(folder.glob("*.qca.txt")))[:1]
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+    """Such files, each alone."""
+    return ((file,) for file in sorted(folder.glob("*.qca.txt")))
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

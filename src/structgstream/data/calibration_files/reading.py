@@ -14,12 +14,11 @@ LARGEST_BYTES = 50_000_000  # of a file that is searched to recognise it
 BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError)
 
 
-def first_json_with(folder: Path, key: str) -> tuple[Path, ...]:
-    """The first JSON file of ``folder`` that contains the quoted ``key``, as a tuple of one; empty if there is none."""
+def json_files_with(folder: Path, key: str) -> Iterator[tuple[Path]]:
+    """The JSON files of ``folder`` that contain the quoted ``key``, each alone."""
     for file in sorted(folder.glob("*.json")):
         if file.stat().st_size < LARGEST_BYTES and f'"{key}"'.encode() in file.read_bytes():
-            return (file,)
-    return ()
+            yield (file,)
 
 
 @contextmanager

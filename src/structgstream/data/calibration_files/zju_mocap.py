@@ -6,6 +6,7 @@ else. ``cams`` holds lists ``K``, ``D`` (OpenCV's order), ``R`` and ``T``, world
 each instant, ``CAMERA/FRAME.jpg`` in the order of the cameras.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,11 @@ EXPECTED = "a dictionary with cams (lists K, D, R and T) and ims, as ZJU-MoCap h
 METRES = 0.001
 
 
-def find(folder: Path) -> tuple[Path, ...]:
+def find(folder: Path) -> Iterator[tuple[Path, ...]]:
     """``annots.npy``."""
     file = folder / "annots.npy"
-    return (file,) if file.is_file() else ()
+    if file.is_file():
+        yield (file,)
 
 
 def read(files: tuple[Path, ...]) -> Calibration:
