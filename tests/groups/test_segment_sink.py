@@ -105,6 +105,17 @@ def test_a_finished_segment_is_left(tmp_path: Path, whole: bytes) -> None:
     assert (path.stat().st_mtime_ns, path.stat().st_ino) == (before.st_mtime_ns, before.st_ino)
 
 
+def test_what_is_whole_but_was_killed_before_it_had_its_name_gets_it(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "g.sgs"
+    partial_path(path).write_bytes(whole)
+    found = resume_segment(path, base(), IDENTITY)
+    assert found is not None
+    assert found.complete
+    found.close()
+    assert path.read_bytes() == whole
+    assert not partial_path(path).exists()
+
+
 def test_nothing_is_gone_on_with_where_nothing_is(tmp_path: Path) -> None:
     assert resume_segment(tmp_path / "g.sgs", base(), IDENTITY) is None
     partial_path(tmp_path / "g.sgs").touch()

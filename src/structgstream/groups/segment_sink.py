@@ -159,12 +159,13 @@ def _packet(record: bytes) -> Packet:
 def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment | None:
     """What is there of a segment: the finished file, else the longest whole part of an unfinished one.
 
-    A finished file that is damaged becomes an unfinished one. A file that is damaged before its first packet counts as
+    A finished file that is damaged becomes an unfinished one, and an unfinished file in which nothing is missing gets
+    its name: a run may have been killed just before that. A file that is damaged before its first packet counts as
     nothing.
 
     Raises:
         ConfigError: what is there was fitted from something else.
-        StorageError: the damaged file cannot be renamed.
+        StorageError: a file cannot be renamed, or another process writes it.
     """
     if path.exists():
         found = _matching(path, base, identity)
@@ -173,7 +174,13 @@ def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Se
         if found is not None:
             found.close()
         path.replace(partial_path(path))
-    return _matching(partial_path(path), base, identity) if partial_path(path).exists() else None
+    found = _matching(partial_path(path), base, identity) if partial_path(path).exists() else None
+    if found is None or not found.complete:
+        return found
+    size = len(found.data)
+    found.close()
+    GrowingFile(path, keep=size).finish()
+    return open_segment(path)
 
 
 def _matching(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment | None:
