@@ -28,7 +28,7 @@ MODELS: dict[LensModel, str] = {
     "brown": "OPENCV",  # none of COLMAP's ends at k3, which is added after its models (bundle.py)
     "fisheye": "OPENCV_FISHEYE",
 }
-QUIET = 2  # COLMAP tells every step; errors of its own are raised anyway
+QUIET = 3  # COLMAP tells every step and every start that leads nowhere; what comes of it is told by who asked
 
 
 def pycolmap_module() -> ModuleType:

@@ -306,8 +306,9 @@ def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) ->
             f"that agree, in {len(groups)} groups ({'; '.join(', '.join(group) for group in groups[:4])}). Let "
             "neighbouring cameras see more of the same, take more instants, or film a board (structgstream board)."
         )
+    has = "has" if len(alone) == 1 else "have"
     return (
-        f"Too few cameras see anything in common: {listed(alone)} have no pair with enough matches that agree "
+        f"Too few cameras see anything in common: {listed(alone)} {has} no pair with enough matches that agree "
         f"({len(pairs)} of {len(matches)} pairs have). Let neighbouring cameras see more of the same, take more "
         "instants, or film a board (structgstream board)."
     )
