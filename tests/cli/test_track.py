@@ -16,9 +16,9 @@ from streams import header_for, small_scene, write_stream
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.groups import pictures, track_pass
-from structgstream.groups.growing_file import partial_path
 from structgstream.groups.track_file import TrackHead, TrackWriter
 from structgstream.presets import TINY, to_json
+from structgstream.whole_files import partial_path
 
 FRAMES = 12
 

@@ -16,10 +16,10 @@ from structgstream.cli.options import parse_options
 from structgstream.cli.track import Track
 from structgstream.errors import StreamError
 from structgstream.executors.task import PYTHON
-from structgstream.groups.growing_file import partial_path
 from structgstream.groups.track_file import TrackHead, TrackStart, TrackWriter, open_track
 from structgstream.parallel.parts import Parts
 from structgstream.parallel.unit import Unit, cut_track, groups_of, groups_path, starts_in
+from structgstream.whole_files import partial_path
 
 HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream plan``."""
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -116,6 +115,7 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
 
 
 def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured", console: Console) -> None:
+    from structgstream.evaluation.report import write_json
     from structgstream.parallel.cost import estimate, sequential_seconds, serial_seconds, stream_bytes, workers_for
 
     costs = found.costs
@@ -146,7 +146,7 @@ def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured
         facts |= {"sequential_seconds": alone, "serial_seconds": serial}
         facts["estimates"] = [{"machines": count, **asdict(each)} for count, each in estimates]
         facts["wanted"] = None if wanted is None else asdict(wanted)
-        options.json.write_text(json.dumps(facts, indent=1) + "\n")
+        write_json(options.json, facts)
 
 
 def _live(rate: float, fps: float) -> str:

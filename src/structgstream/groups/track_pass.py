@@ -18,7 +18,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.boundaries import equal_groups, quiet_groups
-from structgstream.groups.growing_file import partial_path, write_whole
+from structgstream.groups.growing_file import name_finished
 from structgstream.groups.pictures import fingerprint
 from structgstream.groups.segment_file import Segment
 from structgstream.groups.segment_sink import GroupSoFar
@@ -29,6 +29,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.training.motion_start import with_displacements
 from structgstream.training.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
+from structgstream.whole_files import partial_path, write_whole
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ def track_capture(
 ) -> Generator[TrackProgress, None, None]:
     """Tracks through ``source`` into the file ``path``; goes on where an interrupted pass has stopped.
 
-    The generator yields after each frame; a track that is finished yields nothing.
+    The generator yields after each frame; a track in which nothing is missing yields nothing, and gets its name if the
+    pass was killed just before that.
 
     Raises:
         ConfigError: ``path`` is another track.
@@ -104,6 +106,7 @@ def track_capture(
     )
     found = _existing(path, head)
     if found is not None and found.groups is not None:
+        _end(path, found.groups)
         return
     if not options.quiet:
         _write_groups(path, _groups(options, len(source), {}))
@@ -122,6 +125,14 @@ def track_capture(
         writer.finish(len(source), groups)
     finally:
         writer.close()
+
+
+def _end(path: Path, groups: list[tuple[int, int]]) -> None:
+    """Does what a pass that was killed after its last record did not come to."""
+    if not groups_path(path).exists():
+        _write_groups(path, groups)
+    if not path.exists():
+        name_finished(path)
 
 
 def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:

@@ -12,8 +12,9 @@ from structgstream.executors.local import LocalEngine
 from structgstream.executors.places import Place
 from structgstream.executors.task import Ending, Task
 from structgstream.parallel.exchange import Exchange, SharedFolder
-from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of, write_whole
+from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 from structgstream.parallel.unit import HEADER, JOIN, TRACK, Groups, Unit, groups_of, groups_path
+from structgstream.whole_files import write_whole
 
 POLL_SECONDS = 0.5
 LINES_TOLD = 6
