@@ -18,6 +18,6 @@ def examples(count: int) -> settings:
 
 
 def use_for_all() -> None:
-    """Makes a hundred examples what a property takes that does not say how many, with all else that holds for others."""
+    """Makes a hundred examples what a property takes that names no number, and all else what it is for others."""
     settings.register_profile("suite", parent=examples(100))
     settings.load_profile("suite")

@@ -65,9 +65,10 @@ def main(arguments: list[str]) -> None:
     from structgstream.cli.app import usage_errors
     from structgstream.groups.base import GroupBase
     from structgstream.groups.boundaries import check_length
+    from structgstream.groups.group_list import groups_path
     from structgstream.groups.pictures import open_for
     from structgstream.groups.segment_file import open_segment
-    from structgstream.groups.track_pass import TrackOptions, groups_path
+    from structgstream.groups.track_pass import TrackOptions
     from structgstream.kernels.backend import select_backend
     from structgstream.training.tracking import TrackConfig
     from structgstream.whole_files import partial_path

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Protocol
 
 from structgstream.executors.task import PYTHON, Task
+from structgstream.groups.group_list import groups_path
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import Parts
 from structgstream.parallel.pieces import last_pieces
 from structgstream.parallel.staged import HERE
-from structgstream.parallel.unit import CutsTrack, groups_path
+from structgstream.parallel.unit import CutsTrack
 from structgstream.whole_files import partial_path, write_whole
 
 STAGED = (PYTHON, "-m", "structgstream.parallel.staged")

@@ -21,10 +21,10 @@ from structgstream.data.prepared import (
     prepared_rig,
     write_prepared,
 )
+from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.data.tone import ToneCurve
-from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
 from structgstream.preparation.calibration.solved import SolvedCalibration
