@@ -127,8 +127,7 @@ def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured
         f"{source.name}: {work.frames} frames ({seconds:.1f} s of film) in {len(work.groups)} groups of {work.group}.",
         f"Measured on one worker: frame 0 {costs.header_seconds:.1f} s, tracking {costs.track_seconds:.2f} s a frame, "
         f"a group {costs.process_seconds + costs.first_seconds:.1f} s and {costs.frame_seconds:.2f} s a frame "
-        f"({found.groups} groups), memory "
-        f"{human_bytes(costs.worker_bytes)}.",
+        f"({found.groups} groups), memory {human_bytes(costs.worker_bytes)}.",
         f"One frame after the other: {_time(alone)}. Stream: {human_bytes(size)}, {size * 8e-6 / seconds:.2f} Mbit/s.",
     )
     _table(console, estimates)
