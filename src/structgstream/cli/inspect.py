@@ -12,6 +12,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import JsonPath, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def main(arguments: list[str]) -> None:
         console.print(part)
         console.print()
     if plot is not None:
-        console.print(f"Wrote {plot}", highlight=False, markup=False, soft_wrap=True)
+        say(console, f"Wrote {plot}")
 
 
 def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, Folder, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.cli.termination import Terminated, Termination
 
@@ -126,12 +127,10 @@ def _say(path: Path, frames: int, spent: float | None) -> None:
 
     groups = open_track(path).groups or []
     size = human_bytes(path.stat().st_size)
-    Console().print(
+    say(
+        Console(),
         f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
         + " ".join(f"{first}:{end}" for first, end in groups[:8])
         + (" ..." if len(groups) > 8 else "")
         + ("" if spent is None else f"; {spent:.2f} core-seconds a frame"),
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
     )

@@ -12,6 +12,7 @@ from structgstream.executors.places import thread_environment
 from structgstream.executors.task import PYTHON, Task
 from structgstream.groups.group_list import Groups
 from structgstream.parallel.parts import Parts, group_name
+from structgstream.whole_files import partial_path
 
 HEADER, TRACK, JOIN = "header", "track", "join"
 PROGRAM = (PYTHON, "-m", "structgstream")
@@ -45,7 +46,6 @@ def cut_track(track: Path, first: int) -> bytes:
     Raises:
         StreamError: there is none, or it is damaged.
     """
-    from structgstream.groups.growing_file import partial_path
     from structgstream.groups.track_file import TrackWriter, open_track
 
     found = open_track(track)
