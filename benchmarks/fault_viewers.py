@@ -26,7 +26,7 @@ from benchmarks.load_trainer import renumbered
 from benchmarks.outside import chromium
 from benchmarks.stream_writers import Sent, content, edge_of
 from structgstream.codec.packets import PacketSink
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink
 from structgstream.codec.stored_segments import resume_segments

@@ -14,10 +14,13 @@ from collections.abc import Iterator
 
 import pytest
 
+from properties import use_for_all
+
 
 def pytest_configure() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    use_for_all()
 
 
 @pytest.fixture(autouse=True)

@@ -15,3 +15,9 @@ THOROUGH = bool(os.environ.get("STRUCTGSTREAM_THOROUGH"))
 def examples(count: int) -> settings:
     """``count`` of them in a thorough run, and never fewer than eight; no single one is timed."""
     return settings(deadline=None, max_examples=count if THOROUGH else max(count // 4, 8), derandomize=not THOROUGH)
+
+
+def use_for_all() -> None:
+    """Makes a hundred examples what a property takes that names no number, and all else what it is for others."""
+    settings.register_profile("suite", parent=examples(100))
+    settings.load_profile("suite")

@@ -8,7 +8,8 @@ from pathlib import Path
 from streams import header_for, moved, small_scene
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.sinks import MemorySink
 from structgstream.codec.stored_segments import StoredSegments, resume_segments

@@ -54,7 +54,7 @@ def test_rates_stages_and_sizes_are_of_the_last_frames(tmp_path: Path) -> None:
     assert values["disk_free_bytes"] > 0
     assert values["stored_after_seconds"] == extras["run"]["stored_after_seconds"] == 4.0
     assert extras["run"]["live"]["skipped_sets"] == 5
-    assert not list(tmp_path.glob("*.part"))
+    assert not list(tmp_path.glob("*.partial"))
 
 
 def test_before_the_first_frame_and_of_a_recording_what_is_unknown_is_null(tmp_path: Path) -> None:
@@ -86,6 +86,6 @@ def test_how_a_run_ended_is_the_last_word(tmp_path: Path, error: type[BaseExcept
 
 
 def test_a_disk_that_is_full_does_not_end_the_run(tmp_path: Path) -> None:
-    (tmp_path / "x.metrics.json.part").mkdir()
+    (tmp_path / "x.metrics.json.partial").mkdir()
     RunMetrics(tmp_path / "x.sgs", fps=30.0).write()
     assert free_bytes(tmp_path / "not" / "yet" / "there") == pytest.approx(free_bytes(tmp_path), rel=0.2)

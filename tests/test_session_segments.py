@@ -9,7 +9,7 @@ import pytest
 from segment_streams import Hands, folder
 from small_presets import TINY_RIG
 from structgstream.codec.segments.archive import write_archive
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.codec.stored_segments import resume_segments

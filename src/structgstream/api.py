@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError

@@ -10,7 +10,8 @@ from typing import Any
 
 from structgstream.codec.packets import PacketSink
 from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.stored_segments import StoredSegments, resume_segments
 from structgstream.data.prefetch import read_ahead

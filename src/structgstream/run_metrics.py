@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from structgstream.data.live.status import LiveStatus
+from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport
 from structgstream.memory import resident_bytes
+from structgstream.whole_files import write_whole
 
 FORMAT, VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0
@@ -77,7 +79,7 @@ class RunMetrics:
         self._recent: deque[tuple[float, FrameReport]] = deque(maxlen=RECENT)
         self._arrived: deque[tuple[float, int]] = deque(maxlen=RECENT)
         self._bytes = 0
-        self._lock = threading.Lock()
+        self._lock, self._writing = threading.Lock(), threading.Lock()
 
     def frame(self, report: FrameReport) -> dict[str, Any]:
         """Takes a frame's report; what its line of the log gets besides, if the run is live."""
@@ -133,11 +135,9 @@ class RunMetrics:
 
     def write(self) -> None:
         """Writes the file. A full disk is not told here: the stream itself will."""
-        path = metrics_path(self._stream)
-        part = path.with_name(path.name + ".part")
-        with suppress(OSError):
-            part.write_text(json.dumps(self.values(), allow_nan=False) + "\n")
-            part.replace(path)
+        content = f"{json.dumps(self.values(), allow_nan=False)}\n".encode()
+        with self._writing, suppress(StorageError):
+            write_whole(metrics_path(self._stream), content, sync=False)
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -20,6 +20,13 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def quick_tiny() -> Iterator[None]:
+    """The preset tiny with few initial points, also for what a module makes once for all its tests."""
+    with few_points("tiny"):
+        yield
+
+
 @pytest.fixture
 def quick_presets() -> Iterator[None]:
     """Presets with few initial points."""

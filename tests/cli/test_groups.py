@@ -1,33 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Header, track, groups and joining by commands, as a shell loop gives them."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from backends import QUICKEST
-from small_presets import few_points
+from quick_streams import CLIP, QUARTER
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
-from structgstream.data.clip import bundled_clip_path
 
-CLIP = str(bundled_clip_path())
-QUICK = ["--scale", "0.25", "--preset", "tiny", "--device", QUICKEST, "--initial.iterations", "3"]
-QUICK += ["--online.iterations", "2", "--online.patching.iteration", "1", "--points.max-points", "1500"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_presets() -> Iterator[None]:
-    with few_points("tiny"):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_tiny")
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``header.sgs``, ``track``, and segments ``g0.sgs`` and ``g2.sgs``."""
     folder = tmp_path_factory.mktemp("groups")
-    assert main(["reconstruct", CLIP, "-o", str(folder / "header.sgs"), "--frames", "1", *QUICK]) == 0
+    assert main(["reconstruct", CLIP, "-o", str(folder / "header.sgs"), "--frames", "1", *QUARTER]) == 0
     assert main([*track(folder), "--groups", "2", "--odd", "--frames", "4"]) == 0
     for line in (folder / "track.groups").read_text().split():
         assert main(group(folder, line)) == 0

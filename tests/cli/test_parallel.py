@@ -1,43 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """``parallel`` on the bundled clip, and what it says when something is wrong."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from small_presets import few_points
+from quick_streams import CLIP, QUARTER, error_of
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
-from structgstream.data.clip import bundled_clip_path
 
-CLIP = str(bundled_clip_path())
-QUICK = ["--preset", "tiny", "--device", QUICKEST, "--scale", "0.25", "--initial.iterations", "3"]
-QUICK += ["--online.iterations", "2", "--online.patching.iteration", "1"]
 GROUPS = ["--frames", "5", "--groups", "2", "--odd", "--executor", "inline"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_presets() -> Iterator[None]:
-    with few_points("tiny"):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_tiny")
 
 
 @pytest.fixture(scope="module")
 def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five frames in groups of two, hardly trained."""
     path = tmp_path_factory.mktemp("parallel") / "clip.sgs"
-    assert main(["parallel", CLIP, "-o", str(path), *GROUPS, *QUICK]) == 0
+    assert main(["parallel", CLIP, "-o", str(path), *GROUPS, *QUARTER]) == 0
     return path
-
-
-def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
-    capsys.readouterr()
-    assert main(arguments) == status
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    return error
 
 
 def test_the_result_is_an_ordinary_stream(stream: Path) -> None:
@@ -54,7 +35,7 @@ def test_the_result_is_an_ordinary_stream(stream: Path) -> None:
 def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.stat().st_mtime_ns for path in stream.parent.rglob("*0*.sgs")}
     capsys.readouterr()
-    assert main(["parallel", CLIP, "-o", str(stream), *GROUPS, *QUICK]) == 0
+    assert main(["parallel", CLIP, "-o", str(stream), *GROUPS, *QUARTER]) == 0
     assert "groups: 3 of 3 groups done" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in stream.parent.rglob("*0*.sgs")} == before
 
@@ -68,7 +49,7 @@ def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.Capture
         (["--preset", "tny"], 2, "there is no preset 'tny'"),
         (["--online.iteration", "5"], 2, "--online.iterations"),
         (
-            ["--groups", "7", "--frames", "8", "--executor", "inline", *QUICK],
+            ["--groups", "7", "--frames", "8", "--executor", "inline", *QUARTER],
             1,
             "Groups of 7 frames cost a key packet each",
         ),

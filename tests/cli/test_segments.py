@@ -6,31 +6,21 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from backends import QUICKEST
+from quick_streams import CLIP, QUARTER
 from s3_emulator import BUCKET, emulator
-from small_presets import few_points
 from structgstream.cli import main, segment_options
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.cloud_store import CloudStore
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
-from structgstream.data.clip import bundled_clip_path
 
-CLIP = str(bundled_clip_path())
-QUICK = ["--scale", "0.25", "--preset", "tiny", "--device", QUICKEST, "--initial.iterations", "3"]
-QUICK += ["--online.iterations", "2", "--online.patching.iteration", "1", "--points.max-points", "1500"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick_presets() -> Iterator[None]:
-    with few_points("tiny"):
-        yield
+pytestmark = pytest.mark.usefixtures("quick_tiny")
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the same three frames as ``file.sgs`` and as ``segments``."""
     folder = tmp_path_factory.mktemp("made")
     for output, more in ((folder / "file.sgs", []), (folder / "segments", ["--sink", "segments", "--keep", "60"])):
-        assert main(["reconstruct", CLIP, "-o", str(output), "--frames", "3", *QUICK, *more]) == 0
+        assert main(["reconstruct", CLIP, "-o", str(output), "--frames", "3", *QUARTER, *more]) == 0
     return folder
 
 
@@ -77,7 +67,7 @@ def test_a_folder_is_continued_without_saying_what_it_is(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    common = ["reconstruct", CLIP, "-o", str(out), *QUICK]
+    common = ["reconstruct", CLIP, "-o", str(out), *QUARTER]
     assert main([*common, "--sink", "segments", "--frames", "2"]) == 0
     assert main([*common, "--frames", "3"]) == 1
     assert "out holds a stream; continue it with --resume" in capsys.readouterr().err
@@ -105,7 +95,9 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_sigterm_finishes_the_frame_and_closes_the_stream(tmp_path: Path) -> None:
     """Status 143; with --resume it goes on."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "structgstream", "reconstruct", CLIP, "-o", str(out), "--sink", "segments", *QUICK]
+    command = [sys.executable, "-m", "structgstream", "reconstruct", CLIP, *QUARTER, "-o", str(out)]
+    command += ["--sink", "segments"]
+    command += ["--points.max-points", "1500"]  # The fixture does not reach another process.
     process = subprocess.Popen([*command, "--frames", "12"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
     try:
         while not (out / "manifest.json").is_file() and process.poll() is None:
@@ -134,7 +126,8 @@ def test_publishing_to_s3(
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", options["secret"])
         monkeypatch.setattr(segment_options, "FINISH_SECONDS", 0.0)
         url = f"s3://{BUCKET}/out"
-        command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUICK, "--sink", "segments", "--publish", url]
+        command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUARTER]
+        command += ["--sink", "segments", "--publish", url]
         assert main(command) == 0
         monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
         assert main([*command, "--resume"]) == 0

@@ -16,9 +16,10 @@ from streams import header_for, small_scene, write_stream
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.groups import pictures, track_pass
-from structgstream.groups.growing_file import partial_path
+from structgstream.groups.group_list import groups_path
 from structgstream.groups.track_file import TrackHead, TrackWriter
 from structgstream.presets import TINY, to_json
+from structgstream.whole_files import partial_path
 
 FRAMES = 12
 
@@ -96,14 +97,14 @@ def test_overwrite_removes_what_is_there_and_nothing_else_does(
     tracks(monkeypatch, then=KeyboardInterrupt())
     path = tmp_path / "new" / "track"
     path.parent.mkdir()
-    there = (path, partial_path(path), track_pass.groups_path(path))
+    there = (path, partial_path(path), groups_path(path))
     for each in there:
         each.write_bytes(b"before")
     assert main([*words, "--cameras", "1"]) == 2
     assert all(each.read_bytes() == b"before" for each in there)
     assert main([*words, "--overwrite"]) == 130
     assert not path.exists()
-    assert not track_pass.groups_path(path).exists()
+    assert not groups_path(path).exists()
     assert partial_path(path).read_bytes() != b"before"
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from killed import folders_of_the_killed
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
 from structgstream.codec.container import disk_room
 from structgstream.codec.container.records import RecordType, scan_records
@@ -74,6 +75,31 @@ def test_writes_return_their_bytes_and_index_and_footer_point_at_them() -> None:
     assert (index.type, index.offset, index.end) == (RecordType.INDEX, offset, len(sink.data) - 16)
     entries = list(struct.iter_unpack("<IBQ", index.payload))
     assert entries == [(i, kind, sum(sizes[: i + 1])) for i, kind in enumerate((2, 3, 3, 2))]
+
+
+def test_killed_at_any_step_a_file_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    """Also when the run that goes on is killed: while it cuts off what is not whole, or the index."""
+    header, sent, whole = header_for(SCENES[0]), packets(), small_stream()
+
+    def go_on(folder: Path) -> None:
+        sink, found = FileSink.resume(folder / "a.sgs")
+        sink.open(header)
+        for packet in sent[0 if found is None else len(found) :]:
+            sink.write(packet)
+        sink.close()
+
+    first = folders_of_the_killed(tmp_path, go_on, begin=lambda folder: None)
+    lengths = sorted({path.stat().st_size for folder in first for path in folder.iterdir()})
+    assert len(lengths) == len(sent) + 3, "empty, header, each packet, index"
+    for left in (lengths[-1], lengths[-2], lengths[-2] - 1):  # with the index, without it, with a packet that is cut
+        (tmp_path / str(left)).mkdir()
+
+        def begin(folder: Path, left: int = left) -> None:
+            (folder / "a.sgs").write_bytes(whole[:left])
+
+        for folder in folders_of_the_killed(tmp_path / str(left), go_on, begin=begin):
+            go_on(folder)
+            assert (folder / "a.sgs").read_bytes() == whole
 
 
 def test_the_whole_file_is_there_after_each_write(tmp_path: Path) -> None:

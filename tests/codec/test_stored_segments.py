@@ -12,7 +12,7 @@ from streams import same
 from structgstream.codec.packet_table import LOST
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.stored_segments import StoredSegments, resume_segments
 
 SENT = packets(9)

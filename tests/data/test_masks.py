@@ -14,7 +14,8 @@ from structgstream.data.images import reduced_mask
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.masks import with_masks
 from structgstream.data.open import open_capture
-from structgstream.data.undistortion import Undistortion, rectilinear, undistort
+from structgstream.data.rectilinear import rectilinear
+from structgstream.data.undistortion import Undistortion, undistort
 from structgstream.data.wrappers import every_nth_frame
 from structgstream.errors import CaptureError
 

@@ -20,9 +20,9 @@ from structgstream.data.prepared import (
     read_prepared,
     write_prepared,
 )
+from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
 from structgstream.data.tone import ToneCurve
-from structgstream.data.undistortion import rectilinear
 from structgstream.errors import CalibrationError, CaptureError, StorageError
 
 LENSES = (Pinhole(), RadialTangential(k1=-0.1, k2=0.02, p1=0.001), Fisheye(k1=0.02), Pinhole())

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from killed import folders_of_the_killed
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_path, read_log
 
@@ -31,6 +32,15 @@ def test_a_cut_line_is_dropped_and_a_resumed_run_goes_on_after_it(tmp_path: Path
     append_log(stream, {"index": 2, "run": 2})
     assert [entry["run"] for entry in read_log(stream).values()] == [1, 1, 2]
     assert len(log_path(stream).read_text().splitlines()) == 3
+
+
+def test_killed_at_any_step_of_its_beginning_a_resumed_run_keeps_the_lines(tmp_path: Path) -> None:
+    def begin(folder: Path) -> None:
+        for index in range(4):
+            append_log(folder / "ball.sgs", {"index": index})
+
+    resumed = folders_of_the_killed(tmp_path, lambda folder: begin_log(folder / "ball.sgs", frames=3), begin=begin)
+    assert all([*read_log(folder / "ball.sgs")][:3] == [0, 1, 2] for folder in resumed)
 
 
 def test_a_new_run_forgets_the_old_one(tmp_path: Path) -> None:

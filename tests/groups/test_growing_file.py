@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that have their name only when they are whole."""
 
+import os
 from pathlib import Path
 
 import pytest
 
+from killed import folders_of_the_killed
 from structgstream.errors import StorageError
-from structgstream.groups.growing_file import GrowingFile, partial_path, whole_file, write_whole
+from structgstream.groups.growing_file import GrowingFile, name_finished
+from structgstream.whole_files import partial_path
 
 
 def test_it_grows_under_another_name_and_goes_on(tmp_path: Path) -> None:
@@ -38,13 +41,42 @@ def test_a_file_that_has_become_shorter_is_not_continued(tmp_path: Path) -> None
         GrowingFile(tmp_path / "a", keep=5)
 
 
-def test_a_whole_file_is_written_or_not(tmp_path: Path) -> None:
+def test_killed_at_any_step_of_finishing_nothing_is_lost_and_it_can_be_finished(tmp_path: Path) -> None:
+    def begin(folder: Path) -> None:
+        partial_path(folder / "a").write_bytes(b"one")
+
+    def finish(folder: Path) -> None:
+        file = GrowingFile(folder / "a", keep=3)
+        file.append(b"two")
+        file.finish()
+
+    for folder in folders_of_the_killed(tmp_path, finish, begin=begin):
+        path, partial = folder / "a", partial_path(folder / "a")
+        if path.exists():
+            assert path.read_bytes() == b"onetwo"
+            assert not partial.exists()
+        elif partial.read_bytes() == b"onetwo":
+            name_finished(path)
+        else:
+            assert partial.read_bytes() == b"one"
+            finish(folder)
+        assert [(entry.name, entry.read_bytes()) for entry in folder.iterdir()] == [("a", b"onetwo")]
+
+
+def test_what_another_process_has_finished_meanwhile_is_not_cut_off(tmp_path: Path) -> None:
+    """It has been opened under its other name just before that."""
     path = tmp_path / "a"
-    write_whole(path, b"old")
-    with pytest.raises(RuntimeError), whole_file(path) as file:  # noqa: PT012
-        file.write(b"new")
-        raise RuntimeError
-    assert path.read_bytes() == b"old"
-    assert [*tmp_path.iterdir()] == [path]
-    with pytest.raises(StorageError, match="cannot be written"):
-        write_whole(tmp_path / "none" / "a", b"")
+    partial_path(path).write_bytes(b"one")
+    opened = os.open
+
+    def slow(name: Path, flags: int, mode: int = 0o777) -> int:
+        descriptor = opened(name, flags, mode)
+        if partial_path(path).exists() and not path.exists():
+            partial_path(path).rename(path)
+        return descriptor
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "open", slow)
+        with pytest.raises(StorageError, match="Another process has changed"):
+            GrowingFile(path, keep=2)
+    assert path.read_bytes() == b"one"

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from killed import folders_of_the_killed
 from properties import examples
 from small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
 from streams import same
@@ -15,9 +16,9 @@ from structgstream.codec.container import disk_room
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError
 from structgstream.groups import segment_sink
-from structgstream.groups.growing_file import partial_path
 from structgstream.groups.segment_file import inspect_segment, open_segment
 from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_segment
+from structgstream.whole_files import partial_path
 
 COUNT = END - FIRST
 
@@ -53,6 +54,15 @@ def test_a_segment_has_its_name_when_it_is_whole(tmp_path: Path) -> None:
     write(path, encoded()[0])
     assert inspect_segment(path).complete
     assert not partial_path(path).exists()
+
+
+def test_killed_at_any_step_it_goes_on_to_the_same_bytes_under_its_name(tmp_path: Path, whole: bytes) -> None:
+    packets = encoded()[0]
+    killed = folders_of_the_killed(tmp_path, lambda folder: write(folder / "g", packets), begin=lambda folder: None)
+    assert len(killed) > 3 * COUNT
+    for folder in killed:
+        go_on(folder / "g")
+        assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [("g", whole)]
 
 
 def test_each_write_says_what_it_took(tmp_path: Path) -> None:

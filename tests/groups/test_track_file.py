@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from killed import folders_of_the_killed
 from structgstream.errors import StreamError
-from structgstream.groups.growing_file import partial_path
 from structgstream.groups.track_file import PREFIX, SIGNATURE, TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.whole_files import partial_path
 
 HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 
@@ -51,6 +52,23 @@ def test_a_track_comes_back_and_may_be_read_while_it_grows(tmp_path: Path) -> No
     assert (found.head, found.starts, found.frames) == (HEAD, [4, 8], 12)
     assert found.groups == [(0, 4), (4, 8), (8, 12)]
     assert not partial_path(path).exists()
+
+
+def test_killed_at_any_step_what_was_written_is_read(tmp_path: Path) -> None:
+    def act(folder: Path) -> None:
+        writer = TrackWriter(folder / "t", HEAD)
+        for frame in (4, 8):
+            writer.write(start(frame))
+        writer.finish(12, [(0, 12)])
+
+    for folder in folders_of_the_killed(tmp_path, act, begin=lambda folder: None):
+        try:
+            found = open_track(folder / "t")
+        except StreamError:
+            assert not (folder / "t").exists()
+            continue
+        assert found.starts in ([], [4], [4, 8])
+        assert (found.groups is not None) >= (folder / "t").exists()
 
 
 def test_a_cut_or_damaged_track_says_so(tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ import torch
 from clip_groups import FRAMES, LENGTH, OPTIONS, made, track
 from structgstream.errors import ConfigError
 from structgstream.groups.base import GroupBase
-from structgstream.groups.growing_file import partial_path
+from structgstream.groups.group_list import groups_path
 from structgstream.groups.segment_file import open_segment
 from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import open_track
-from structgstream.groups.track_pass import groups_path
+from structgstream.whole_files import partial_path
 
 
 def test_a_track_has_a_start_for_each_group() -> None:
@@ -45,6 +45,20 @@ def test_cut_in_a_record_it_goes_on_before_that(tmp_path: Path) -> None:
         track(path, made().header)
         assert path.read_bytes() == whole
         path.unlink()
+
+
+def test_killed_between_the_last_byte_and_the_name_it_gets_its_name(tmp_path: Path) -> None:
+    path, whole = tmp_path / "track", made().track.read_bytes()
+    for groups_there in (True, False):
+        partial_path(path).write_bytes(whole)
+        if groups_there:
+            groups_path(path).write_text("0:2\n2:4\n4:6\n")
+        assert track(path, made().header) == 0
+        assert path.read_bytes() == whole
+        assert groups_path(path).read_text() == "0:2\n2:4\n4:6\n"
+        assert sorted(tmp_path.iterdir()) == [path, groups_path(path)]
+        path.unlink()
+        groups_path(path).unlink()
 
 
 def test_a_finished_track_is_left_and_another_is_refused(tmp_path: Path) -> None:

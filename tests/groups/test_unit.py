@@ -14,10 +14,11 @@ from structgstream.api import reconstruct
 from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
 from structgstream.groups import method
 from structgstream.groups.base import GroupBase
-from structgstream.groups.growing_file import GrowingFile, partial_path
+from structgstream.groups.growing_file import GrowingFile
 from structgstream.groups.segment_file import inspect_segment, open_segment
 from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.scene.state import state_of
+from structgstream.whole_files import partial_path
 
 
 def test_a_segment_is_finished_when_it_has_its_name() -> None:

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Notes are believed only for what is there as it was; torn ones are passed over."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
-from structgstream.errors import StorageError
+from killed import folders_of_the_killed
+from structgstream.errors import ConfigError, StorageError
 from structgstream.executors.task import Ending
 from structgstream.parallel.parts import Parts, read_notes
 
@@ -43,6 +45,50 @@ def test_torn_notes_are_passed_over(parts: Parts) -> None:
     path = parts.folder / "done.jsonl"
     path.write_text(path.read_text() + '{"name": "track", "key"\nnot JSON\n{"name": "other"}\n')
     assert set(read_notes(parts.folder)) == {"header"}
+
+
+def test_killed_at_any_step_of_a_note_the_notes_are_those_before_or_one_more(tmp_path: Path, parts: Parts) -> None:
+    """And the next note is not lost, as it was when it was appended to a line that a kill had cut."""
+
+    def noted(folder: Path) -> None:
+        Parts(folder).note(Ending("track", 0, 1.0), "key", folder / "header.sgs", frames=5)
+
+    def begin(folder: Path) -> None:
+        shutil.copytree(parts.folder, folder, dirs_exist_ok=True)
+
+    for folder in folders_of_the_killed(tmp_path, noted, begin=begin):
+        assert set(read_notes(folder)) in ({"header"}, {"header", "track"})
+        noted(folder)
+        assert set(read_notes(folder)) == {"header", "track"}
+
+
+def test_a_note_after_one_that_was_cut_is_not_lost(parts: Parts) -> None:
+    """As earlier versions may have left them."""
+    path = parts.folder / "done.jsonl"
+    path.write_text(path.read_text() + '{"name": "track", "ke')
+    again = Parts(parts.folder)
+    again.note(Ending("join", 0, 1.0), "key", parts.header, frames=5)
+    assert set(read_notes(parts.folder)) == {"header", "join"}
+
+
+def test_killed_at_any_step_of_clearing_what_is_left_is_refused_as_before_or_nothing(
+    tmp_path: Path, parts: Parts
+) -> None:
+    parts.keep_to({"capture": "old"})
+
+    def cleared(folder: Path) -> None:
+        with Parts(folder).held():
+            Parts(folder).clear()
+
+    def begin(folder: Path) -> None:
+        shutil.copytree(parts.folder, folder, dirs_exist_ok=True)
+
+    for folder in folders_of_the_killed(tmp_path, cleared, begin=begin):
+        left = Parts(folder)
+        if left.header.exists():
+            with pytest.raises(ConfigError, match="has parts of another run"):
+                left.keep_to({"capture": "new"})
+        assert not left.notes or left.header.exists()
 
 
 def test_cleared_is_empty(parts: Parts) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of a command come from a store and go to it, also while they grow, and after the command was killed."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -8,13 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.parallel import object_folder, staged
 from structgstream.parallel.object_folder import ObjectFolder
-from structgstream.parallel.staged import Staging, assembled, pieces_of
+from structgstream.parallel.pieces import folder_of, last_pieces, piece_name
+from structgstream.parallel.staged import Staging
+
+ATTEMPT = "000001-0123abcd"
 
 
 @pytest.fixture(autouse=True)
@@ -38,6 +39,11 @@ def run(store: ObjectFolder, script: str, *flags: str) -> int:
     """The status of a command whose first word is the folder of this machine."""
     words = ["--store", store.url, "--name", "task", *flags, "--", "sh", "-c", script, staged.HERE]
     return staged.run(staged.parsed(words))
+
+
+def grown(store: ObjectFolder, name: str, *, have: int = 0) -> bytes:
+    """What the store has of a file."""
+    return last_pieces(store, name).read(store, have=have)
 
 
 def scratch(tmp_path: Path) -> list[Path]:
@@ -82,7 +88,7 @@ def test_early_files_are_there_before_the_end_and_growing_ones_piece_by_piece(
     store: ObjectFolder, tmp_path: Path
 ) -> None:
     """The command waits for what the store has of its files, so that it would not end otherwise."""
-    pieces = tmp_path / "store" / pieces_of("t")
+    pieces = tmp_path / "store" / folder_of("t")
     script = f"""
 echo groups > "$0/t.groups"; printf abc > "$0/t.partial"
 until [ -e "{tmp_path}/store/t.groups" ] && [ "$(ls "{pieces}" | wc -l)" = 1 ]; do sleep 0.01; done
@@ -92,19 +98,19 @@ printf f >> "$0/t.partial"; mv "$0/t.partial" "$0/t"
 """
     store.write("unused", b"")
     assert run(store, script, "--early", "t.groups", "--grows", "t") == 0
-    assert store.names(pieces_of("t")) == [f"{pieces_of('t')}/{have:015d}" for have in (0, 3, 5)]
-    assert (assembled(store, "t"), assembled(store, "t", have=4), store.read("t")) == (b"abcdef", b"ef", b"abcdef")
+    assert [*last_pieces(store, "t").names] == [0, 3, 5]
+    assert (grown(store, "t"), grown(store, "t", have=4), store.read("t")) == (b"abcdef", b"ef", b"abcdef")
 
 
 def test_two_files_may_grow(store: ObjectFolder) -> None:
     script = 'printf aaaa > "$0/a.partial"; printf b > "$0/b.partial"; sleep 0.1; printf b >> "$0/b.partial"'
     assert run(store, script, "--grows", "a", "--grows", "b") == 0
-    assert (assembled(store, "a"), assembled(store, "b")) == (b"aaaa", b"bb")
+    assert (grown(store, "a"), grown(store, "b")) == (b"aaaa", b"bb")
 
 
 def test_on_another_machine_a_growing_file_goes_on(store: ObjectFolder, staging: Staging) -> None:
-    store.write(f"{pieces_of('t')}/{0:015d}", b"abc")
-    store.write(f"{pieces_of('t')}/{3:015d}", b"de")
+    store.write(piece_name("t", ATTEMPT, 0), b"abc")
+    store.write(piece_name("t", ATTEMPT, 3), b"de")
     staging.bring_growing("t")
     assert (staging.folder / "t.partial").read_bytes() == b"abcde"
     (staging.folder / "t.partial").write_bytes(b"abcdef")
@@ -113,28 +119,10 @@ def test_on_another_machine_a_growing_file_goes_on(store: ObjectFolder, staging:
 
 
 def test_a_finished_file_is_not_one_that_grows(store: ObjectFolder, staging: Staging) -> None:
-    store.write(f"{pieces_of('t')}/{0:015d}", b"abc")
+    store.write(piece_name("t", ATTEMPT, 0), b"abc")
     store.write("t", b"abcdef")
     staging.bring_growing("t")
     assert [path.name for path in staging.folder.iterdir()] == ["t"]
-
-
-@examples(80)
-@given(st.binary(max_size=40), st.data())
-def test_pieces_that_overlap_or_lack_others_give_the_beginning(
-    tmp_path_factory: pytest.TempPathFactory, data: bytes, choice: st.DataObject
-) -> None:
-    store = ObjectFolder(f"file://{tmp_path_factory.mktemp('store')}")
-    cuts = choice.draw(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=6))
-    there = set()
-    for begin, length in cuts:
-        name = f"{pieces_of('t')}/{begin:015d}"
-        if begin < len(data) and (store.read(name) or b"") < data[begin : begin + length]:
-            store.write(name, data[begin : begin + length])
-            there |= {*range(begin, min(begin + length, len(data)))}
-    have = choice.draw(st.integers(0, len(data)))
-    reached = next((i for i in range(have, len(data)) if i not in there), len(data))
-    assert assembled(store, "t", have=have) == data[have:reached]
 
 
 def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:
@@ -146,8 +134,35 @@ def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFo
         check=False,
     )
     assert done.returncode == -signal.SIGKILL
-    assert assembled(store, "t") == b"abc", "what had grown is in the store"
+    assert grown(store, "t") == b"abc", "what had grown is in the store"
     assert len(scratch(tmp_path)) == 1, "and here, for the next attempt"
+
+
+def test_what_a_killed_command_cut_and_the_next_one_wrote_otherwise_is_in_the_store_as_the_next_one_wrote_it(
+    store: ObjectFolder,
+) -> None:
+    """The next one keeps the whole record ``abc`` and makes ``xyz`` in the place of the cut ``d``."""
+    assert run(store, 'printf abcd > "$0/t.partial"; exit 137', "--grows", "t") == 137
+    assert grown(store, "t") == b"abcd"
+    # It is looked at before the cut record is cut off.
+    script = 'sleep 0.1; printf abcxy > "$0/t.partial"; sleep 0.1; printf z >> "$0/t.partial"; exit 137'
+    assert run(store, script, "--grows", "t") == 137
+    assert grown(store, "t") == b"abcxyz"
+
+
+def test_a_disk_of_this_machine_without_room_is_a_sentence(
+    store: ObjectFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    store.write("a", b"a")
+    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(sys, "argv", ["staged", "--store", store.url, "--name", "task", "--needs", "a", "--", "true"])
+    assert staged.main() == 1
+    error = capsys.readouterr().err
+    assert error.startswith("structgstream: ")
+    assert error.endswith("a cannot be written (No space left on device); make room.\n")
 
 
 def test_a_store_that_cannot_be_used_is_a_sentence(

@@ -1,25 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The commands of a parallel run, which the programs understand, and what is read of a track while it grows."""
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.cli.group_run import ReconstructGroup
 from structgstream.cli.join import Join
 from structgstream.cli.options import parse_options
 from structgstream.cli.track import Track
 from structgstream.errors import StreamError
 from structgstream.executors.task import PYTHON
-from structgstream.groups.growing_file import partial_path
 from structgstream.groups.track_file import TrackHead, TrackStart, TrackWriter, open_track
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.unit import Unit, cut_track, groups_of, groups_path, starts_in
+from structgstream.parallel.unit import Unit, cut_track, starts_in
+from structgstream.whole_files import partial_path
 
 HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 
@@ -117,37 +113,3 @@ def test_a_group_gets_the_one_start_that_it_needs(growing: Path, tmp_path: Path)
     with pytest.raises(StreamError, match="no start at frame 12"):
         cut_track(growing, 12)
     assert partial_path(growing).read_bytes() == before
-
-
-@examples(60)
-@given(st.lists(st.integers(1, 90), min_size=1, max_size=9), st.data())
-def test_groups_come_back_and_those_that_do_not_follow_each_other_do_not(
-    tmp_path_factory: pytest.TempPathFactory, lengths: list[int], choice: st.DataObject
-) -> None:
-    track = tmp_path_factory.mktemp("groups") / "track"
-    borders = [0, *(sum(lengths[: i + 1]) for i in range(len(lengths)))]
-    groups = [*pairwise(borders)]
-    groups_path(track).write_text("".join(f"{first}:{end}\n" for first, end in groups))
-    assert groups_of(track) == groups
-    number = choice.draw(st.integers(0, len(groups) - 1))
-    shift = choice.draw(st.integers(1, 5))
-    first, end = groups[number]
-    wrong = choice.draw(st.sampled_from([(first + shift, end), (first - shift, end), (first, first)]))
-    groups[number] = wrong
-    groups_path(track).write_text("".join(f"{first}:{end}\n" for first, end in groups))
-    with pytest.raises(StreamError, match="do not follow each other from frame 0 on"):
-        groups_of(track)
-
-
-def test_undecided_groups_are_none(tmp_path: Path) -> None:
-    assert groups_of(tmp_path / "track") is None
-    for text in ("", "0:4", "0:4\n4:"):
-        groups_path(tmp_path / "track").write_text(text)
-        assert groups_of(tmp_path / "track") is None
-
-
-@pytest.mark.parametrize("text", [b"\n", b"four\n", b"0:4 4\n", b"0-4\n", b"\xff\xfe\n", b"0:4\n8:12\n", b"4:8\n"])
-def test_what_are_no_groups_is_told(tmp_path: Path, text: bytes) -> None:
-    groups_path(tmp_path / "track").write_bytes(text)
-    with pytest.raises(StreamError, match=r"track\.groups"):
-        groups_of(tmp_path / "track")

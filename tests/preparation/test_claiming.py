@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from killed import folders_of_the_killed
 from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.claiming import LOCK, SOURCE, alone, claim
 from structgstream.preparation.steps import FOLDER
@@ -76,15 +77,23 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, videos: Path) -> N
 def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
     tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(self: Path, text: str) -> int:
-        self.touch()
+    def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_text", full)
+        patch.setattr("os.fsync", full)
         with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
             claim(tmp_path / "capture", videos)
     claim(tmp_path / "capture", videos)
+
+
+def test_killed_at_any_step_it_leaves_the_folder_free_for_the_next_time(tmp_path: Path, videos: Path) -> None:
+    killed = folders_of_the_killed(
+        tmp_path, lambda folder: claim(folder / "capture", videos), begin=lambda folder: (folder / "capture").mkdir()
+    )
+    for folder in killed:
+        claim(folder / "capture", videos)
+        assert [path.name for path in (folder / "capture").rglob("*")] == [FOLDER, SOURCE]
 
 
 def test_one_process_at_a_time(tmp_path: Path, videos: Path) -> None:

@@ -12,7 +12,7 @@ from calibrations import WRITERS, truths, write_anipose, write_transforms
 from captures import small_rig, write_immersive, write_text_model
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
-from structgstream.data.undistortion import rectilinear
+from structgstream.data.rectilinear import rectilinear
 from structgstream.errors import CalibrationError
 from structgstream.preparation.given import demand_calibration, find_calibration
 

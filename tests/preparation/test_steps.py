@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from killed import folders_of_the_killed
 from structgstream.errors import StorageError
 from structgstream.preparation.steps import FOLDER, Silent, Steps, Stored, fingerprint
 
@@ -81,6 +82,18 @@ def test_an_interruption_leaves_no_result(tmp_path: Path) -> None:
             "a", {}, interrupted, pack=lambda _: Stored(), unpack=lambda _: 0, summary=lambda _: ""
         )
     assert not list(tmp_path.rglob("a.*"))
+
+
+def test_killed_at_any_step_of_writing_it_is_done_again_or_was_done(tmp_path: Path) -> None:
+    """Never the numbers of one result with the arrays of another."""
+
+    def begin(folder: Path) -> None:
+        run(Steps(folder, Silent()), "a", 3, [])
+
+    for folder in folders_of_the_killed(tmp_path, lambda folder: run(Steps(folder, Silent()), "a", 5, []), begin=begin):
+        for value in (3, 5, 3):
+            assert run(Steps(folder, Silent()), "a", value, []) == value
+        assert sorted(path.name for path in (folder / FOLDER).iterdir()) == ["a.json", "a.npz"]
 
 
 def test_a_full_disk_is_told(tmp_path: Path) -> None:

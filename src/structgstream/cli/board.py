@@ -10,6 +10,7 @@ from rich.console import Console
 
 from structgstream.cli.app import usage_errors
 from structgstream.cli.options import parse_options
+from structgstream.cli.plain_text import say
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,6 @@ def main(arguments: list[str]) -> None:
     told = (
         f"Wrote {options.output}: {board.text}, on {options.paper}. Print it at 100 %, and check its bar with a ruler."
     )
-    console.print(told, highlight=False, markup=False, soft_wrap=True)
+    say(console, told)
     use = f"Then: structgstream prepare VIDEOS -o CAPTURE --calibration board --board {board_text(board)}"
-    console.print(use, highlight=False, markup=False, soft_wrap=True)
+    say(console, use)

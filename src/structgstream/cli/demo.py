@@ -12,11 +12,16 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, parse_known_options, resolve_config
+from structgstream.cli.plain_text import say
 from structgstream.cli.tables import quality_text, report_tables
 
 if TYPE_CHECKING:
+    from structgstream.data.source import FrameSource
     from structgstream.evaluation.report import Report
+    from structgstream.kernels.backend import Backend
+    from structgstream.presets import StreamConfig
 
+PLAYER = "player.html"
 SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
 
 
@@ -45,17 +50,9 @@ def main(arguments: list[str]) -> None:
     options, rest = parse_known_options(Demo, "demo", arguments=arguments)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
-    from structgstream.cli.evaluate import run_evaluation
-    from structgstream.cli.reconstruct import run_reconstruction
-    from structgstream.cli.render import path_pictures, write_pictures
-    from structgstream.codec.reader import open_stream
     from structgstream.data.clip import bundled_clip_path
     from structgstream.data.open import open_capture
-    from structgstream.evaluation.evaluate import compared_frames
-    from structgstream.evaluation.pictures import side_by_side
     from structgstream.kernels.backend import select_backend
-    from structgstream.player.stream_file import StreamFile
-    from structgstream.player.write import write_page
     from structgstream.presets import DEMO_PRESET
     from structgstream.recorder import check_output
 
@@ -66,52 +63,69 @@ def main(arguments: list[str]) -> None:
     backend = select_backend(options.device)
     stream = options.output / "clip.sgs"
     check_output(stream, may_exist=True)
-    camera = source.rig.testing[0]
-    width, height = source.rig[camera].width, source.rig[camera].height
+    _reconstruct(stream, source, config, backend, preset=preset, scale=options.scale, console=console)
+    report, files = _look_at(stream, source, backend)
+    _print_results(console, report, files, seconds=time.perf_counter() - began)
+    player = options.output / PLAYER
+    say(
+        console,
+        f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
+        f"or, beside what the cameras took: structgstream play {stream} --capture {bundled_clip_path()}",
+    )
+
+
+def _reconstruct(
+    stream: Path,
+    source: "FrameSource",
+    config: "StreamConfig",
+    backend: "Backend",
+    *,
+    preset: str,
+    scale: float,
+    console: Console,
+) -> None:
+    """The clip as a stream."""
+    from structgstream.cli.reconstruct import run_reconstruction
+
+    filmed = source.rig[source.rig.testing[0]]
     console.print(
-        f"Reconstructing the bundled clip: {len(source.rig.training)} training cameras of {width}x{height}, "
-        f"{len(source)} frames, preset {preset}, back-end {backend.name}.",
+        f"Reconstructing the bundled clip: {len(source.rig.training)} training cameras of "
+        f"{filmed.width}x{filmed.height}, {len(source)} frames, preset {preset}, back-end {backend.name}.",
         highlight=False,
     )
+    metadata = {"preset": preset, "start": 0, "scale": scale}
     try:
-        run_reconstruction(
-            source,
-            config,
-            output=stream,
-            backend=backend,
-            metadata={"preset": preset, "start": 0, "scale": options.scale},
-        )
+        run_reconstruction(source, config, output=stream, backend=backend, metadata=metadata)
     except Interrupted:
-        raise Interrupted(f"What was done is in {options.output}; the demo starts again from the beginning.") from None
+        raise Interrupted(f"What was done is in {stream.parent}; the demo starts again from the beginning.") from None
+
+
+def _look_at(stream: Path, source: "FrameSource", backend: "Backend") -> tuple["Report", dict[str, Path | str]]:
+    """Scores, pictures, videos and the page with the player beside the stream; the scores, and where the rest is."""
+    from structgstream.cli.evaluate import run_evaluation
+    from structgstream.cli.render import path_pictures, write_pictures
+    from structgstream.codec.reader import open_stream
+    from structgstream.evaluation.evaluate import compared_frames
+    from structgstream.evaluation.pictures import side_by_side
+    from structgstream.player.stream_file import StreamFile
+    from structgstream.player.write import write_page
+
+    folder, camera = stream.parent, source.rig.testing[0]
     reader = open_stream(stream)
-    report_folder = options.output / "report"
-    report = run_evaluation(reader, source, stream=stream, backend=backend, cameras=None, folder=report_folder)
-    held_out, orbit = options.output / "held-out.mp4", options.output / "orbit.mp4"
+    report = run_evaluation(reader, source, stream=stream, backend=backend, cameras=None, folder=folder / "report")
+    held_out, orbit = folder / "held-out.mp4", folder / "orbit.mp4"
     pairs = compared_frames(reader, source, backend=backend, camera=camera)
     write_pictures(held_out, (side_by_side(*pair) for pair in pairs), fps=source.fps * SLOWED)
     write_pictures(orbit, path_pictures(reader, backend, path="orbit", camera=camera), fps=source.fps)
-    player = options.output / "player.html"
-    write_page(player, StreamFile(stream))
-    _print_results(
-        console,
-        report,
-        {
-            "stream": stream,
-            "pictures": report_folder / "contact_sheet.png",
-            "plots": report_folder / "over_time.png",
-            "numbers": report_folder / "report.json",
-            "held-out view": f"{held_out} (truth, rendering, difference x4; a fifth of the speed)",
-            "moving camera": orbit,
-        },
-        seconds=time.perf_counter() - began,
-    )
-    console.print(
-        f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
-        f"or, beside what the cameras took: structgstream play {stream} --capture {bundled_clip_path()}",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    write_page(folder / PLAYER, StreamFile(stream))
+    return report, {
+        "stream": stream,
+        "pictures": folder / "report" / "contact_sheet.png",
+        "plots": folder / "report" / "over_time.png",
+        "numbers": folder / "report" / "report.json",
+        "held-out view": f"{held_out} (truth, rendering, difference x4; a fifth of the speed)",
+        "moving camera": orbit,
+    }
 
 
 def _print_results(console: Console, report: "Report", files: Mapping[str, Path | str], *, seconds: float) -> None:
@@ -119,7 +133,7 @@ def _print_results(console: Console, report: "Report", files: Mapping[str, Path 
     console.print(report_tables(report, title="bundled clip, held-out camera"))
     console.print()
     for name, path in files.items():
-        console.print(f"{name:<14}  {path}", highlight=False, markup=False, soft_wrap=True)
+        say(console, f"{name:<14}  {path}")
     console.print(
         f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, everything in {seconds:.0f} s.",
         highlight=False,

@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.tables import quality_text, report_tables
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def main(arguments: list[str]) -> None:
     console = Console()
     console.print(report_tables(report, title=options.stream.name))
     if options.report is not None:
-        console.print(f"Report: {options.report}", highlight=False, markup=False, soft_wrap=True)
+        say(console, f"Report: {options.report}")
 
 
 def run_evaluation(

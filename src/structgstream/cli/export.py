@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from structgstream.cli.app import usage_errors
 from structgstream.cli.options import Device, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.exporters.formats import Format, PageFormat
 
@@ -88,9 +89,9 @@ def main(arguments: list[str]) -> None:
     what = "1 frame" if len(numbers) == 1 else f"{len(numbers)} frames"
     text = f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(written)}"
     console = Console()
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    say(console, text)
     if reader.damage:
-        console.print(f"The stream is damaged: {reader.cut_reason}.", highlight=False, markup=False, soft_wrap=True)
+        say(console, f"The stream is damaged: {reader.cut_reason}.")
 
 
 def _export_page(path: Path, output: Path, format: PageFormat) -> None:
@@ -105,4 +106,4 @@ def _export_page(path: Path, output: Path, format: PageFormat) -> None:
         size_bytes = write_site(output, stream)
         then = "put the folder on any web server"
     text = f"Wrote {output}, {human_bytes(size_bytes)}; {then}"
-    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+    say(Console(), text)

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, Folder, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import display
 from structgstream.cli.termination import Terminated, Termination
 
@@ -69,7 +70,7 @@ def main(arguments: list[str]) -> None:
     task = SegmentTask(options.scene, options.init, options.track, first, end, start)
     written = _fit(options, task)
     text = f"Wrote {options.output}" if written else f"{options.output} is finished."
-    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+    say(Console(), text)
 
 
 def _fit(options: ReconstructGroup, task: "SegmentTask") -> bool:

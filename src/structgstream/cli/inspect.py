@@ -12,9 +12,11 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import JsonPath, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 
 if TYPE_CHECKING:
+    from structgstream.cameras import CameraRig
     from structgstream.codec.reader import StreamReader
     from structgstream.evaluation.byte_count import Row
 
@@ -79,7 +81,7 @@ def main(arguments: list[str]) -> None:
         console.print(part)
         console.print()
     if plot is not None:
-        console.print(f"Wrote {plot}", highlight=False, markup=False, soft_wrap=True)
+        say(console, f"Wrote {plot}")
 
 
 def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:
@@ -107,39 +109,13 @@ def describe_stream(
     ``changes`` of a packet are the numbers of added and removed anchors and free Gaussians, if the run's ``log`` has
     them.
     """
-    from structgstream.evaluation.byte_count import REST
-
     header = reader.header
-    cameras = {
-        name: {
-            "width": camera.width,
-            "height": camera.height,
-            "K": camera.K.tolist(),
-            "viewmat": camera.viewmat.tolist(),
-            "near": camera.near,
-            "held_out": name in header.rig.held_out,
-        }
-        for name, camera in header.rig.cameras.items()
-    }
     periods = [describe_period(reader, place, rows, log=log) for place in range(len(reader.periods))]
-    packets = [
-        {
-            "kind": row.kind,
-            "index": row.index,
-            "pts_seconds": row.pts_seconds,
-            "offset": row.offset,
-            "bytes": row.bytes,
-            "fields": {name: size for name, size in row.sizes.items() if name != REST},
-            "changes": {name: log.get(row.index, {})[name] for name in CHANGES if name in log.get(row.index, {})},
-            "counts": log.get(row.index, {}).get("counts", {}),
-        }
-        for row in rows
-    ]
     return {
         "header": {
             "codec": header.codec,
             "fps": header.fps,
-            "frames": len(packets),
+            "frames": len(rows),
             "complete": reader.complete,
             "cut_reason": reader.cut_reason,
             "damage": [
@@ -152,11 +128,40 @@ def describe_stream(
             "dynamic": sorted(header.dynamic),
             "fields": periods[0]["fields"],
             "distance_input": header.distance_input,
-            "cameras": cameras,
+            "cameras": _cameras(header.rig),
             "config": dict(header.config),
             "metadata": dict(header.metadata),
         },
-        "packets": packets,
+        "packets": [_packet(row, log.get(row.index, {})) for row in rows],
+    }
+
+
+def _cameras(rig: "CameraRig") -> dict[str, dict[str, Any]]:
+    return {
+        name: {
+            "width": camera.width,
+            "height": camera.height,
+            "K": camera.K.tolist(),
+            "viewmat": camera.viewmat.tolist(),
+            "near": camera.near,
+            "held_out": name in rig.held_out,
+        }
+        for name, camera in rig.cameras.items()
+    }
+
+
+def _packet(row: "Row", logged: Mapping[str, Any]) -> dict[str, Any]:
+    from structgstream.evaluation.byte_count import REST
+
+    return {
+        "kind": row.kind,
+        "index": row.index,
+        "pts_seconds": row.pts_seconds,
+        "offset": row.offset,
+        "bytes": row.bytes,
+        "fields": {name: size for name, size in row.sizes.items() if name != REST},
+        "changes": {name: logged[name] for name in CHANGES if name in logged},
+        "counts": logged.get("counts", {}),
     }
 
 

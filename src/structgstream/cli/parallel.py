@@ -11,6 +11,7 @@ from rich.console import Console
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.options import CaptureOptions, Device, Folder, parse_known_options, resolve_config
 from structgstream.cli.parallel_display import ParallelDisplay
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.executors.opening import ExecutorName, ExecutorOptions
 
@@ -103,9 +104,10 @@ def main(arguments: list[str]) -> None:
     console = Console()
     with parts.held():
         if options.overwrite:
-            parts.clear()
+            # Killed in between, the folder still has the old plan, with which no other run goes on.
             if options.store is not None:
                 ObjectFolder(options.store).clear()
+            parts.clear()
         if options.output.exists() and not options.overwrite and not parts.notes:
             raise StorageError(f"{options.output} exists; replace it with --overwrite, or choose another name.")
         with usage_errors():
@@ -113,7 +115,7 @@ def main(arguments: list[str]) -> None:
         with executor:
             _drive(_job(options, rest), parts, executor, options.store, console)
     size = human_bytes(options.output.stat().st_size)
-    _say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}, which can be deleted.")
+    say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}, which can be deleted.")
 
 
 def parts_folder(output: Path) -> Path:
@@ -184,7 +186,3 @@ def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", store: str | None,
             drive(job, parts, executor, exchange=exchange, listener=display.show)
         except KeyboardInterrupt:
             raise Interrupted(f"Whole frames are kept in {parts.folder}; go on with the same command.") from None
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

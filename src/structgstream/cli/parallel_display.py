@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from structgstream.cli.plain_text import say
+
 if TYPE_CHECKING:
     from structgstream.parallel.driver import State, Status
 
@@ -50,9 +52,7 @@ def counted(status: "Status") -> str:
     counts = Counter(str(state) for state in status.states)
     frames = sum(end - first for (first, end), state in zip(status.groups, status.states) if state == "done")
     parts = [f"{counts['done']} of {len(status.groups)} groups done ({frames} of {status.groups[-1][1]} frames)"]
-    parts += [
-        f"{counts[name]} {name}" for name in ("running", "ready", "waiting for the track", "failed") if counts[name]
-    ]
+    parts += [f"{counts[name]} {name}" for name in OTHERS if counts[name]]
     return ", ".join(["joining", *parts[:1]] if status.stage == "join" else parts)
 
 
@@ -82,7 +82,7 @@ class ParallelDisplay:
             self._live.stop()
 
     def show(self, status: "Status") -> None:
-        """Shows it."""
+        """Renews the picture; elsewhere than on a terminal, prints a line if it says something new."""
         if self._console.is_terminal:
             self._live.update(self._picture(status))
             return
@@ -90,7 +90,7 @@ class ParallelDisplay:
         line = f"{status.stage}: {done} of {len(status.groups)} groups done" if status.groups else status.stage
         line += f", failed: {', '.join(status.failed)}" if status.failed else ""
         if line != self._told:
-            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+            say(self._console, line)
             self._console.file.flush()
             self._told = line
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream plan``."""
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +18,7 @@ from structgstream.cli.options import (
     parse_known_options,
     resolve_config,
 )
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.cli.tables import compact_table, literal_cells
 
@@ -116,37 +116,37 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
 
 
 def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured", console: Console) -> None:
+    from structgstream.evaluation.report import write_json
     from structgstream.parallel.cost import estimate, sequential_seconds, serial_seconds, stream_bytes, workers_for
 
     costs = found.costs
     estimates = [(count, estimate(costs, work, count * options.workers)) for count in options.machines]
     alone, serial, size = sequential_seconds(costs, work), serial_seconds(costs, work), stream_bytes(costs, work)
     seconds = work.frames / source.fps
-    _print(
+    say(
         console,
         f"{source.name}: {work.frames} frames ({seconds:.1f} s of film) in {len(work.groups)} groups of {work.group}.",
         f"Measured on one worker: frame 0 {costs.header_seconds:.1f} s, tracking {costs.track_seconds:.2f} s a frame, "
         f"a group {costs.process_seconds + costs.first_seconds:.1f} s and {costs.frame_seconds:.2f} s a frame "
-        f"({found.groups} groups), memory "
-        f"{human_bytes(costs.worker_bytes)}.",
+        f"({found.groups} groups), memory {human_bytes(costs.worker_bytes)}.",
         f"One frame after the other: {_time(alone)}. Stream: {human_bytes(size)}, {size * 8e-6 / seconds:.2f} Mbit/s.",
     )
     _table(console, estimates)
-    _print(console, _serial(costs.header_seconds, serial, alone, work.frames))
+    say(console, _serial(costs.header_seconds, serial, alone, work.frames))
     wanted = None
     if options.finish_hours is not None:
         wanted = workers_for(costs, work, options.finish_hours * 3600)
         least = _time(estimate(costs, work, len(work.groups) + 1).seconds)
         ends = f"{wanted.workers} workers ({_time(wanted.seconds)})" if wanted else f"not possible; least {least}"
-        _print(console, f"Within {options.finish_hours:g} h: {ends}.")
+        say(console, f"Within {options.finish_hours:g} h: {ends}.")
     rate = 1 / costs.frame_seconds
-    _print(console, _live(rate, source.fps), ASSUMED)
+    say(console, _live(rate, source.fps), ASSUMED)
     if options.json is not None:
         facts: dict[str, Any] = {"work": asdict(work), "measured": asdict(found), "bytes": size, "live_fps": rate}
         facts |= {"sequential_seconds": alone, "serial_seconds": serial}
         facts["estimates"] = [{"machines": count, **asdict(each)} for count, each in estimates]
         facts["wanted"] = None if wanted is None else asdict(wanted)
-        options.json.write_text(json.dumps(facts, indent=1) + "\n")
+        write_json(options.json, facts)
 
 
 def _live(rate: float, fps: float) -> str:
@@ -181,8 +181,3 @@ def _time(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
-def _print(console: Console, *lines: str) -> None:
-    for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -12,6 +12,7 @@ from rich.console import Console
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import StreamFile as StreamPath
 from structgstream.cli.options import parse_options
+from structgstream.cli.plain_text import say
 from structgstream.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def main(arguments: list[str]) -> None:
             lines.append("The file has no end yet: frames appear as they are written.")
         if options.browser and not open_browser(address):
             lines.append("There is no screen to open a browser on: open the address yourself.")
-        Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+        say(Console(), *lines)
 
     run(application(stream, truth=truth), port=options.port, on_start=tell)
 
@@ -78,7 +79,7 @@ def main(arguments: list[str]) -> None:
 def _wait_for(stream: "StreamFile") -> None:
     if not stream.has_header():
         text = f"Waiting for {stream.path}, which comes when frame 0 is done (Ctrl-C ends)."
-        Console(stderr=True).print(text, highlight=False, markup=False, soft_wrap=True)
+        say(Console(stderr=True), text)
     while not stream.has_header():
         time.sleep(LOOK_AGAIN_SECONDS)
 

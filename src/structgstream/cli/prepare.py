@@ -12,6 +12,7 @@ from rich.console import Console
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.interruption import interruptible
 from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.step_display import step_display
 
 if TYPE_CHECKING:
@@ -115,8 +116,8 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
             made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
     except KeyboardInterrupt:
         raise Interrupted("Steps that are done are kept; continue with the same command.") from None
-    console.print(f"Capture: {made.path}", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Report: {made.report}", highlight=False, markup=False, soft_wrap=True)
+    say(console, f"Capture: {made.path}")
+    say(console, f"Report: {made.report}")
     return made.findings
 
 
@@ -126,7 +127,7 @@ def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
     folder = options.videos / "report" if options.report is None else options.report
     with step_display(console) as display:
         checked = check_folder(options.videos, report=folder, listener=display)
-    console.print(f"Report: {folder / 'index.html'}", highlight=False, markup=False, soft_wrap=True)
+    say(console, f"Report: {folder / 'index.html'}")
     return checked.report.findings
 
 
@@ -165,7 +166,7 @@ def _conclude(findings: "Sequence[Finding]", console: Console) -> None:
     errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
         if finding is not (errors[0] if errors else None):
-            console.print(f"{finding.severity}: {finding.sentence}", highlight=False, markup=False, soft_wrap=True)
+            say(console, f"{finding.severity}: {finding.sentence}")
     if errors:
         raise CaptureError(errors[0].sentence)
-    console.print("The check found nothing that would spoil a stream.", highlight=False, markup=False, soft_wrap=True)
+    say(console, "The check found nothing that would spoil a stream.")

@@ -12,6 +12,8 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
+from structgstream.cli.plain_text import say
+
 if TYPE_CHECKING:
     from structgstream.frame_report import FrameReport
     from structgstream.training.result import Step
@@ -126,7 +128,7 @@ class Lines:
         self._print(summary(report, self._frames))
 
     def _print(self, text: str) -> None:
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        say(self._console, text)
         self._console.file.flush()
         self._spoken = time.monotonic()
 

@@ -21,6 +21,7 @@ from structgstream.cli.options import (
     parse_known_options,
     resolve_config,
 )
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.cli.segment_options import SegmentOptions
 from structgstream.cli.termination import Terminated, Termination
@@ -106,9 +107,9 @@ def main(arguments: list[str]) -> None:
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
     console = Console()
     may_exist = options.resume or options.overwrite
-    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(_say, console)) as storage:
+    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(say, console)) as storage:
         _reconstruct(options, config, preset=preset, storage=storage, console=console)
-    _say(console, f"Wrote {options.output}")
+    say(console, f"Wrote {options.output}")
 
 
 def _reconstruct(
@@ -130,7 +131,7 @@ def _reconstruct(
         source = open_selected_capture(options.scene, options.capture)
         length, captured = f"{len(source)} frames", None
     backend = select_backend(options.device)
-    _say(
+    say(
         console,
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
         f"{', '.join(source.rig.testing) or 'none'}; {length}; preset {preset}, back-end {backend.name}.",
@@ -149,11 +150,7 @@ def _reconstruct(
     )
     if peaks:
         stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
-        _say(console, f"Peak memory by stage: {stages}.")
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+        say(console, f"Peak memory by stage: {stages}.")
 
 
 def run_reconstruction(

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -95,7 +96,7 @@ def main(arguments: list[str]) -> None:
         pictures = camera_pictures(reader, backend, camera=choose_camera(reader, options.camera), frame=options.frame)
     single = output.suffix.lower() == ".png"
     write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
-    Console().print(f"Wrote {output}", highlight=False, markup=False, soft_wrap=True)
+    say(Console(), f"Wrote {output}")
 
 
 def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:

@@ -14,7 +14,7 @@ import tyro
 from structgstream.cli.app import UsageError
 
 if TYPE_CHECKING:
-    from structgstream.codec.segments.sink import SegmentsOptions
+    from structgstream.codec.segments.retention import SegmentsOptions
     from structgstream.codec.segments.store import Store
     from structgstream.recorder import Storage
     from structgstream.scene.scene import Scene
@@ -71,7 +71,7 @@ class SegmentOptions:
             StorageError: it exists and may not be replaced, or cannot be written.
             MissingExtraError: a package is missing that the URL needs.
         """
-        from structgstream.codec.segments.sink import SegmentsOptions
+        from structgstream.codec.segments.retention import SegmentsOptions
         from structgstream.recorder import check_output, segments_folder
 
         options = SegmentsOptions(self.window, self.keep)

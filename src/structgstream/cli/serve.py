@@ -10,6 +10,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def main(arguments: list[str]) -> None:
             lines.append(f"Viewers need a token: structgstream token NAME --secret-file {options.secret_file}")
         elif options.public:
             lines.append("Everyone who reaches this machine sees all of them.")
-        Console().print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+        say(Console(), *lines)
 
     run(settings, address=address, port=options.port, on_start=tell)
 

@@ -8,6 +8,8 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from structgstream.cli.plain_text import say
+
 WORTH_SAYING_SECONDS = 0.05
 
 
@@ -58,7 +60,7 @@ class StepDisplay(AbstractContextManager["StepDisplay"]):
         """Prints the line of a step."""
         seconds = time.monotonic() - self._began
         took = "  as before" if self._skipped else f"  {seconds:.1f} s" if seconds > WORTH_SAYING_SECONDS else ""
-        self._console.print(f"{step:<12} {summary}{took}", highlight=False, markup=False, soft_wrap=True)
+        say(self._console, f"{step:<12} {summary}{took}")
         if self._task is not None:
             self._bar.remove_task(self._task)
         self._task = None

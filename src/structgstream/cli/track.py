@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, Folder, StreamFile, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.cli.termination import Terminated, Termination
 
@@ -65,12 +66,13 @@ def main(arguments: list[str]) -> None:
     from structgstream.cli.app import usage_errors
     from structgstream.groups.base import GroupBase
     from structgstream.groups.boundaries import check_length
-    from structgstream.groups.growing_file import partial_path
+    from structgstream.groups.group_list import groups_path
     from structgstream.groups.pictures import open_for
     from structgstream.groups.segment_file import open_segment
-    from structgstream.groups.track_pass import TrackOptions, groups_path
+    from structgstream.groups.track_pass import TrackOptions
     from structgstream.kernels.backend import select_backend
     from structgstream.training.tracking import TrackConfig
+    from structgstream.whole_files import partial_path
 
     base = GroupBase.read(options.init)
     length = base.key_interval if options.groups is None else options.groups
@@ -125,12 +127,10 @@ def _say(path: Path, frames: int, spent: float | None) -> None:
 
     groups = open_track(path).groups or []
     size = human_bytes(path.stat().st_size)
-    Console().print(
+    say(
+        Console(),
         f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
         + " ".join(f"{first}:{end}" for first, end in groups[:8])
         + (" ..." if len(groups) > 8 else "")
         + ("" if spent is None else f"; {spent:.2f} core-seconds a frame"),
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
     )

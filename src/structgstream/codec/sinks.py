@@ -18,6 +18,7 @@ from structgstream.codec.header import pack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError
+from structgstream.whole_files import sync_folder
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 
@@ -163,6 +164,7 @@ class FileSink:
             if self._resumed is not None:
                 self._writer.continue_at(*self._resumed)
                 return 0
+            sync_folder(self.path.parent)
         except OSError as error:
             raise StorageError(
                 f"Cannot open {self.path} for writing ({error.strerror}); choose another place or mend its permissions."

@@ -8,7 +8,8 @@ from structgstream.codec.packet_table import LOST, PacketInfo, PacketInfos
 from structgstream.codec.packets import Packet, StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
-from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
+from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import Store
 from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.scene.scene import Scene

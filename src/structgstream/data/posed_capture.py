@@ -27,9 +27,10 @@ from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pict
 from structgstream.data.lenses import LensCamera
 from structgstream.data.picture_size import picture_size
 from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
-from structgstream.data.undistortion import rectilinear, undistort
+from structgstream.data.undistortion import undistort
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import VIDEO_SUFFIXES, scan_videos
 from structgstream.errors import CalibrationError, CaptureError
@@ -60,7 +61,7 @@ def open_posed(
     Args:
         path: the folder with pictures or videos.
         calibration: its cameras.
-        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
+        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.rectilinear.rectilinear`.
         complete: whether every video must be calibrated; else the others are left out with a warning.
 
     Raises:

@@ -6,7 +6,6 @@ calibrated again without touching what was filmed.
 """
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -28,7 +27,8 @@ from structgstream.data.tone import ToneCurve, toned
 from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.errors import CalibrationError, CaptureError, StorageError
+from structgstream.errors import CalibrationError, CaptureError
+from structgstream.whole_files import write_whole
 
 FILE = "capture.json"
 FORMAT, VERSION = "structgstream-capture", 1
@@ -89,13 +89,8 @@ def write_prepared(path: Path, capture: PreparedCapture) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    content = prepared_entries(capture)
-    part = path / f"{FILE}.part"
-    try:
-        part.write_text(json.dumps(content, indent=1) + "\n")
-        os.replace(part, path / FILE)
-    except OSError as error:
-        raise StorageError(f"{path / FILE} cannot be written ({error.strerror}).") from None
+    content = json.dumps(prepared_entries(capture), indent=1) + "\n"
+    write_whole(path / FILE, content.encode())
 
 
 def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import MissingExtraError, StorageError
+from structgstream.whole_files import give_name, partial_path
 
 BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2  # values of ISO/IEC 23091-2 and of libavutil
 BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
@@ -35,7 +36,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
     def __init__(self, path: Path, *, fps: float, crf: int = 18) -> None:
         av = _av()
         self.path = path
-        self._part = path.with_name(path.name + ".part")
+        self._part = partial_path(path)
         self._fps = Fraction(fps).limit_denominator(1001)
         self._count = 0
         self._av = av
@@ -74,7 +75,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
                 self._mux(None)
             self._container.close()
             if kind is None and self._count:
-                self._part.replace(self.path)
+                give_name(self._part, self.path)
         except (OSError, self._av.error.FFmpegError) as problem:
             raise StorageError(f"The video {self.path} cannot be written ({problem.strerror}).") from None
         finally:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.codec.packet_table import PacketInfo
@@ -17,7 +16,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
-from structgstream.evaluation.affine import ChannelFit, channel_fit, psnr_affine, psnr_camera_color
+from structgstream.evaluation.affine import ChannelFit, channel_fit
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.facts import (
     check_same_frames,
@@ -28,8 +27,7 @@ from structgstream.evaluation.facts import (
     training_facts,
 )
 from structgstream.evaluation.flow import Flow
-from structgstream.evaluation.masks import blackened, both, changed_pixels
-from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
+from structgstream.evaluation.masks import blackened
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
@@ -40,13 +38,11 @@ from structgstream.evaluation.optional_metrics import (
 )
 from structgstream.evaluation.recording import Drawable, Recording, to_device
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
+from structgstream.evaluation.scoring import Mask, Picture, counting, score
 from structgstream.frame_report import counts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
 from structgstream.scene.render import render, to_8bit_image
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -218,64 +214,6 @@ def decoded(recording: Recording, device: torch.device) -> Iterator[tuple[Packet
             torch.cuda.synchronize(device)
         yield info, drawable, time.perf_counter() - began
         began = time.perf_counter()
-
-
-def score(
-    picture: Picture,
-    truth: Picture,
-    first: Picture,
-    *,
-    backend: Backend,
-    seconds: float = 0.0,
-    color: ChannelFit | None = None,
-    mask: Mask | None = None,
-    first_mask: Mask | None = None,
-) -> Scores:
-    """The scores of a rendering against ``truth``.
-
-    Args:
-        picture: the rendering.
-        truth: the camera's picture.
-        first: the camera's picture of frame 0.
-        backend: computes SSIM.
-        seconds: duration of the rendering.
-        color: the camera's colour response, fitted to frame 0; None to leave out that score.
-        mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
-        first_mask: that of ``first``.
-
-    Raises:
-        CaptureError: the pictures have different sizes.
-    """
-    for other, what in ((truth, "truth"), (first, "truth of frame 0")):
-        if picture.shape != other.shape:
-            raise CaptureError(
-                f"A rendering of {picture.shape[1]}x{picture.shape[0]} pixels cannot be scored against a {what} of "
-                f"{other.shape[1]}x{other.shape[0]}; open the capture at the scale of the reconstruction."
-            )
-    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first, both(mask, first_mask))
-    ssim_score = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
-    if mask is not None:
-        errors, changed = errors[mask], changed[mask]
-        picture, truth = counting(mask, picture, truth)
-    total, moving = int(errors.sum(dtype=np.int64)), int(np.count_nonzero(changed))
-    in_changed = int(np.sum(errors, where=changed, dtype=np.int64))
-    return Scores(
-        psnr=decibels(mean_of_squares(total, errors.size)),
-        ssim=ssim_score,
-        psnr_affine=psnr_affine(picture, truth),
-        psnr_changed=decibels(mean_of_squares(in_changed, moving)) if moving else None,
-        psnr_still=decibels(mean_of_squares(total - in_changed, errors.size - moving))
-        if moving < errors.size
-        else None,
-        changed_share=moving / errors.size,
-        render_seconds=seconds,
-        psnr_camera_color=None if color is None else psnr_camera_color(picture, truth, color),
-    )
-
-
-def counting(mask: Mask | None, *pictures: Picture) -> tuple[Picture, ...]:
-    """The pixels of each picture ``[H, W, 3]`` that count, as a picture ``[P, 1, 3]``; without a mask as they are."""
-    return pictures if mask is None else tuple(picture[mask][:, None] for picture in pictures)
 
 
 def rendered(scene: Drawable, camera: Camera, backend: Backend) -> tuple[Picture, float]:

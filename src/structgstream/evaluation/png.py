@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import StorageError
+from structgstream.whole_files import write_whole
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 RGB, FILTER_UP = 2, 2
@@ -33,16 +33,12 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Writes ``picture`` ``[H, W, 3]`` and makes the folder when it is missing.
+    """Writes ``picture`` ``[H, W, 3]``, whole or not at all, and makes the folder when it is missing.
 
     Raises:
         StorageError: the file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(png_bytes(picture))
-    except OSError as error:
-        raise StorageError(f"The picture {path} cannot be written ({error.strerror}).") from None
+    write_whole(path, png_bytes(picture), called="The picture", new_folder=True, sync=False)
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.errors import StorageError
+from structgstream.whole_files import write_whole
 
 
 @dataclass(frozen=True)
@@ -172,13 +172,9 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes ``content`` as JSON and makes the folder when it is missing.
+    """Writes ``content`` as JSON, whole or not at all, and makes the folder when it is missing.
 
     Raises:
         StorageError: the file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
+    write_whole(path, f"{json.dumps(content, indent=1, allow_nan=False)}\n".encode(), new_folder=True)

@@ -8,12 +8,13 @@ are of each stage (``stage``) or of the process since its start (``process``).
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from structgstream.errors import StorageError
+from structgstream.whole_files import write_whole
 
 if TYPE_CHECKING:
     from structgstream.frame_report import FrameReport
@@ -31,7 +32,7 @@ def begin_log(stream: Path, *, frames: int = 0) -> None:
         StorageError: the file cannot be written.
     """
     kept = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
-    _write(log_path(stream), kept, mode="w")
+    write_whole(log_path(stream), _lines(kept), called="The log")
 
 
 def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
@@ -40,7 +41,12 @@ def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    _write(log_path(stream), [entry], mode="a")
+    path = log_path(stream)
+    try:
+        with path.open("ab") as file:
+            file.write(_lines([entry]))
+    except OSError as error:
+        raise StorageError(f"The log {path} cannot be written ({error.strerror}).") from None
 
 
 def log_entry(report: "FrameReport") -> dict[str, Any]:
@@ -78,9 +84,5 @@ def read_log(stream: Path) -> dict[int, dict[str, Any]]:
     return entries
 
 
-def _write(path: Path, entries: list[Mapping[str, Any]] | list[dict[str, Any]], *, mode: str) -> None:
-    try:
-        with path.open(mode) as file:
-            file.writelines(json.dumps(entry) + "\n" for entry in entries)
-    except OSError as error:
-        raise StorageError(f"The log {path} cannot be written ({error.strerror}).") from None
+def _lines(entries: Iterable[Mapping[str, Any]]) -> bytes:
+    return "".join(f"{json.dumps(entry)}\n" for entry in entries).encode()

@@ -9,7 +9,7 @@ from structgstream.exporters.formats import Format
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.splat import splat_bytes
 from structgstream.exporters.spz import spz_bytes
-from structgstream.exporters.whole_file import write_whole
+from structgstream.whole_files import write_whole
 
 FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
     "ply": ply_bytes,
@@ -36,5 +36,5 @@ def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) ->
         StorageError: the file cannot be written.
     """
     data = FORMAT_BYTES[format](gaussians)
-    write_whole(path, [data])
+    write_whole(path, data, new_folder=True)
     return len(data)

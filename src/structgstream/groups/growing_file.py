@@ -1,62 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that have their name only when they are whole, and locks on those that are being written."""
+"""Files that grow, and go on growing after an interruption, under another name until they are whole."""
 
-import errno
-import fcntl
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from structgstream.errors import StorageError
+from structgstream.whole_files import give_name, open_alone, partial_path
 
 
-def partial_path(path: Path) -> Path:
-    """The name of a file while it is written."""
-    return path.with_name(f"{path.name}.partial")
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Writes a small file, whole or not at all.
+def name_finished(path: Path) -> None:
+    """Gives a file its name that is whole under the other one: who wrote it was killed just before that.
 
     Raises:
-        StorageError: it cannot be written.
-    """
-    with whole_file(path) as file:
-        file.write(data)
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """A file that gets the name ``path`` at the end of the block, if that is reached.
-
-    Raises:
-        StorageError: it cannot be written.
+        StorageError: it cannot be renamed, or another process writes it.
     """
     partial = partial_path(path)
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        give_name(partial, path)
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written ({error.strerror}); make room or mend permissions.") from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-
-
-def give_name(partial: Path, path: Path) -> None:
-    """Renames a written and synced file, and syncs the folder, so that the name is there after a power cut."""
-    partial.replace(path)
-    with suppress(OSError):  # Some file systems cannot sync folders.
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
 
 
 class GrowingFile:
@@ -75,8 +35,7 @@ class GrowingFile:
     def __init__(self, path: Path, *, keep: int = 0) -> None:
         self.path, self.partial = path, partial_path(path)
         try:
-            descriptor = os.open(self.partial, os.O_RDWR | os.O_CREAT, 0o666)
-            self._file = os.fdopen(descriptor, "rb+", buffering=0)
+            self._file = open_alone(self.partial, of=path, buffering=0)
             try:
                 self._begin(keep)
             except BaseException:
@@ -87,14 +46,6 @@ class GrowingFile:
         self.size = keep
 
     def _begin(self, keep: int) -> None:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (errno.EACCES, errno.EAGAIN):
-                raise StorageError(
-                    f"Another process writes {self.path}; wait for its end, or give another name with -o."
-                ) from error
-            # A file system without locks, as some networks' are.
         if self._file.seek(0, os.SEEK_END) < keep:
             raise StorageError(f"Another process has changed {self.partial}; give the same command again.")
         self._file.truncate(keep)

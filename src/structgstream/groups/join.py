@@ -9,9 +9,9 @@ from typing import BinaryIO
 from structgstream.codec.container.index import pack_index
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError
-from structgstream.groups.growing_file import whole_file
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.training.patching import BIRTHS_PER_FRAME
+from structgstream.whole_files import whole_file
 
 
 def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False) -> int:

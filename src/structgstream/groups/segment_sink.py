@@ -15,9 +15,10 @@ from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import PacketInfo
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
-from structgstream.groups.growing_file import GrowingFile, partial_path
+from structgstream.groups.growing_file import GrowingFile, name_finished
 from structgstream.groups.segment_file import Segment, SegmentIdentity, open_segment
 from structgstream.scene.scene import Scene
+from structgstream.whole_files import partial_path
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _KINDS = {record: kind for kind, record in _TYPES.items()}
@@ -177,9 +178,8 @@ def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Se
     found = _matching(partial_path(path), base, identity) if partial_path(path).exists() else None
     if found is None or not found.complete:
         return found
-    size = len(found.data)
     found.close()
-    GrowingFile(path, keep=size).finish()
+    name_finished(path)
     return open_segment(path)
 
 

@@ -18,7 +18,8 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.boundaries import equal_groups, quiet_groups
-from structgstream.groups.growing_file import partial_path, write_whole
+from structgstream.groups.group_list import Groups, groups_path, write_groups
+from structgstream.groups.growing_file import name_finished
 from structgstream.groups.pictures import fingerprint
 from structgstream.groups.segment_file import Segment
 from structgstream.groups.segment_sink import GroupSoFar
@@ -29,6 +30,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.training.motion_start import with_displacements
 from structgstream.training.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
+from structgstream.whole_files import partial_path
 
 
 @dataclass(frozen=True)
@@ -74,17 +76,13 @@ class TrackProgress:
     stored_bytes: int = 0
 
 
-def groups_path(track: Path) -> Path:
-    """The path of a track's list of groups, one ``a:b`` a line."""
-    return track.with_name(f"{track.name}.groups")
-
-
 def track_capture(
     path: Path, source: FrameSource, base: GroupBase, options: TrackOptions, backend: Backend
 ) -> Generator[TrackProgress, None, None]:
     """Tracks through ``source`` into the file ``path``; goes on where an interrupted pass has stopped.
 
-    The generator yields after each frame; a track that is finished yields nothing.
+    The generator yields after each frame; a track in which nothing is missing yields nothing, and gets its name if the
+    pass was killed just before that.
 
     Raises:
         ConfigError: ``path`` is another track.
@@ -104,9 +102,10 @@ def track_capture(
     )
     found = _existing(path, head)
     if found is not None and found.groups is not None:
+        _end(path, found.groups)
         return
     if not options.quiet:
-        _write_groups(path, _groups(options, len(source), {}))
+        write_groups(path, _groups(options, len(source), {}))
     done = [] if found is None else [*found.whole_starts()]
     writer = TrackWriter(path, head, keep=done[-1][1] if done else 0)
     try:
@@ -118,10 +117,18 @@ def track_capture(
         past = Pass.at(base, options.tracking, backend, last)
         yield from _frames(past, source, writer, first=options.first, every=every, changed=changed)
         groups = _groups(options, len(source), changed)
-        _write_groups(path, groups)
+        write_groups(path, groups)
         writer.finish(len(source), groups)
     finally:
         writer.close()
+
+
+def _end(path: Path, groups: Groups) -> None:
+    """Does what a pass that was killed after its last record did not come to."""
+    if not groups_path(path).exists():
+        write_groups(path, groups)
+    if not path.exists():
+        name_finished(path)
 
 
 def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
@@ -182,10 +189,6 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
             "another name, or --overwrite."
         )
     return found
-
-
-def _write_groups(path: Path, groups: list[tuple[int, int]]) -> None:
-    write_whole(groups_path(path), "".join(f"{first}:{end}\n" for first, end in groups).encode())
 
 
 @dataclass

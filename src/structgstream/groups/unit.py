@@ -10,7 +10,6 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.groups.base import GroupBase
-from structgstream.groups.growing_file import partial_path
 from structgstream.groups.method import GroupEntry, GroupMethod
 from structgstream.groups.pictures import fingerprint, open_for
 from structgstream.groups.segment_file import Segment, SegmentIdentity
@@ -25,6 +24,7 @@ from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.group_start import GroupStartConfig
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import StepListener
+from structgstream.whole_files import partial_path
 
 LEAST_PIXELS = 0.5
 """A mover that was tracked no further than this, pixels of a median camera, is where frame 0 has it."""

@@ -19,6 +19,7 @@ import torch
 
 from structgstream.errors import BackendError
 from structgstream.kernels.cuda_ssim import LossLibrary, cuda_stream
+from structgstream.whole_files import give_name
 
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC")
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes
@@ -70,7 +71,7 @@ def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Pa
         with tempfile.TemporaryDirectory(dir=cache) as scratch:
             built = Path(scratch) / library.name
             _output([str(nvcc), *flags, "-o", str(built), *map(str, units)])
-            built.replace(library)
+            give_name(built, library)
     except OSError as error:
         raise BackendError(f"Compiled CUDA kernels cannot be kept in {cache} ({error}); set XDG_CACHE_HOME.") from error
     return library

@@ -130,15 +130,15 @@ def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
     first, end = 0, tracking
     for length in work.groups:
         tracked = begin if not first else begin + costs.track_start_seconds + (first + 1) * costs.track_seconds
+        # Frame 0 is in the header, so that its group has no first frame to fit.
         fitting = length * costs.frame_seconds + (costs.first_seconds if first else -costs.frame_seconds)
-        done = max(heapq.heappop(free), tracked) + costs.process_seconds + fitting  # Frame 0 is in the header.
+        done = max(heapq.heappop(free), tracked) + costs.process_seconds + fitting
         heapq.heappush(free, done)
         end, first = max(end, done), first + length
     joining = _joining(costs, work)
     total = end + joining
-    return Estimate(
-        workers, total, costs.header_seconds, end - tracking, joining, sequential_seconds(costs, work) / total
-    )
+    speedup = sequential_seconds(costs, work) / total
+    return Estimate(workers, total, costs.header_seconds, end - tracking, joining, speedup)
 
 
 def workers_for(costs: Costs, work: Work, seconds: float) -> Estimate | None:

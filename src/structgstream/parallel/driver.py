@@ -11,9 +11,11 @@ from structgstream.executors.executor import Executor, TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.places import Place
 from structgstream.executors.task import Ending, Task
+from structgstream.groups.group_list import Groups, groups_path, read_groups
 from structgstream.parallel.exchange import Exchange, SharedFolder
-from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of, write_whole
-from structgstream.parallel.unit import HEADER, JOIN, TRACK, Groups, Unit, groups_of, groups_path
+from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
+from structgstream.parallel.unit import HEADER, JOIN, TRACK, Unit
+from structgstream.whole_files import write_whole
 
 POLL_SECONDS = 0.5
 LINES_TOLD = 6
@@ -152,7 +154,7 @@ class _Drive:
         if not is_tracked:
             self._exchange.follow()
         if not self._status.groups:
-            groups = groups_of(self._parts.track)
+            groups = read_groups(self._parts.track)
             if groups is None:
                 return
             self._index = {group_name(*group): i for i, group in enumerate(groups)}
@@ -187,7 +189,7 @@ class _Drive:
             if ending.done:
                 self._exchange.bring(self._parts.track)
                 self._exchange.bring(groups_path(self._parts.track))
-                frames = (groups_of(self._parts.track) or [(0, 0)])[-1][1]
+                frames = (read_groups(self._parts.track) or [(0, 0)])[-1][1]
                 self._parts.note(ending, key_of(self._header_key), self._parts.track, frames=frames)
             return
         first, end = self._status.groups[self._index[ending.name]]

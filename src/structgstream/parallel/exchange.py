@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Protocol
 
 from structgstream.executors.task import PYTHON, Task
+from structgstream.groups.group_list import groups_path
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.staged import HERE, assembled, growing_files, write_here
-from structgstream.parallel.unit import CutsTrack, groups_path
+from structgstream.parallel.pieces import last_pieces
+from structgstream.parallel.staged import HERE
+from structgstream.parallel.unit import CutsTrack
+from structgstream.whole_files import partial_path, write_whole
 
 STAGED = (PYTHON, "-m", "structgstream.parallel.staged")
 LOOK_SECONDS = 1.0
@@ -75,6 +78,7 @@ class ObjectStore:
     def __init__(self, store: ObjectFolder, parts: Parts, *, cut: CutsTrack) -> None:
         self._store, self._parts, self._cut = store, parts, cut
         self._looked = 0.0
+        self._followed = ""  # the attempt at the track that is copied here
 
     def header(self, task: Task) -> Task:
         """See ``Exchange.header``."""
@@ -90,19 +94,20 @@ class ObjectStore:
         """See ``Exchange.group``."""
         track = self._parts.track.with_name(f"start-{first:06d}.sgt")
         command = tuple(word.replace(str(self._parts.track), str(track)) for word in task.command)
-        partial, _ = growing_files(self._name(track))
+        partial = self._name(partial_path(track))
         if first:
             self._store.write(partial, self._cut(self._parts.track, first))
         segment = Path(task.result)
         log = segment.with_suffix(".log.jsonl")
         files = ["--needs", self._name(self._parts.header), "--needs", partial]
-        files += ["--gives", self._name(segment), "--gives", self._name(log)]
+        # The segment last: who finds it in the store finds its log.
+        files += ["--gives", self._name(log), "--gives", self._name(segment)]
         return self._staged(replace(task, command=command), files)
 
     def bring(self, part: Path) -> None:
         """See ``Exchange.bring``."""
         if (data := self._store.read(self._name(part))) is not None:
-            write_here(part, data)
+            write_whole(part, data, new_folder=True)
 
     def follow(self) -> None:
         """See ``Exchange.follow``; asks the store once a second."""
@@ -113,9 +118,13 @@ class ObjectStore:
         groups = groups_path(track)
         if not groups.exists():
             self.bring(groups)
-        partial = track.with_name(growing_files(track.name)[0])
-        with partial.open("ab") as file:
-            file.write(assembled(self._store, self._name(track), have=file.tell()))
+        partial, pieces = partial_path(track), last_pieces(self._store, self._name(track))
+        if pieces.attempt != self._followed:
+            write_whole(partial, pieces.read(self._store))
+            self._followed = pieces.attempt
+        elif pieces.attempt:
+            with partial.open("ab") as file:
+                file.write(pieces.read(self._store, have=file.tell()))
 
     def _name(self, path: Path) -> str:
         return str(path.relative_to(self._parts.folder))

@@ -8,9 +8,10 @@ from typing import Any
 
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import read_log
+from structgstream.groups.group_list import read_groups
 from structgstream.parallel.cost import Costs
-from structgstream.parallel.parts import Note, Parts
-from structgstream.parallel.unit import HEADER, JOIN, TRACK, groups_of
+from structgstream.parallel.parts import Note, Parts, group_name
+from structgstream.parallel.unit import HEADER, JOIN, TRACK
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def measured_in(folder: Path) -> Measured:
         ConfigError: there is no finished run, or none with a group that begins after frame 0.
     """
     parts = Parts(folder)
-    groups = [(parts.notes.get(f"group-{a:06d}-{b:06d}"), a, b) for a, b in groups_of(parts.track) or ()]
+    groups = [(parts.notes.get(group_name(a, b)), a, b) for a, b in read_groups(parts.track) or ()]
     if not {HEADER, TRACK, JOIN} <= parts.notes.keys() or any(note is None for note, _, _ in groups):
         raise ConfigError(
             f"{folder} has no finished parallel run; give the OUT.parts of one, or none, so that two groups are fitted."

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from structgstream.errors import MissingExtraError, StorageError
+from structgstream.errors import StorageError
+from structgstream.remote_folders import open_url, reason_of
 
 T = TypeVar("T")
 TRIES = 8
@@ -31,17 +32,8 @@ class ObjectFolder:
     """
 
     def __init__(self, url: str) -> None:
-        try:
-            from fsspec.core import url_to_fs
-        except ModuleNotFoundError:
-            raise MissingExtraError("fsspec", "cloud") from None
         self.url = url.rstrip("/")
-        try:
-            self._files, self._root = url_to_fs(self.url, use_listings_cache=False)
-        except ImportError as error:
-            raise MissingExtraError(str(error.name or "s3fs"), "cloud") from None
-        except Exception as error:  # Each file system has its own; all mean that it cannot be used.
-            raise StorageError(f"{url} cannot be used as a store ({_reason(error)}).") from error
+        self._files, self._root = open_url(self.url)
 
     def write(self, name: str, data: bytes) -> None:
         """Writes or replaces an object.
@@ -115,11 +107,7 @@ class ObjectFolder:
                 return action()
             except Exception as error:  # Each file system has its own.
                 if attempt + 1 == TRIES:
-                    raise StorageError(f"Cannot {what} in {self.url} ({_reason(error)}).") from error
+                    raise StorageError(f"Cannot {what} in {self.url} ({reason_of(error)}).") from error
             time.sleep(delay)
             delay = min(2 * delay, LONGEST_DELAY_SECONDS)
         raise AssertionError("unreachable")
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

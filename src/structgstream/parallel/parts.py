@@ -6,11 +6,8 @@ else is believed: what was cut or has rotted since, or is of other options, is m
 from it what it can.
 """
 
-import errno
-import fcntl
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +17,8 @@ from typing import Any
 
 from structgstream.errors import ConfigError, StorageError
 from structgstream.executors.task import Ending
+from structgstream.file_locks import lock_file
+from structgstream.whole_files import write_whole
 
 PLAN = "plan.json"
 NOTES = "done.jsonl"
@@ -90,13 +89,10 @@ class Parts:
         except OSError as error:
             raise StorageError(f"The folder {self.folder} cannot be made ({error.strerror}).") from error
         with file:
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in (errno.EACCES, errno.EAGAIN):
-                    raise StorageError(
-                        f"Another process makes the parts in {self.folder}; wait for its end, or choose another output."
-                    ) from error
+            if not lock_file(file, holder="process"):
+                raise StorageError(
+                    f"Another process makes the parts in {self.folder}; wait for its end, or choose another output."
+                )
             yield
 
     def clear(self) -> None:
@@ -105,8 +101,10 @@ class Parts:
         Raises:
             StorageError: they cannot be removed.
         """
+        # Killed before its end, what is left is still parts of the old plan, and none of them is believed.
+        order = {NOTES: 0, PLAN: 2}
         try:
-            for path in self.folder.iterdir():
+            for path in sorted(self.folder.iterdir(), key=lambda path: order.get(path.name, 1)):
                 if path.is_dir():
                     shutil.rmtree(path)
                 elif path.name != _LOCK:
@@ -171,11 +169,7 @@ class Parts:
         if earlier is not None and (earlier.key, earlier.sha256) == (note.key, note.sha256):
             return earlier
         self.notes[note.name] = note
-        try:
-            with (self.folder / NOTES).open("a") as file:
-                file.write(json.dumps(asdict(note)) + "\n")
-        except OSError as error:
-            raise StorageError(f"{self.folder / NOTES} cannot be written ({error.strerror}).") from error
+        write_whole(self.folder / NOTES, [f"{json.dumps(asdict(each))}\n".encode() for each in self.notes.values()])
         return note
 
 
@@ -185,7 +179,7 @@ def group_name(first: int, end: int) -> str:
 
 
 def read_notes(folder: Path) -> dict[str, Note]:
-    """The last note of each task; lines that a crash has cut are passed over."""
+    """The last note of each task; what is no note is passed over."""
     try:
         lines = (folder / NOTES).read_text().splitlines()
     except OSError:
@@ -216,23 +210,6 @@ def sha256_of(path: Path) -> str:
         while piece := file.read(_PIECE_BYTES):
             digest.update(piece)
     return digest.hexdigest()
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Writes or replaces a file in one step.
-
-    Raises:
-        StorageError: it cannot be written.
-    """
-    temporary = path.with_name(f".new-{os.getpid()}-{path.name}")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written ({error.strerror}).") from error
 
 
 def _json_of(path: Path) -> dict[str, Any] | None:

@@ -18,33 +18,14 @@ from pathlib import Path
 from structgstream.errors import StructGStreamError
 from structgstream.executors.task import words
 from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.pieces import GrowingCopy, last_pieces
+from structgstream.whole_files import partial_path, write_whole
 
 HERE = "{here}"
 """In a word of the command: the folder of this machine."""
 SCRATCH = "STRUCTGSTREAM_SCRATCH"
 """The variable that names a folder for files of this machine; without it, that of temporary files."""
 LOOK_SECONDS = 1.0
-
-
-def growing_files(name: str) -> tuple[str, ...]:
-    """Under which names a file lies while it grows and afterwards."""
-    return f"{name}.partial", name
-
-
-def pieces_of(name: str) -> str:
-    """The folder of the store with the pieces of a file that grows, named by where they begin."""
-    return f"{name}.pieces"
-
-
-def assembled(store: ObjectFolder, name: str, *, have: int = 0) -> bytes:
-    """What the store has of a growing file from byte ``have`` on."""
-    data = b""
-    for piece in store.names(pieces_of(name)):
-        begins = int(piece.rsplit("/", 1)[-1])
-        content = store.read(piece)
-        if content is not None and begins <= have + len(data) < begins + len(content):
-            data += content[have + len(data) - begins :]
-    return data
 
 
 class Staging:
@@ -58,41 +39,21 @@ class Staging:
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists() and (data := self.store.read(name)) is not None:
-            write_here(path, data)
+            write_whole(path, data)
 
     def bring_growing(self, name: str) -> None:
         """As :meth:`bring`, of a file that grows."""
         self.bring(name)
-        partial, whole = (self.folder / each for each in growing_files(name))
-        if not whole.exists() and not partial.exists() and (data := assembled(self.store, name)):
-            write_here(partial, data)
+        whole = self.folder / name
+        partial = partial_path(whole)
+        if not whole.exists() and not partial.exists() and (data := last_pieces(self.store, name).read(self.store)):
+            write_whole(partial, data)
 
     def take(self, name: str) -> None:
         """Takes a file to the store, if there is one."""
         path = self.folder / name
         if path.exists():
             self.store.write(name, path.read_bytes())
-
-    def take_piece(self, name: str, have: int) -> int:
-        """Takes what a growing file has from byte ``have`` on to the store; returns how much there is then."""
-        for each in growing_files(name):
-            try:
-                with (self.folder / each).open("rb") as file:
-                    file.seek(have)
-                    data = file.read()
-            except OSError:
-                continue
-            if data:
-                self.store.write(f"{pieces_of(name)}/{have:015d}", data)
-            return have + len(data)
-        return have
-
-
-def write_here(path: Path, data: bytes) -> None:
-    """Writes a file in one step."""
-    temporary = path.with_name(f".new-{os.getpid()}-{path.name}")
-    temporary.write_bytes(data)
-    temporary.replace(path)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -109,14 +70,14 @@ def run(options: argparse.Namespace) -> int:
         staging.bring_growing(name)
     command = words(tuple(word.replace(HERE, str(staging.folder)) for word in options.command))
     process = subprocess.Popen(command)
-    have = dict.fromkeys(options.grows, 0)
+    growing = [GrowingCopy(staging.store, name, of=staging.folder / name) for name in options.grows]
     while True:
         try:
             status = process.wait(LOOK_SECONDS)
         except subprocess.TimeoutExpired:
             status = None
-        for name in options.grows:
-            have[name] = staging.take_piece(name, have[name])
+        for copy in growing:
+            copy.take()
         for name in options.early:
             staging.take(name)
         if status is not None:

@@ -2,7 +2,7 @@
 """The commands that a parallel run consists of, as tasks: header, tracking pass, a group each, joining."""
 
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -10,11 +10,12 @@ from typing import Protocol
 from structgstream.errors import StreamError
 from structgstream.executors.places import thread_environment
 from structgstream.executors.task import PYTHON, Task
+from structgstream.groups.group_list import Groups
 from structgstream.parallel.parts import Parts, group_name
+from structgstream.whole_files import partial_path
 
 HEADER, TRACK, JOIN = "header", "track", "join"
 PROGRAM = (PYTHON, "-m", "structgstream")
-Groups = Sequence[tuple[int, int]]
 
 
 class ReadsTrack(Protocol):
@@ -45,7 +46,6 @@ def cut_track(track: Path, first: int) -> bytes:
     Raises:
         StreamError: there is none, or it is damaged.
     """
-    from structgstream.groups.growing_file import partial_path
     from structgstream.groups.track_file import TrackWriter, open_track
 
     found = open_track(track)
@@ -109,31 +109,3 @@ class Unit:
         segments = [str(parts.segment(first, end)) for first, end in groups]
         command = (*self.program, "join", *segments, "-o", str(output), "--overwrite")
         return Task(JOIN, command, str(output), parts.log(JOIN))
-
-
-def groups_path(track: Path) -> Path:
-    """Where the groups of a track are listed."""
-    return track.with_name(f"{track.name}.groups")
-
-
-def groups_of(track: Path) -> Groups | None:
-    """The groups that a track is for; None while they are not decided.
-
-    Raises:
-        StreamError: they have gaps, or are no groups.
-    """
-    path = groups_path(track)
-    try:
-        text = path.read_text(errors="replace")
-    except OSError:
-        return None
-    if not text.endswith("\n"):
-        return None
-    try:
-        groups = [(int(first), int(end)) for first, _, end in (line.partition(":") for line in text.split())]
-    except ValueError:
-        raise StreamError(f"{path} has no groups, 'first:end' a line.") from None
-    borders = [0, *(end for _, end in groups)]
-    if not groups or [first for first, _ in groups] != borders[:-1] or borders != sorted(set(borders)):
-        raise StreamError(f"The groups in {path} do not follow each other from frame 0 on.")
-    return groups

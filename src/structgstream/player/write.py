@@ -4,10 +4,10 @@
 from pathlib import Path
 
 from structgstream.errors import StorageError
-from structgstream.exporters.whole_file import write_whole
 from structgstream.player.bundle import bundle
 from structgstream.player.page import linked_page, single_page
 from structgstream.player.stream_file import StreamFile, check_has_header, pieces
+from structgstream.whole_files import write_whole
 
 
 def write_page(path: Path, stream: StreamFile) -> int:
@@ -24,7 +24,7 @@ def write_page(path: Path, stream: StreamFile) -> int:
     with stream.opened() as data:
         check_has_header(data, str(stream.path))
         page = single_page(stream.path.stem, module=bundle(), stream=data)
-    write_whole(path, [page])
+    write_whole(path, page, new_folder=True)
     return len(page)
 
 
@@ -48,7 +48,7 @@ def write_site(folder: Path, stream: StreamFile) -> int:
         "player.js": bundle().encode(),
     }
     for name, content in small.items():
-        write_whole(folder / name, [content])
+        write_whole(folder / name, content, new_folder=True)
     with stream.opened() as data:
-        write_whole(copy, pieces(data, range(len(data))))
+        write_whole(copy, pieces(data, range(len(data))), new_folder=True)
         return sum(map(len, small.values())) + len(data)

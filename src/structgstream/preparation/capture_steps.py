@@ -21,13 +21,12 @@ from structgstream.data.prepared import (
     prepared_rig,
     write_prepared,
 )
+from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.data.tone import ToneCurve
-from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
-from structgstream.errors import StorageError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 from structgstream.preparation.checking.findings import Finding
@@ -38,6 +37,7 @@ from structgstream.preparation.linking import bring
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.steps import FOLDER, Stored
 from structgstream.similarity import rig_radius
+from structgstream.whole_files import whole_file
 
 REPORT = "report"
 POINTS = "points.npy"
@@ -109,10 +109,8 @@ class CaptureSteps:
             summary=lambda points: f"{len(points):,} points of frame 0",
             after=("synchronize",),
         )  # fmt: skip
-        try:
-            np.save(self.capture / POINTS, found)
-        except OSError as error:
-            raise StorageError(f"{self.capture / POINTS} cannot be written ({error.strerror}).") from None
+        with whole_file(self.capture / POINTS) as file:
+            np.save(file, found)
         content = replace(content, points=POINTS)
         write_prepared(self.capture, content)
         return content

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whose folder a capture is: one of other videos, made by hand, or in another process's hands is not written into."""
 
-import fcntl
 import json
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from structgstream.errors import CaptureError, StorageError
+from structgstream.file_locks import lock_file
 from structgstream.preparation.steps import FOLDER
+from structgstream.whole_files import partial_path, replacing
 
 SOURCE = "source.json"
 LOCK = ".preparing"
+_CLAIMS = (Path(FOLDER), partial_path(Path(FOLDER, SOURCE)))
+"""What a claim that was killed or met a full disk leaves in a folder, which is as free as before."""
 
 
 def claim(capture: Path, videos: Path) -> None:
@@ -35,19 +37,15 @@ def claim(capture: Path, videos: Path) -> None:
                 f"{capture} was prepared from {before}, not from {origin}; choose another folder with -o, or remove it."
             )
         return
-    if capture.exists() and any(capture.iterdir()):
+    if any(entry not in _CLAIMS for entry in _below(capture)):
         raise CaptureError(
             f"The folder {capture} is not empty and was not made by prepare; choose another with -o, or empty it."
         )
-    part = marker.with_suffix(".part")
     try:
         marker.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps({"videos": origin}) + "\n")
-        os.replace(part, marker)
+        with replacing(marker) as file:
+            file.write(f"{json.dumps({'videos': origin})}\n".encode())
     except OSError as error:
-        with suppress(OSError):  # so that the folder is empty as before, when there is room again
-            part.unlink(missing_ok=True)
-            marker.parent.rmdir()
         raise StorageError(f"The folder {capture} cannot be written ({error.strerror}).") from None
 
 
@@ -66,15 +64,16 @@ def alone(capture: Path) -> Iterator[None]:
     except OSError as error:
         raise StorageError(f"The folder {capture} cannot be written ({error.strerror}).") from None
     with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock_file(file):
             raise StorageError(
                 f"Another process prepares {capture} now; wait for its end, or choose another folder with -o."
-            ) from None
-        except OSError:
-            pass  # A file system without locks, as some networks' are.
+            )
         yield
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    """Everything in a folder and its folders, relative to it; nothing if there is none."""
+    return (path.relative_to(folder) for path in folder.rglob("*"))
 
 
 def _origin(marker: Path) -> str | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from structgstream.errors import StorageError
+from structgstream.whole_files import give_name, partial_path
 
 Link = Literal["hard", "symlink", "copy"]
 
@@ -50,9 +51,9 @@ def _bring_file(source: Path, target: Path, link: Link) -> None:
             return
         except OSError:  # another file system, or one without links
             pass
-    part = target.with_name(f"{target.name}.part")
+    part = partial_path(target)
     shutil.copy2(source, part)
-    os.replace(part, target)
+    give_name(part, target)
 
 
 def _same(source: Path, target: Path, link: Link) -> bool:

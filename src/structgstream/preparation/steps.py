@@ -7,7 +7,6 @@ inputs and of the keys of the steps before it; the JSON is written last, so what
 
 import hashlib
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import StorageError
+from structgstream.whole_files import replacing
 
 FOLDER = "work"
 VERSION = 4  # of the steps' results; a new one does all steps again
@@ -137,12 +137,10 @@ class Steps:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             numbers.unlink(missing_ok=True)
-            part = arrays.with_suffix(".part")
-            with part.open("wb") as file:
+            with replacing(arrays) as file:
                 np.savez_compressed(file, **stored.arrays)  # pyright: ignore[reportArgumentType]
-            os.replace(part, arrays)
-            part.write_text(json.dumps({"key": key, "values": stored.values}, indent=1) + "\n")
-            os.replace(part, numbers)
+            with replacing(numbers) as file:
+                file.write(f"{json.dumps({'key': key, 'values': stored.values}, indent=1)}\n".encode())
         except OSError as error:
             raise StorageError(
                 f"The result of step {step!r} cannot be written to {self._folder} ({error.strerror}); make room, or "

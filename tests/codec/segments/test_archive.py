@@ -9,9 +9,8 @@ import pytest
 from segment_folders import GrowingFolder
 from segment_streams import as_file, folder, packets, written
 from streams import small_stream
-from structgstream.codec.segments import archive
 from structgstream.codec.segments.archive import write_archive
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.errors import StorageError, StreamError
@@ -72,8 +71,8 @@ def test_a_file_that_cannot_be_written_leaves_nothing(
     def full(handle: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(archive.os, "fsync", full)
-    with pytest.raises(StorageError, match=r"a\.sgs cannot be written \(No space left on device\)"):
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match=r"a\.sgs cannot be written \(No space left on device\); make room"):
         write_archive(store, tmp_path / "a.sgs")
     assert os.listdir(tmp_path) == ["out"]
 

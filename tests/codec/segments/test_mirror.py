@@ -11,7 +11,7 @@ from segment_streams import Hands, as_file, folder, packets, written
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.manifest_json import manifest_from_json
 from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError

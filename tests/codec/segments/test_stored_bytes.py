@@ -15,7 +15,7 @@ from streams import small_stream
 from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.manifest_json import manifest_to_json
-from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments, read_manifest
 from structgstream.errors import StreamError

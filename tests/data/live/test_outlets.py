@@ -131,7 +131,7 @@ def test_a_resumed_run_takes_what_waited_when_it_was_killed(tmp_path: Path) -> N
     assert taken(killed) == 0.0
     while len(list((tmp_path / "q").glob("set-*"))) < 4:
         threading.Event().wait(0.001)
-    (tmp_path / "q" / "set-00000005.part").write_bytes(b"half")
+    (tmp_path / "q" / "set-00000005.partial").write_bytes(b"half")
     again = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert, resume=True)
     again.put(one_set(9))
     assert [taken(again) for _ in range(5)] == [1, 2, 3, 4, 9]

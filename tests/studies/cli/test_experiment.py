@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from backends import QUICKEST
+from quick_streams import CLIP, error_of
 from small_presets import few_points
 from structgstream.cli import main
 from structgstream.cli.options import CaptureOptions, resolve_config
@@ -26,7 +27,6 @@ from structgstream_studies.experiments.sweep import Outcome, Progress
 from structgstream_studies.experiments.tasks import VariantRun
 from structgstream_studies.experiments.worker import Task
 
-CLIP = str(bundled_clip_path())
 SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", QUICKEST, "--jobs", "2"]
 QUICK = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2"]
 QUICK += ["--online.patching.iteration", "1"]
@@ -38,16 +38,6 @@ def with_iterations(config: StreamConfig, iterations: int) -> StreamConfig:
 
 def ablate(folder: Path) -> list[str]:
     return ["ablate", CLIP, "--table", "distance", "-o", str(folder), *SMALL, *QUICK]
-
-
-def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status: int) -> str:
-    """What a command that fails with ``status`` says; never a traceback."""
-    capsys.readouterr()
-    assert main(arguments) == status
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert "should not happen" not in error
-    return error
 
 
 def contents(folder: Path) -> dict[str, int]:

@@ -39,12 +39,10 @@ def test_writing_that_breaks_off_leaves_the_old_result(tmp_path: Path, monkeypat
     path = tmp_path / "r.json"
     write_result(path, outcome("v", psnr=30.0))
 
-    def cut(self: Path, text: str) -> int:
-        with self.open("w") as file:
-            file.write(text[: len(text) // 2])
+    def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", cut)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(StorageError, match=r"r\.json cannot be written \(No space left on device\)"):
         write_result(path, outcome("v", psnr=20.0))
     monkeypatch.undo()

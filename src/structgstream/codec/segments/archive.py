@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stream of segments as one stream file."""
 
-import os
 from pathlib import Path
 
 from structgstream.codec.segments.store import Store
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
-from structgstream.errors import StorageError, StreamError
+from structgstream.errors import StreamError
+from structgstream.whole_files import write_whole
 
 
 def write_archive(store: Store, path: Path) -> int:
@@ -26,16 +26,5 @@ def write_archive(store: Store, path: Path) -> int:
             f"{store.name} is not whole: frames {gone} have left its window (--window). A stream file has no gaps; "
             "reconstruct without a window to archive a whole stream."
         )
-    partial = path.with_name(f"{path.name}.partial")
-    try:
-        with partial.open("wb") as file:
-            for data in stored.files():
-                file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, stored.files())
     return len(stored.sizes)

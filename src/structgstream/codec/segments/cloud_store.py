@@ -7,7 +7,8 @@ from typing import Any
 
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.store import is_ours
-from structgstream.errors import MissingExtraError, StorageError, StreamError
+from structgstream.errors import StorageError, StreamError
+from structgstream.remote_folders import open_url, reason_of
 
 IMMUTABLE = "public, max-age=31536000, immutable"
 """Cache-Control of everything but the manifest."""
@@ -32,17 +33,8 @@ class CloudStore:
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        try:
-            from fsspec.core import url_to_fs
-        except ModuleNotFoundError:
-            raise MissingExtraError("fsspec", "cloud") from None
         self.name = url.rstrip("/")
-        try:
-            self._files, self._root = url_to_fs(self.name, use_listings_cache=False, **options)
-        except ImportError as error:
-            raise MissingExtraError(str(error.name or "s3fs"), "cloud") from None
-        except Exception as error:  # Each file system has its own; all mean that it cannot be used.
-            raise StorageError(f"{url} cannot be used as a store ({_reason(error)}).") from error
+        self._files, self._root = open_url(self.name, **options)
         protocols = self._files.protocol
         self._scheme = protocols if isinstance(protocols, str) else protocols[0]
 
@@ -63,7 +55,7 @@ class CloudStore:
         try:
             return self._files.cat_file(f"{self._root}/{name}")
         except Exception as error:
-            raise StreamError(f"Cannot read {name} in {self.name} ({_reason(error)}).") from error
+            raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error)}).") from error
 
     def delete(self, name: str) -> None:
         """See ``Store.delete``."""
@@ -81,7 +73,7 @@ class CloudStore:
         except FileNotFoundError:
             return frozenset()
         except Exception as error:
-            raise StreamError(f"Cannot list {self.name} ({_reason(error)}).") from error
+            raise StreamError(f"Cannot list {self.name} ({reason_of(error)}).") from error
         return frozenset(filter(is_ours, (str(path).rsplit("/", 1)[-1] for path in found)))
 
     def free_bytes(self) -> int | None:
@@ -99,8 +91,4 @@ class CloudStore:
         try:
             yield
         except Exception as error:
-            raise StorageError(f"Cannot {what} in {self.name} ({_reason(error)}).") from error
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+            raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error)}).") from error

@@ -10,7 +10,7 @@ should the manifest that names it never be written, resuming finds the part by i
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -18,13 +18,10 @@ from structgstream.codec.container.disk_room import check_room
 from structgstream.codec.container.records import RecordType, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.segments.group import part_of
-from structgstream.codec.segments.history import segments_from
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     Edge,
     Manifest,
-    PeriodEntry,
-    SegmentEntry,
     Window,
 )
 from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
@@ -35,13 +32,12 @@ from structgstream.codec.segments.next_manifest import (
     period_entry,
     periods_in,
     reopened,
-    running_period,
     with_frame,
     with_period,
     with_segment,
     without_empty_period,
 )
-from structgstream.codec.segments.recovery import stale_files
+from structgstream.codec.segments.retention import Retention, SegmentsOptions
 from structgstream.codec.segments.store import Store
 from structgstream.errors import StorageError, StreamError
 
@@ -49,19 +45,6 @@ _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _RECENT_FRAMES = 8
 _LATENCY_FRAMES = 3.0
 _ENTRY_BYTES = 1024
-
-
-@dataclass(frozen=True)
-class SegmentsOptions:
-    """What of a stream is kept.
-
-    Args:
-        window_seconds: media seconds before the edge that viewers can go back; None for everything.
-        grace_seconds: seconds that a file stays after the last manifest that named it.
-    """
-
-    window_seconds: float | None = None
-    grace_seconds: float = 120.0
 
 
 def _unknown(frame: int) -> float | None:
@@ -105,14 +88,10 @@ class SegmentsSink:
     ) -> None:
         self._store = store
         self._overwrite = overwrite
-        self._options = options or SegmentsOptions()
         self._clocks = clocks or Clocks()
         self._found = found
         self._draft: Draft | None = None
-        self._present: list[SegmentEntry] = []  # segments in the window, if there is one
-        self._kept: list[SegmentEntry] = []  # those that have left it and are needed to resume
-        self._named: tuple[PeriodEntry, ...] = ()  # the last manifest's periods
-        self._leaving: dict[str, float] = {}  # files that no manifest names, and since when; oldest first
+        self._retention = Retention(store, options or SegmentsOptions(), self._clocks.elapsed)
         self._published: deque[float] = deque(maxlen=_RECENT_FRAMES + 1)
         self._header_bytes = self._largest = 0
 
@@ -201,20 +180,11 @@ class SegmentsSink:
 
     def _continue(self, found: Draft) -> None:
         """Write what a killed run did not come to, and take up the stream where it ends."""
-        manifest, there = found.manifest, self._store.names()
-        self._header_bytes = manifest.periods[-1].bytes
+        self._header_bytes = found.manifest.periods[-1].bytes
         self._largest = max(map(len, found.records), default=0)
         self._put(found.files)
-        if self._options.window_seconds is not None:
-            first, needed = manifest.window.first_segment, running_period(manifest).first_segment
-            found_from = min(first, needed)
-            there_are = segments_from(self._store, manifest.history, manifest.segments, first=found_from)
-            entries = [entry for entry in there_are if entry.segment >= first or entry.segment == needed]
-            self._present = [entry for entry in entries if entry.segment >= first]
-            self._kept = [entry for entry in entries if entry.segment < first]
-        now = self._clocks.elapsed()
-        self._leaving = dict.fromkeys(sorted(stale_files(manifest, there)), now)
-        self._publish(replace(found, manifest=replace(manifest, live=True)), [])
+        self._retention.take_up(found.manifest)
+        self._publish(replace(found, manifest=replace(found.manifest, live=True)), [])
 
     def _remove(self, there: frozenset[str]) -> int:
         """Remove the stream that is to be replaced, its manifest first; returns its last sequence number."""
@@ -234,39 +204,14 @@ class SegmentsSink:
             leaving: files that this manifest is the first not to name.
         """
         self._put(draft.files)
-        present = self._present_with(draft.manifest)
-        gone = self._leaving_segments(draft.manifest, present)
-        manifest = self._with_window(draft.manifest, present[:gone])
+        turnover = self._retention.turnover(draft.manifest)
+        manifest = self._stamped(draft.manifest, turnover.window)
         self._put([(MANIFEST, manifest_to_json(manifest))])
         self._draft = Draft(manifest, draft.records)
-        self._present = present[gone:]
-        needed = running_period(manifest).first_segment  # Its first frame is needed to resume.
-        left = [*self._kept, *present[:gone]]
-        self._kept = [entry for entry in left if entry.segment == needed]
-        ended = {period.file for period in self._named} - {period.file for period in manifest.periods}
-        self._named = manifest.periods
-        self._forget([*leaving, *sorted(ended), *(entry.file for entry in left if entry.segment != needed)])
+        self._retention.published(manifest, turnover, leaving)
 
-    def _present_with(self, manifest: Manifest) -> list[SegmentEntry]:
-        """The segments that are there, if there is a window, as of this manifest."""
-        if self._options.window_seconds is None:
-            return []
-        first = manifest.segments[0].segment if manifest.segments else 0
-        listed = [entry for entry in manifest.segments if entry.segment >= manifest.window.first_segment]
-        return [*(entry for entry in self._present if entry.segment < first), *listed]
-
-    def _leaving_segments(self, manifest: Manifest, present: Sequence[SegmentEntry]) -> int:
-        """How many segments leave the window with this manifest."""
-        if (seconds := self._options.window_seconds) is None:
-            return 0
-        start = manifest.edge.pts_seconds - seconds
-        return next((i for i, entry in enumerate(present) if entry.pts_seconds[1] >= start), len(present))
-
-    def _with_window(self, manifest: Manifest, left: Sequence[SegmentEntry]) -> Manifest:
-        """The manifest with its next number, its window without the segments that ``left``, and the pace of late."""
-        window = replace(manifest.window, seconds=self._options.window_seconds)
-        if left:
-            window = Window(left[-1].first_frame + left[-1].frames, left[-1].segment + 1, window.seconds)
+    def _stamped(self, manifest: Manifest, window: Window) -> Manifest:
+        """The manifest with its next number, its window, and the pace of late."""
         frame_seconds = None
         if len(self._published) > 1:
             frame_seconds = max(self._published[-1] - self._published[0], 0.0) / (len(self._published) - 1)
@@ -278,16 +223,6 @@ class SegmentsSink:
             frame_seconds=None if frame_seconds is None else round(frame_seconds, 4),
             target_latency_seconds=round(_LATENCY_FRAMES * max(frame_seconds or 0.0, 1.0 / manifest.fps), 3),
         )
-
-    def _forget(self, leaving: Iterable[str]) -> None:
-        """Remember that files are no longer named; remove those for which that has been so for long enough."""
-        now = self._clocks.elapsed()
-        self._leaving |= dict.fromkeys(leaving, now)
-        late = now - self._options.grace_seconds
-        for name in [name for name, since in self._leaving.items() if since <= late]:
-            del self._leaving[name]
-            with suppress(StorageError):  # It is found again when the stream is resumed.
-                self._store.delete(name)
 
     def _check_room(self, draft: Draft, size: int) -> None:
         self._largest = max(self._largest, size)
@@ -305,8 +240,7 @@ class SegmentsSink:
         try:
             for name, data in files:
                 self._store.put(name, data)
-                # What a killed run had written too early may come again under the same name, and then stays.
-                self._leaving.pop(name, None)
+                self._retention.written(name)
         except StorageError as error:
             frames = 0 if self._draft is None else self._draft.manifest.edge.frame + 1
             raise StorageError(

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a stream's segments lie: a folder here; an object store in ``cloud_store``."""
 
-import errno
-import fcntl
 import os
 import re
 import weakref
-from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
 from structgstream.codec.container.disk_room import free_bytes
 from structgstream.errors import StorageError, StreamError
+from structgstream.file_locks import lock_file
+from structgstream.whole_files import replacing
 
 _TEMPORARY = ".new-"
 _LOCK = ".writer"
@@ -114,30 +113,17 @@ class FolderStore:
             file = path.open("w")
         except OSError as error:
             raise StorageError(f"{self.folder} cannot be written ({error.strerror}).") from error
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        if not lock_file(file, holder="process"):
             file.close()
-            if error.errno in (errno.EACCES, errno.EAGAIN):
-                raise StorageError(
-                    f"Another process writes to {self.folder}; wait for its end, or choose another folder."
-                ) from error
-            return  # A file system without locks, as some networks' are.
+            raise StorageError(f"Another process writes to {self.folder}; wait for its end, or choose another folder.")
         weakref.finalize(self, file.close)
 
     def put(self, name: str, data: bytes) -> None:
         """See :meth:`Store.put`."""
-        temporary = self.folder / f"{_TEMPORARY}{name}"
         try:
-            with temporary.open("wb") as file:
+            with replacing(self.folder / name, partial=self.folder / f"{_TEMPORARY}{name}") as file:
                 file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(self.folder / name)
-            self._sync()
         except OSError as error:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
             raise StorageError(
                 f"Cannot write {len(data)} bytes to {self.folder / name} ({error.strerror or error})."
             ) from error
@@ -169,11 +155,3 @@ class FolderStore:
     def free_bytes(self) -> int | None:
         """What an ordinary user may still write to the folder's disk."""
         return free_bytes(self.folder)
-
-    def _sync(self) -> None:
-        """Make a rename durable."""
-        descriptor = os.open(self.folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

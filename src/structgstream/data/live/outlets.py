@@ -130,7 +130,7 @@ class DiskQueue:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for file in sorted(folder.glob("set-*")):
-                if resume and file.suffix != ".part":
+                if resume and not file.suffix:  # Another name is that of a file that was being written.
                     self._files.append((file, file.stat().st_size, None))
                 else:
                     file.unlink()

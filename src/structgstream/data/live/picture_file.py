@@ -11,7 +11,6 @@ takes two subtractions of whole arrays, is undone by two running sums, and leave
 """
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,9 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from structgstream.errors import CaptureError, StorageError
+from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
+from structgstream.whole_files import write_whole
 
 FORMAT = "structgstream-pictures-2"
 WITHOUT_RESIDUALS = "structgstream-pictures-1"  # which a run of an earlier version may have left
@@ -54,17 +54,7 @@ def write_pictures(path: Path, frame: MultiViewFrame, *, sync: bool, **facts: An
     header = {"format": FORMAT, "index": frame.index, "pts_seconds": frame.pts_seconds,
               "captured_unix_seconds": frame.captured_unix_seconds, **facts, **entries}  # fmt: skip
     content = [json.dumps(header).encode() + b"\n", *(data for own in packed.values() for data in own.values())]
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.writelines(content)
-            if sync:
-                file.flush()
-                os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise StorageError(f"The pictures {path} cannot be written ({error.strerror}).") from None
+    write_whole(path, content, called="The pictures", sync=sync)
     return sum(map(len, content))
 
 

@@ -48,7 +48,18 @@ def guided_matches(
     workers: int,
     config: GuidedMatchConfig = GuidedMatchConfig(),
 ) -> dict[Pair, NDArray[np.uint32]]:
-    """Mutually best matches ``[S, 2]`` within ``pixels`` of the planes, of cameras that look the same way."""
+    """Matches of cameras that look the same way: each other's best ones among those near one epipolar plane.
+
+    Args:
+        keypoints: by camera.
+        cameras: with their rough poses.
+        pixels: how far from the plane a keypoint may lie.
+        workers: threads.
+        config: what counts as alike.
+
+    Returns:
+        ``[S, 2]`` by pair of cameras: indices of the keypoints of the first and of the second.
+    """
     rays = {name: camera_rays(filmed, keypoints[name].pixels) for name, filmed in cameras.items()}
 
     def one(pair: Pair) -> NDArray[np.uint32]:

@@ -57,9 +57,12 @@ def rematched(
     """``found`` adjusted to more points; itself if it has enough, little is gained or a camera loses some.
 
     Args:
-        keypoints: of the cameras.
+        found: a first solution (Note [What a first solution lacks]).
+        keypoints: of its cameras, by name.
         limits: which observations stay.
         adjust: adjusts cameras and points together.
+        workers: threads.
+        config: when it is done, and what is kept.
     """
     before = _counts(found)
     if before.min() >= config.enough:

@@ -11,6 +11,7 @@ from structgstream.preparation.report.charts import draw_colors, draw_coverage, 
 from structgstream.preparation.report.overlays import chosen_pairs, draw_epipolar, draw_overlay
 from structgstream.preparation.report.page import page
 from structgstream.preparation.steps import Listener, Silent
+from structgstream.whole_files import write_whole
 
 PAGE, NUMBERS = "index.html", "report.json"
 
@@ -52,11 +53,8 @@ def write_report(folder: Path, checked: Checked, *, listener: Listener | None = 
         "Rig and coverage": ["coverage.png"],
         "Times and colours" if len(charts) == 2 else "Times" if "times.png" in charts else "Colours": charts,
     }
-    try:
-        (folder / NUMBERS).write_text(json.dumps(report.as_json(), indent=1) + "\n")
-        (folder / PAGE).write_text(page(report, off=examined.suspects.off, sections=sections))
-    except OSError as error:
-        raise StorageError(f"The report in {folder} cannot be written ({error.strerror}).") from None
+    write_whole(folder / NUMBERS, f"{json.dumps(report.as_json(), indent=1)}\n".encode())
+    write_whole(folder / PAGE, page(report, off=examined.suspects.off, sections=sections).encode())
     listener.progress(total, total, "")
     return folder / PAGE
 

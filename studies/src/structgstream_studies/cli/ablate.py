@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.options import Folder, parse_known_options, resolve_config
+from structgstream.cli.plain_text import say
 from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, run_sweep
 
 if TYPE_CHECKING:
@@ -76,4 +77,4 @@ def main(arguments: list[str]) -> None:
     for table in options.table:
         for sheet in write_ablation(options.output, table, runs, backend=select_backend(options.device)):
             print_sheet(sheet, console)
-    console.print(f"Tables and pictures: {options.output}", highlight=False, markup=False, soft_wrap=True)
+    say(console, f"Tables and pictures: {options.output}")

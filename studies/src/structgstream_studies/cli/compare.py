@@ -9,6 +9,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.plain_text import say
 from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, run_sweep
 
 
@@ -57,4 +58,4 @@ def main(arguments: list[str]) -> None:
     run_sweep(with_dependencies(runs), options)
     console = Console()
     print_sheet(write_methods(options.output, runs, backend=select_backend(options.device)), console)
-    console.print(f"Table and pictures: {options.output}", highlight=False, markup=False, soft_wrap=True)
+    say(console, f"Table and pictures: {options.output}")

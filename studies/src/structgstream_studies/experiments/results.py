@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from structgstream.errors import StorageError
+from structgstream.whole_files import write_whole
 
 if TYPE_CHECKING:
     from structgstream.evaluation.report import Report
@@ -103,18 +104,13 @@ def _free_bytes(fields: Mapping[str, int]) -> int:
 
 
 def write_result(path: Path, result: Result) -> None:
-    """Writes a result atomically.
+    """Writes a result whole or not at all.
 
     Raises:
         StorageError: the file cannot be written.
     """
-    partial = path.with_suffix(".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(json.dumps(round_floats(vars(result)), allow_nan=False, separators=(",", ":")) + "\n")
-        partial.replace(path)
-    except OSError as error:
-        raise StorageError(f"The result {path} cannot be written ({error.strerror}).") from None
+    content = json.dumps(round_floats(vars(result)), allow_nan=False, separators=(",", ":")) + "\n"
+    write_whole(path, content.encode(), called="The result", new_folder=True)
 
 
 def round_floats(value: Any) -> Any:

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The list of the groups that a track is for, beside the track: one ``a:b`` a line, from frame a to before frame b."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from structgstream.errors import StreamError
+from structgstream.whole_files import write_whole
+
+Groups = Sequence[tuple[int, int]]
+"""First frame and end of each group, in their order."""
+
+
+def groups_path(track: Path) -> Path:
+    """The path of a track's list."""
+    return track.with_name(f"{track.name}.groups")
+
+
+def write_groups(track: Path, groups: Groups) -> None:
+    """Writes the list of a track, whole or not at all.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    write_whole(groups_path(track), "".join(f"{first}:{end}\n" for first, end in groups).encode())
+
+
+def read_groups(track: Path) -> Groups | None:
+    """The groups of a track of a whole capture; None while they are not decided.
+
+    Raises:
+        StreamError: they have gaps, or are no groups.
+    """
+    path = groups_path(track)
+    try:
+        text = path.read_text(errors="replace")
+    except OSError:
+        return None
+    if not text.endswith("\n"):
+        return None
+    try:
+        groups = [(int(first), int(end)) for first, _, end in (line.partition(":") for line in text.split())]
+    except ValueError:
+        raise StreamError(f"{path} has no groups, 'first:end' a line.") from None
+    borders = [0, *(end for _, end in groups)]
+    if not groups or [first for first, _ in groups] != borders[:-1] or borders != sorted(set(borders)):
+        raise StreamError(f"The groups in {path} do not follow each other from frame 0 on.")
+    return groups

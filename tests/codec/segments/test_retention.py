@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What of a stream stays, one manifest after the other (``test_sink`` has it with a sink and its files)."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from segment_streams import folder, header
+from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, segment_name
+from structgstream.codec.segments.next_manifest import empty_manifest
+from structgstream.codec.segments.retention import Retention, SegmentsOptions
+from structgstream.codec.segments.store import FolderStore
+
+SHA = "0" * 64
+FIRST = PeriodEntry(0, "init-0000-0123456789abcdef.sgs", 10, SHA, 0, 0)
+SECOND = PeriodEntry(1, "init-0001-0123456789abcdef.sgs", 10, SHA, 12, 4)
+
+
+def segment(number: int) -> SegmentEntry:
+    """Three frames, a second apart."""
+    first = 3 * number
+    name = segment_name(number, SHA)
+    return SegmentEntry(number, name, 0, first, 3, (float(first), first + 2.0), 30, 10, (10, 10, 10), SHA)
+
+
+def manifest(segments: int, *, periods: tuple[PeriodEntry, ...] = (FIRST,), after: Manifest | None = None) -> Manifest:
+    """After so many segments, and with the window of the manifest before."""
+    found = empty_manifest(header(), FIRST)
+    found = found if after is None else replace(found, window=after.window)
+    last = 3 * segments - 1
+    edge = replace(found.edge, frame=last, pts_seconds=float(last))
+    return replace(found, edge=edge, periods=periods, segments=tuple(map(segment, range(segments))))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> FolderStore:
+    found = folder(tmp_path)
+    for number in range(8):
+        found.put(segment(number).file, b"")
+    return found
+
+
+def there(store: FolderStore) -> list[int]:
+    """Numbers of the segments in a store."""
+    return [number for number in range(8) if segment(number).file in store.names()]
+
+
+def publish(retention: Retention, named: Manifest, *leaving: str) -> Manifest:
+    """The manifest with its window, once it is written."""
+    turnover = retention.turnover(named)
+    named = replace(named, window=turnover.window)
+    retention.published(named, turnover, leaving)
+    return named
+
+
+def test_without_a_window_everything_stays(store: FolderStore) -> None:
+    retention = Retention(store, SegmentsOptions(grace_seconds=0.0), lambda: 0.0)
+    for segments in range(1, 8):
+        assert publish(retention, manifest(segments)).window.first_segment == 0
+    assert there(store) == [*range(8)]
+
+
+def test_a_segment_leaves_the_window_at_once_and_the_store_after_the_time_of_grace(store: FolderStore) -> None:
+    now = [0.0]
+    retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=5.0), lambda: now[0])
+    periods, last = (FIRST, SECOND), None
+    for segments in range(1, 7):
+        last = publish(retention, manifest(segments, periods=periods, after=last))
+        first = max(segments - 2, 0)
+        assert (last.window.first_segment, last.window.first_frame) == (first, 3 * first)
+    assert there(store) == [*range(8)]
+    now[0] = 5.0
+    publish(retention, manifest(6, periods=periods, after=last))
+    assert there(store) == [4, 5, 6, 7], "a period begins at segment 4, so that nothing needs segment 0"
+
+
+def test_the_segment_that_resuming_needs_stays(store: FolderStore) -> None:
+    retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=0.0), lambda: 0.0)
+    last = None
+    for segments in range(1, 7):
+        last = publish(retention, manifest(segments, after=last))
+    assert there(store) == [0, 4, 5, 6, 7]
+
+
+def test_a_file_that_is_written_again_stays(store: FolderStore) -> None:
+    now = [0.0]
+    retention = Retention(store, SegmentsOptions(grace_seconds=5.0), lambda: now[0])
+    publish(retention, manifest(1), segment(6).file, segment(7).file)
+    retention.written(segment(7).file)
+    now[0] = 9.0
+    publish(retention, manifest(1))
+    assert there(store) == [0, 1, 2, 3, 4, 5, 7]
+
+
+def test_what_a_manifest_that_is_taken_up_does_not_name_leaves(store: FolderStore) -> None:
+    now = [0.0]
+    retention = Retention(store, SegmentsOptions(grace_seconds=5.0), lambda: now[0])
+    retention.take_up(manifest(3))
+    publish(retention, manifest(3))
+    assert there(store) == [*range(8)]
+    now[0] = 5.0
+    publish(retention, manifest(3))
+    assert there(store) == [0, 1, 2]
