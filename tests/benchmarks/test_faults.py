@@ -105,7 +105,7 @@ def test_rows_of_several_seeds_are_added_up() -> None:
 
 def test_all_is_asked_for_by_default() -> None:
     options = parsed([])
-    assert set(options.only) == {*FILMED, "server", "trainer"}
+    assert set(options.only) == {*FILMED, "server", "trainer", "trainer that fits"}
     assert options.moments >= 200
     assert options.kills >= 200
     assert np.isfinite(options.down_seconds)
