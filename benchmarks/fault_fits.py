@@ -26,7 +26,7 @@ def killed_fits(*, kills: int, seed: int, folder: Path, players: int, page: bool
         place = folder / f"after-{row.kills}"
         place.mkdir()
         one = _stream(rng, whole, place, players=players, page=page, most=kills - row.kills, seconds=frame_seconds)
-        _add(row, one)
+        added_up(row, one)
     return row
 
 
@@ -62,8 +62,8 @@ def _fit(folder: Path, writing: int) -> None:
         os._exit(status)
 
 
-def _add(row: ViewerRow, one: ViewerRow) -> None:
-    """Adds a stream up."""
+def added_up(row: ViewerRow, one: ViewerRow) -> None:
+    """Adds a stream to a row of several."""
     for name, value in vars(one).items():
         if name == "page_notices":
             for text, times in value.items():

@@ -211,7 +211,7 @@ def one_event(row: Row, sent: Sent, rng: random.Random, folder: Path, *, seconds
     mirror = MirroredStore(here, service.store(name), options=MirrorOptions(tell=told.append))
     reader = Reader(other.store(name), sent.whole)
     reader.start()
-    begin = rng.randrange(5, 25)
+    begin = rng.randrange(1, len(sent.packets) // 4)
     trouble = threading.Thread(target=_trouble, args=(row, troubled, service, other.store(name), seconds, reader))
     sink, _ = resume_segments(mirror, options=OPTIONS)
     sink.open(sent.header)
