@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -88,14 +89,14 @@ class ViewerRow:
 
 
 class Trainer:
-    """A process that writes packets from where the stream ends, until it is told to end or killed."""
+    """A process that goes on with a stream, until it is told to end or killed; ``life`` is given where it reports."""
 
-    def __init__(self, folder: Path, sent: Sent) -> None:
+    def __init__(self, life: Callable[[int], object]) -> None:
         reading, writing = os.pipe()
         self._process = os.fork()
         if not self._process:
             os.close(reading)
-            _write(folder, sent, writing)
+            life(writing)
         os.close(writing)
         os.set_blocking(reading, False)
         self._reading, self._reported, self._ended = reading, -1, False
@@ -109,12 +110,13 @@ class Trainer:
             pass
         return self._reported
 
-    def end(self, how: signal.Signals) -> int:
-        """Ends it, if it has not been; the last frame that it reported."""
+    def end(self, how: signal.Signals | None) -> int:
+        """Ends it, if it has not been, or without a signal waits for its end; the last frame that it reported."""
         if self._ended:
             return self._reported
         self._ended = True
-        os.kill(self._process, how)
+        if how is not None:
+            os.kill(self._process, how)
         os.waitpid(self._process, 0)
         found = self.reported()
         os.close(self._reading)
@@ -124,20 +126,20 @@ class Trainer:
 class Trainers:
     """One trainer after the other."""
 
-    def __init__(self, folder: Path, sent: Sent) -> None:
-        self._folder, self._sent = folder, sent
-        self._one = Trainer(folder, sent)
+    def __init__(self, life: Callable[[int], object]) -> None:
+        self._life = life
+        self._one = Trainer(life)
 
     def start(self) -> None:
         """Another one goes on with the stream."""
-        self._one = Trainer(self._folder, self._sent)
+        self._one = Trainer(self._life)
 
     def reported(self) -> int:
         """The last frame that the present one reported."""
         return self._one.reported()
 
-    def end(self, how: signal.Signals) -> int:
-        """Ends the present one; the last frame that it reported."""
+    def end(self, how: signal.Signals | None) -> int:
+        """Ends the present one, or waits for its end; the last frame that it reported."""
         return self._one.end(how)
 
 
@@ -220,12 +222,14 @@ class Page:
 
 
 @contextmanager
-def watched(folder: Path, sent: Sent, *, players: int, page: bool) -> Iterator[tuple[Server, Trainers, Players, Any]]:
+def watched(
+    folder: Path, life: Callable[[int], object], *, players: int, page: bool
+) -> Iterator[tuple[Server, Trainers, Players, Any]]:
     """A trainer at work, a server, and who watches."""
     stream = folder / "streams" / NAME
     FolderStore(stream).prepare()
     with ExitStack() as stack:
-        trainers = Trainers(stream, sent)
+        trainers = Trainers(life)
         stack.callback(trainers.end, signal.SIGKILL)
         wait_until(lambda: (stream / "manifest.json").exists())
         server = Server(folder / "streams")
@@ -245,7 +249,8 @@ def killed_servers(
 ) -> ViewerRow:
     """The server is killed at random moments, and started again after up to ``down_seconds``."""
     row, rng = ViewerRow("server", seed=seed, players=players), random.Random(f"server {seed}")
-    with watched(folder, sent, players=players, page=page) as (server, trainers, watching, shown):
+    life = partial(_write, folder / "streams" / NAME, sent)
+    with watched(folder, life, players=players, page=page) as (server, trainers, watching, shown):
         for _ in range(kills):
             time.sleep(rng.uniform(0.0, 1.0))
             server.kill()
@@ -253,8 +258,9 @@ def killed_servers(
             time.sleep(rng.uniform(0.0, down_seconds))
             server.start()
             began = time.monotonic()
-            _wait_for_viewers(row, began, edge, watching, shown)
-        finish(row, trainers, sent, watching, shown, folder)
+            wait_for_viewers(row, began, edge, watching, shown)
+        row.frames = trainers.end(signal.SIGTERM) + 1
+        finish(row, _whole(sent, row.frames), watching, shown, folder)
     return row
 
 
@@ -262,19 +268,20 @@ def killed_trainers(sent: Sent, *, kills: int, seed: int, folder: Path, players:
     """The trainer is killed at random moments, and another goes on at once."""
     row, rng = ViewerRow("trainer", seed=seed, players=players), random.Random(f"trainer {seed}")
     stream = folder / "streams" / NAME
-    with watched(folder, sent, players=players, page=page) as (_, trainers, watching, shown):
+    with watched(folder, partial(_write, stream, sent), players=players, page=page) as (_, trainers, watching, shown):
         for _ in range(kills):
             time.sleep(rng.uniform(0.05, 1.0))
             reported = trainers.end(signal.SIGKILL)
             began, edge = time.monotonic(), edge_of(stream)
             row.reported_frames_lost += max(reported - edge, 0)
             trainers.start()
-            _wait_for_viewers(row, began, edge, watching, shown)
-        finish(row, trainers, sent, watching, shown, folder)
+            wait_for_viewers(row, began, edge, watching, shown)
+        row.frames = trainers.end(signal.SIGTERM) + 1
+        finish(row, _whole(sent, row.frames), watching, shown, folder)
     return row
 
 
-def _wait_for_viewers(row: ViewerRow, began: float, edge: int, watching: Players, shown: Page | None) -> None:
+def wait_for_viewers(row: ViewerRow, began: float, edge: int, watching: Players, shown: Page | None) -> None:
     """Notes when all players have a frame after ``edge``, and when the page shows one."""
     row.kills += 1
     wait_until(lambda: watching.least_frames() > edge + 1)
@@ -284,17 +291,21 @@ def _wait_for_viewers(row: ViewerRow, began: float, edge: int, watching: Players
         row.page_seconds_until_normal.append(time.monotonic() - began)
 
 
-def finish(row: ViewerRow, trainers: Trainers, sent: Sent, watching: Players, shown: Page | None, folder: Path) -> None:
-    """The stream ends; compares it with one that was never interrupted, and with what the viewers have."""
-    row.frames = trainers.end(signal.SIGTERM) + 1
+def _whole(sent: Sent, frames: int) -> bytes:
+    """The stream's bytes, had it not been interrupted."""
     sink = MemorySink()
     sink.open(sent.header)
-    for index in range(row.frames):
+    for index in range(frames):
         _send(sink, sent, index)
     sink.close()
+    return sink.data
+
+
+def finish(row: ViewerRow, whole: bytes, watching: Players, shown: Page | None, folder: Path) -> None:
+    """The stream has ended; compares it with one that was never interrupted, and with what the viewers have."""
     stream = folder / "streams" / NAME
     row.reported_frames_lost += max(row.frames - 1 - edge_of(stream), 0)
-    row.equal = content(stream, beside=folder) == sink.data
+    row.equal = content(stream, beside=folder) == whole
     found = watching.ended(PATIENCE_SECONDS)
     right = digests(stream).get(row.frames)
     row.exact = sum(one.frames == row.frames and one.digest == right and not one.wrong for one in found)

@@ -8,9 +8,9 @@
 Eleven cameras and a held-out one send coded pictures from this machine, and each goes wrong at moments that are drawn
 with a seed (``fault_film``); what the trainer gets is compared with what was filmed (``fault_cameras``). Then servers
 and trainers are killed by SIGKILL while players without a picture check every byte, and a page in Chromium plays on
-(``fault_viewers``; needs pytest and Chromium, ``--no-page`` does without). ``kills`` has what needs no viewers:
-trainers killed and their streams continued, full disks, targets out of reach. A row that the JSON file has is not made
-again.
+(``fault_viewers``; needs pytest and Chromium, ``--no-page`` does without); the *trainer that fits* is the real one, the
+other writes prepared packets. ``kills`` has what needs no viewers: trainers killed and their streams continued, full
+disks; ``store_outages`` targets in trouble. A row that the JSON file has is not made again.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.fault_cameras import FILMED, camera_faults
+from benchmarks.fault_fits import killed_fits
 from benchmarks.fault_report import table
 from benchmarks.fault_viewers import killed_servers, killed_trainers
 from benchmarks.machine import load_average, machine
@@ -32,6 +33,7 @@ from structgstream.codec.reader import open_stream
 
 FRAMES = 4096
 KILLED = ("server", "trainer")
+FITS = "trainer that fits"
 
 
 def prepared() -> Sent:
@@ -49,6 +51,8 @@ def row_of(what: str, sent: Sent, options: argparse.Namespace, folder: Path) -> 
         "kills": options.kills, "seed": options.seed, "folder": folder, "players": options.players,
         "page": options.page,
     }  # fmt: skip
+    if what == FITS:
+        return asdict(killed_fits(**{**common, "kills": options.fits}))
     if what == "server":
         return asdict(killed_servers(sent, down_seconds=options.down_seconds, **common))
     return asdict(killed_trainers(sent, **common))
@@ -77,10 +81,11 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    every = (*FILMED, *KILLED)
+    every = (*FILMED, *KILLED, FITS)
     parser.add_argument("--only", nargs="+", choices=every, default=every, metavar="WHAT", help=", ".join(every))
     parser.add_argument("--moments", type=int, default=204, help="of each fault of cameras")
     parser.add_argument("--kills", type=int, default=200, help="of servers and of trainers")
+    parser.add_argument("--fits", type=int, default=10, help="kills of a trainer that fits the bundled clip")
     parser.add_argument("--players", type=int, default=8, help="that check bytes")
     parser.add_argument("--no-page", dest="page", action="store_false", help="without Chromium")
     parser.add_argument("--down-seconds", type=float, default=1.0, help="at most, until a server is started again")

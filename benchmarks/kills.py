@@ -41,6 +41,7 @@ from benchmarks.stream_writers import (
 from structgstream.codec.reader import open_stream
 
 FRAMES = 60
+SINKS = ("segments", "file", "segments of 8 periods", "file of 8 periods")
 
 
 def started(writer: Writer, path: Path) -> tuple[int, int]:
@@ -132,6 +133,7 @@ def parsed() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200, help="of writers of prepared packets, for each sink")
+    parser.add_argument("--of", nargs="+", choices=SINKS, default=SINKS, metavar="SINK", help=", ".join(SINKS))
     parser.add_argument("--real", type=int, default=20, help="kills of trainers")
     parser.add_argument("--real-frames", type=int, default=8)
     parser.add_argument("--full", type=int, default=50, help="disks that fill up, with and without the margin")
@@ -161,12 +163,14 @@ def measured(options: argparse.Namespace, folder: Path) -> list[Row]:
         rows.append(row)
         print(table([row]).splitlines()[-1], flush=True)
 
-    for name, stream, writer in (
-        ("segments", sent, segments_writer(sent)),
-        ("file", sent, file_writer(sent)),
-        ("segments of 8 periods", periods, segments_writer(periods)),
-        ("file of 8 periods", periods, file_writer(periods)),
-    ):
+    writers = {
+        "segments": (sent, segments_writer(sent)),
+        "file": (sent, file_writer(sent)),
+        "segments of 8 periods": (periods, segments_writer(periods)),
+        "file of 8 periods": (periods, file_writer(periods)),
+    }
+    for name in options.of:
+        stream, writer = writers[name]
         limit = timed(writer, folder / name)
         row = Row(f"kill -9, {name}")
         add(killed_streams(row, writer, kills=options.kills, whole=stream.whole, folder=folder, seed=seed, limit=limit))
@@ -180,8 +184,9 @@ def measured(options: argparse.Namespace, folder: Path) -> list[Row]:
             add(full_disks(row, sent, count=options.full, folder=folder, seed=seed, margin=margin))
     except PermissionError as error:
         print(f"No small disk can be mounted here ({error}).")
-    row = Row(f"target out of reach for {options.outage_seconds:g} s")
-    add(outages(row, sent, count=options.outages, seconds=options.outage_seconds, folder=folder, seed=seed))
+    if options.outages:
+        row = Row(f"target out of reach for {options.outage_seconds:g} s")
+        add(outages(row, sent, count=options.outages, seconds=options.outage_seconds, folder=folder, seed=seed))
     return rows
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where groups begin."""
 
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import pytest
 from hypothesis import given
@@ -55,3 +55,19 @@ def test_frames_before_a_key_frame_are_near_it(apart: float, group: int) -> None
     assert not keys.near(0, 0.0, within=3)
     keys.begin(0, 0.0)
     assert [i for i in range(group) if keys.near(i, i * apart, within=3)] == [group - 3, group - 2, group - 1]
+
+
+@pytest.mark.parametrize(("apart", "group"), [(1 / 30, 30), (0.1, 10), (9.0, LEAST_FRAMES)])
+@pytest.mark.parametrize("since", [0, 1, 4])
+def test_key_frames_are_foreseen(apart: float, group: int, since: int) -> None:
+    keys = KeyFrames(30, 30.0)
+    keys.begin(100, 7.0)
+    coming = keys.ahead(100 + since, 7.0 + since * apart, apart=apart)
+    assert [*islice(coming, 3)] == [group - since, 2 * group - since, 3 * group - since]
+
+
+def test_a_group_that_has_lasted_too_long_ends_with_the_next_frame() -> None:
+    keys = KeyFrames(30, 30.0)
+    keys.begin(0, 0.0)
+    assert [*islice(keys.ahead(7, 60.0, apart=0.1), 2)] == [1, 11]
+    assert (keys.interval, keys.least, KeyFrames(3, 30.0).least) == (30, LEAST_FRAMES, 3)

@@ -6,6 +6,9 @@ there the group ends when it has lasted as long as the same number of frames of 
 than :data:`LEAST_FRAMES`, since key packets are several times as large as others.
 """
 
+from collections.abc import Iterator
+from itertools import count
+
 from structgstream.codec.packets import PacketKind
 
 LEAST_FRAMES = 5
@@ -38,9 +41,29 @@ class KeyFrames:
         apart = seconds / frames if frames else 0.0
         return self._ends(frames + within, seconds + within * apart)
 
+    @property
+    def interval(self) -> int:
+        """Frames of a group where none is left out."""
+        return self._interval
+
+    @property
+    def least(self) -> int:
+        """Frames that a group has however far apart they are."""
+        return min(self._interval, LEAST_FRAMES)
+
+    def ahead(self, index: int, pts_seconds: float, *, apart: float) -> Iterator[int]:
+        """How many frames after frame ``index`` key frames come, rising, if frames go on ``apart`` seconds apart."""
+        key_index, key_seconds = (index, pts_seconds) if self._key is None else self._key
+        first = self._length(index - key_index, pts_seconds - key_seconds, apart)
+        return count(first, self._length(0, 0.0, apart))
+
     def begin(self, index: int, pts_seconds: float) -> None:
         """Frame ``index`` is a key frame that has been written."""
         self._key = index, pts_seconds
+
+    def _length(self, frames: int, seconds: float, apart: float) -> int:
+        """How many frames later a group ends that has lasted so long."""
+        return next(more for more in count(1) if self._ends(frames + more, seconds + more * apart))
 
     def _ends(self, frames: int, seconds: float) -> bool:
         """Whether a group that has lasted so long is followed by a key frame."""

@@ -14,14 +14,25 @@ past packets are known, the size of a key packet in its future part is predicted
 delta packets there. So bytes are saved before a key packet comes. A key packet has all changes since frame 0; its size
 is predicted as that of a delta packet times the square root of its frame number (0.98 to 1.13 times that in 3 streams
 of 2 captures, frames 1 to 19).
+
+Note [Media time]
+~~~~~~~~~~~~~~~~~
+A rate is one of media time, and a live run may leave out pictures: then a packet has the budget of all frames of the
+media from it to the next, and key packets come sooner (``key_frames``). So packets have places, which are their times
+in frames of the media, and those to come are expected as far apart as those of the window have been. Where packets are
+so far apart that a window would have fewer than the least group has, it is as long as that. Without gaps places are
+frame numbers.
 """
 
 import logging
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
+from structgstream.key_frames import KeyFrames
 from structgstream.training.online import OnlineConfig
 
 _log = logging.getLogger(__name__)
@@ -36,6 +47,14 @@ _MISSED = 1.1
 
 
 @dataclass(frozen=True)
+class _Written:
+    """A packet's size in bytes, and its place in frames of the media."""
+
+    size: int
+    place: int
+
+
+@dataclass(frozen=True)
 class RateConfig:
     """Target of the rate control."""
 
@@ -43,7 +62,7 @@ class RateConfig:
     """Target rate in megabits per second of media time; None: constant quality without rate control."""
     window_seconds: float = 1.0
     """Window, in seconds of media time, over which the target holds, without the header; at least the interval of key
-    packets."""
+    packets. Where frames are left out it is at least a group of five frames."""
 
 
 class RateController:
@@ -55,7 +74,7 @@ class RateController:
     Args:
         config: the target.
         fps: frames per second of the media.
-        key_interval: frames from one key packet to the next.
+        keys: which frames are key frames; it follows the same packets, and is told of each before this is.
 
     A warning is logged when the target starts to be missed.
 
@@ -63,10 +82,10 @@ class RateController:
         ConfigError: a target or window that is not positive, or a window shorter than a group.
     """
 
-    def __init__(self, config: RateConfig, fps: float, *, key_interval: int) -> None:
+    def __init__(self, config: RateConfig, fps: float, *, keys: KeyFrames) -> None:
         self.pressure = 1.0
         """From :data:`LEAST` to :data:`MOST`."""
-        self._budget: float | None = None  # bytes a frame
+        self._budget: float | None = None  # bytes a frame of the media
         if config.target_mbits is None:
             return
         if config.target_mbits <= 0 or config.window_seconds <= 0:
@@ -74,80 +93,115 @@ class RateController:
                 f"A target of {config.target_mbits:g} Mbit/s over {config.window_seconds:g} s; both must be positive."
             )
         window = max(2, round(config.window_seconds * fps))
-        if window < key_interval:
+        if window < keys.interval:
             raise ConfigError(
                 f"A rate over {config.window_seconds:g} s cannot be kept with a key packet every "
-                f"{key_interval / fps:g} s; make rate.window_seconds at least key_interval_seconds."
+                f"{keys.interval / fps:g} s; make rate.window_seconds at least key_interval_seconds."
             )
         self._budget = config.target_mbits * 1e6 / 8.0 / fps
-        self._fps, self._interval = fps, key_interval
-        self._ahead = max(1, round(_AHEAD * window))
-        self._last: deque[int] = deque(maxlen=window)
-        self._count = 0
-        self._origin = 0  # the first frame of the period
-        self._key: tuple[int, int] | None = None  # the last key packet's size and frame
+        self._fps, self._keys, self._window = fps, keys, window
+        self._last: deque[_Written] = deque(maxlen=window)
+        self._now = 0, 0.0  # number and time of the last packet
+        self._origin = 0  # place of the period's first packet
+        self._key: tuple[int, int] | None = None  # the last key packet's size, and how far it is from there
         self._delta: tuple[int, float] | None = None  # the last delta packet's size, and its pressure
         self._usual = 0.0  # size of delta packets, a running mean
         self._said = False
 
-    def add(self, size: int, kind: PacketKind, *, begins: bool = False) -> None:
+    def add(self, size: int, kind: PacketKind, *, index: int, pts_seconds: float, begins: bool = False) -> None:
         """Record a written packet of ``size`` bytes; ``begins``: with a header of its own, which is not counted."""
         if self._budget is None:
             return
-        self._last.append(size)
-        if begins:
-            self._origin = self._count
-        self._count += 1
+        place = round(pts_seconds * self._fps)
+        if begins or not self._last:
+            self._origin = place
+        self._last.append(_Written(size, place))
+        self._now = index, pts_seconds
         if kind is PacketKind.DELTA:
             self._usual = size if self._delta is None else 0.8 * self._usual + 0.2 * size
             self._delta = size, self.pressure
-        elif self._count - 1 > self._origin:  # A period's first packet is nearly empty: the header has its fields.
-            self._key = size, self._count - 1 - self._origin
+        elif place > self._origin:  # A period's first packet is nearly empty: the header has its fields.
+            self._key = size, place - self._origin
         if self._delta is not None:
             last, pressure = self._delta
             factor = min(max(last / self._room(self._budget), _FALL), _RISE)
             self.pressure = min(max(pressure * factor, LEAST), MOST)
+        self._tell(index)
+
+    def _tell(self, index: int) -> None:
+        """Warns when the target begins to be missed."""
         if self.missed and not self._said:
             remedy = "nothing more can be saved: take coarser steps (online.rounding.quality) or a higher target"
             _log.warning(
                 "Frame %d: the last %d frames take %.3g Mbit/s, the target is %.3g; %s.",
-                self._count - 1,
-                len(self._last),
+                index,
+                len(self._written()),
                 self.rate_mbits,
-                self._budget * 8e-6 * self._fps,
+                (self._budget or 0.0) * 8e-6 * self._fps,
                 remedy if self.pressure == MOST else "more is saved from now on",
             )
         self._said = self.missed
 
     def _room(self, budget: float) -> float:
         """Budget of the next delta packet in bytes (Note [Windows])."""
-        assert self._last.maxlen is not None, "a window has a length"
-        keys = sum(1 for frame in range(self._count, self._count + self._ahead) if frame % self._interval == 0)
-        past = [*self._last][max(len(self._last) - (self._last.maxlen - self._ahead), 0) :]
-        left = budget * (len(past) + self._ahead) - sum(past) - keys * self._next_key()
-        return min(max(left / max(self._ahead - keys, 1), budget / 4.0), 3.0 * budget)
+        apart, whole = self._apart, self._packets_of_window
+        each, ahead = budget * apart, max(1, round(_AHEAD * whole))
+        index, pts_seconds = self._now
+        coming = self._keys.ahead(index, pts_seconds, apart=apart / self._fps)
+        keys = [*takewhile(lambda frames: frames <= ahead, coming)]
+        past = [*self._last][max(len(self._last) - (whole - ahead), 0) :]
+        left = budget * self._span(past) + each * ahead - sum(one.size for one in past)
+        left -= len(keys) * self._key_after(keys[0]) if keys else 0.0
+        return min(max(left / max(ahead - len(keys), 1), each / 4.0), 3.0 * each)
 
-    def _next_key(self) -> float:
-        """Predicted size of the next key packet in bytes (Note [Windows])."""
-        frame = -(-self._count // self._interval) * self._interval
-        size, known = (self._usual, 1) if self._key is None else self._key
-        return size * ((frame - self._origin) / known) ** 0.5
+    def _key_after(self, frames: int) -> float:
+        """Predicted size of a key packet so many frames from now, in bytes (Note [Windows])."""
+        since = self._last[-1].place + frames * self._apart - self._origin
+        size, known = (self._usual, self._apart) if self._key is None else self._key
+        return size * (since / known) ** 0.5
+
+    @property
+    def _apart(self) -> float:
+        """Frames of the media from packet to packet of late (Note [Media time])."""
+        return self._apart_of(self._written())
+
+    def _apart_of(self, packets: Sequence["_Written"]) -> float:
+        if len(packets) < 2:
+            return 1.0
+        return max(packets[-1].place - packets[0].place, 1) / (len(packets) - 1)
+
+    @property
+    def _packets_of_window(self) -> int:
+        """How many packets a window has where they come as they did of late."""
+        return min(max(round(self._window / self._apart), self._keys.least, 2), self._window)
+
+    def _written(self) -> list["_Written"]:
+        """The packets of the last window."""
+        packets = [*self._last]
+        begin = packets[-1].place - self._window
+        within = sum(1 for one in packets if one.place > begin)
+        return packets[-max(within, self._keys.least, 2) :]
+
+    def _span(self, packets: Sequence["_Written"]) -> float:
+        """Frames of the media from the first of these packets to the one after the last."""
+        return packets[-1].place - packets[0].place + self._apart if packets else 0.0
 
     @property
     def rate_mbits(self) -> float | None:
         """Rate of the last window; None without a target."""
         if self._budget is None or not self._last:
             return None
-        return sum(self._last) * 8e-6 * self._fps / len(self._last)
+        packets = self._written()
+        return sum(one.size for one in packets) * 8e-6 * self._fps / self._span(packets)
 
     @property
     def missed(self) -> bool:
         """Whether a complete window exceeds its budget by more than :data:`_MISSED` allows."""
-        return (
-            self._budget is not None
-            and len(self._last) == self._last.maxlen
-            and sum(self._last) > _MISSED * self._budget * len(self._last)
-        )
+        if self._budget is None or not self._last:
+            return False
+        packets = self._written()
+        complete = len(packets) >= self._packets_of_window
+        return complete and sum(one.size for one in packets) > _MISSED * self._budget * self._span(packets)
 
 
 def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:

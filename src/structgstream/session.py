@@ -14,6 +14,7 @@ from typing import Generic
 from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.encoder import Encoded
+from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead
 from structgstream.errors import StorageError
@@ -76,10 +77,9 @@ class Session(Generic[State, Memory]):
             config=pipeline.config,
             metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
         )
-        key_interval = pipeline.codec.key_interval(source.fps)
-        self._keys = KeyFrames(key_interval, source.fps)
+        self._keys = KeyFrames(pipeline.codec.key_interval(source.fps), source.fps)
         self._plan = PeriodPlan(pipeline.period, most=MAX_PERIODS)
-        self._controller = RateController(pipeline.rate, source.fps, key_interval=key_interval)
+        self._controller = RateController(pipeline.rate, source.fps, keys=self._keys)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
         if resumed is not None:
@@ -174,10 +174,15 @@ class Session(Generic[State, Memory]):
 
     def _write(self, packet: Packet, task: FrameTask) -> int:
         size = self._sink.write(packet)
-        self._controller.add(size, packet.kind, begins=task.begins is not None)
-        if packet.kind is PacketKind.KEY:
-            self._keys.begin(packet.index, packet.pts_seconds)
+        self._note(packet, size, begins=task.begins is not None)
         return size
+
+    def _note(self, packet: Packet | PacketInfo, size: int, *, begins: bool) -> None:
+        """A packet has been written: what follows depends on it."""
+        index, pts_seconds = packet.index, packet.pts_seconds
+        if packet.kind is PacketKind.KEY:
+            self._keys.begin(index, pts_seconds)
+        self._controller.add(size, packet.kind, index=index, pts_seconds=pts_seconds, begins=begins)
 
     def _open(self, header: StreamHeader) -> FrameCoder[State]:
         """The coder of a period, whose header the sink gets."""
@@ -211,9 +216,7 @@ class Session(Generic[State, Memory]):
         self._coder = self._open(resumed.header_of(len(resumed) - 1))
         for info in resumed.packets:
             begins = info.index > 0 and resumed.period(info.index).first_frame == info.index
-            self._controller.add(info.bytes, info.kind, begins=begins)
-            if info.kind is PacketKind.KEY:
-                self._keys.begin(info.index, info.pts_seconds)
+            self._note(info, info.bytes, begins=begins)
 
     def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
         """The state from which the next frame is fitted, decoded from the existing stream."""

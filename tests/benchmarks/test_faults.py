@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from benchmarks.fault_cameras import FILMED, Seen, State, Viewer, camera_row
 from benchmarks.fault_film import PERIOD_SECONDS, Film, Moment, film_of, pictures, read_film, write_film
+from benchmarks.fault_fits import added_up
 from benchmarks.fault_report import table
 from benchmarks.fault_viewers import ViewerRow, killed_servers, killed_trainers
 from benchmarks.faults import parsed
@@ -105,7 +106,20 @@ def test_rows_of_several_seeds_are_added_up() -> None:
 
 def test_all_is_asked_for_by_default() -> None:
     options = parsed([])
-    assert set(options.only) == {*FILMED, "server", "trainer"}
+    assert set(options.only) == {*FILMED, "server", "trainer", "trainer that fits"}
     assert options.moments >= 200
     assert options.kills >= 200
     assert np.isfinite(options.down_seconds)
+
+
+def test_streams_of_the_trainer_that_fits_are_added_up() -> None:
+    total = ViewerRow("trainer that fits", seed=3, equal=True)
+    added_up(total, ViewerRow("one", kills=2, frames=12, equal=True, seconds_until_normal=[1.0, 2.0]))
+    found = ViewerRow("one", kills=1, frames=12, page_went_back=[(5, 4)], page_notices={"a": 2})
+    added_up(total, found)
+    added_up(total, ViewerRow("one", equal=True, page_went_back=[], page_notices={"a": 1}))
+    assert (total.what, total.seed, total.kills, total.frames) == ("trainer that fits", 3, 3, 24)
+    assert total.seconds_until_normal == [1.0, 2.0]
+    assert total.page_went_back == [(5, 4)]
+    assert total.page_notices == {"a": 3}
+    assert not total.equal

@@ -138,6 +138,51 @@ def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(
     assert not {int(name.split("-")[1]) for name in remote.names() if "part" in name} & {0, 1, 2}
 
 
+def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there(tmp_path: Path) -> None:
+    """A round that takes longer than the time of grace: a slow store, or much that waited."""
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    written(here, SENT[:1])  # ends with a short segment, which another run replaces
+    (short,) = (name for name in here.names() if name.startswith("segment"))
+    inside, done = threading.Event(), threading.Event()
+    told: list[str] = []
+
+    def before(name: str) -> None:
+        inside.set()
+        assert done.wait(60)
+
+    remote.before = before
+    mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
+    mirror.copy_all()
+    assert inside.wait(60)
+    written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5))
+    assert short in here.names()
+    done.set()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert remote.edges == [0, 8]  # The remote raises where a manifest names what is not there.
+    assert told == []
+    assert short not in here.names()
+    assert content(remote).items() >= content(here).items()
+
+
+def test_a_store_that_lost_files_while_it_failed_gets_them_again(tmp_path: Path) -> None:
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    mirror = MirroredStore(here, remote)
+
+    def after(frame: int) -> None:
+        if frame != 4:
+            return
+        _settle(mirror)
+        remote.reachable.clear()
+        for name in FolderStore.names(remote):
+            FolderStore.delete(remote, name)
+
+    written(mirror, SENT, after=after)
+    assert remote.refused.acquire(timeout=60)
+    remote.reachable.set()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert content(remote) == content(here)
+
+
 @pytest.mark.parametrize("frame", [2, 3])
 def test_a_killed_writer_is_followed_up(tmp_path: Path, frame: int) -> None:
     """The thread dies with the process, anywhere; the next run compares."""

@@ -9,7 +9,10 @@ Note [Order of copying]
 ~~~~~~~~~~~~~~~~~~~~~~~
 One round takes the folder's manifest and the names that wait together, copies the files, and then the manifest, so
 that the other store's manifest names only files that are there. Manifests that were replaced meanwhile are left out. A
-file is removed from the other store no sooner than the time of grace after its first manifest without it.
+file that is to leave the folder during a round, which may take longer than the time of grace, leaves it when the round
+is over. A file is removed from the other store no sooner than the time of grace after its first manifest without it.
+
+A store that has failed is compared with the folder before the next round: it may have lost what it had.
 """
 
 import threading
@@ -56,6 +59,8 @@ class MirroredStore:
         self._changed = threading.Condition()
         self._waiting: dict[str, None] = {}  # names to copy, in their order
         self._manifest_waits = False
+        self._round_names: frozenset[str] = frozenset()  # what the round that goes on copies
+        self._held: list[str] = []  # of them, what leaves the folder when it is over
         self._gone: dict[str, float | None] = {}  # names to remove, and since when the remote manifest lacks them
         self._ending = False
         self._known = False  # whether the remote's files have been compared with the folder's
@@ -85,7 +90,14 @@ class MirroredStore:
         return self._folder.get(name)
 
     def delete(self, name: str) -> None:
-        """Remove from the folder at once; the copy goes later."""
+        """Remove from the folder, when it is not being copied; the copy goes later."""
+        with self._changed:
+            if name in self._round_names:
+                self._held.append(name)
+                return
+        self._remove(name)
+
+    def _remove(self, name: str) -> None:
         self._folder.delete(name)
         with self._changed:
             self._waiting.pop(name, None)
@@ -154,6 +166,7 @@ class MirroredStore:
             self._copy()
         except (StorageError, StreamError) as error:
             self._failures += 1
+            self._known = False
             if self._failures == 2:  # A single failure is nothing to be told of.
                 self._options.tell(
                     f"{self._remote.name} cannot be reached ({error}); the stream goes on in {self._folder.name}, and "
@@ -172,6 +185,7 @@ class MirroredStore:
         with self._changed:
             earlier = {name: None for name in sorted(here - there - self._waiting.keys()) if name != MANIFEST}
             self._waiting = {**earlier, **self._waiting}
+            self._manifest_waits = self._manifest_waits or MANIFEST in here
             for name in there - here - {MANIFEST}:
                 self._gone.setdefault(name)
             self._known = True
@@ -182,6 +196,7 @@ class MirroredStore:
             names = [*self._waiting]
             manifest = self._folder.get(MANIFEST) if self._manifest_waits else None
             self._manifest_waits = False
+            self._round_names = frozenset(names)
             leaving = [name for name, since in self._gone.items() if since is None]
         try:
             for name in names:
@@ -192,6 +207,12 @@ class MirroredStore:
             with self._changed:
                 self._manifest_waits = self._manifest_waits or manifest is not None
             raise
+        finally:
+            with self._changed:
+                self._round_names = frozenset()
+                held, self._held = self._held, []
+            for name in held:
+                self._remove(name)
         now = self._options.elapsed()
         if manifest is not None:
             with self._changed:

@@ -114,7 +114,7 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   get duration(): number {
-    return this.engine?.durationSeconds ?? Number.NaN;
+    return this.engine?.frames.duration ?? Number.NaN;
   }
 
   /** Goes to the edge of a live stream, and plays it from now on. */
@@ -142,7 +142,7 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   get buffered(): readonly TimeRange[] {
-    return this.engine?.buffered ?? [];
+    return this.engine?.stored.times ?? [];
   }
 
   /** The camera of the picture, in scene units; one that is set is flown to no more than it is looked through. */

@@ -51,7 +51,7 @@ test("the first picture takes head, tail, header and one key packet", async () =
     [CLIP.length - 4096, CLIP.length],
     [4096, key.offset + key.bytes],
   ]);
-  expect(play.engine.durationSeconds).toBeCloseTo(12 / 30);
+  expect(play.engine.frames.duration).toBeCloseTo(12 / 30);
   expect(play.errors).toEqual([]);
 });
 
@@ -148,7 +148,7 @@ test("late frames are dropped, and the picture goes on from the next key", async
   const play = opened(new ServedFile(CLIP));
   await play.settled();
   play.engine.play();
-  await play.until(() => play.engine.buffered[0]?.[1] === play.engine.durationSeconds, "buffer");
+  await play.until(() => play.engine.stored.times[0]?.[1] === play.engine.frames.duration, "buffer");
   play.seconds += 0.31; // a hole of nine frames
   await play.until(() => play.shown.at(-1)! >= 9);
   // Those decoded ahead were there; the ones between were not made into numbers, nor waited for.
@@ -252,7 +252,7 @@ describe("a growing file", () => {
     const cut = (frames: number) => CLIP.subarray(0, PACKETS[frames - 1]!.offset + PACKETS[frames - 1]!.bytes + 5);
     const file = new ServedFile(cut(2));
     const play = opened(file);
-    await play.until(() => play.engine.frames.count === 2 && play.engine.growing);
+    await play.until(() => play.engine.frames.count === 2 && play.engine.edge.grows);
     play.engine.play();
     const ticking = () => {
       play.seconds += 1 / 60;
@@ -289,7 +289,7 @@ describe("a growing file", () => {
   test("that was replaced by a shorter one is refused", async () => {
     const file = new ServedFile(CLIP.subarray(0, PACKETS[5]!.offset));
     const play = opened(file);
-    await play.until(() => play.engine.growing);
+    await play.until(() => play.engine.edge.grows);
     file.bytes = CLIP.subarray(0, 9000);
     await play.until(() => play.errors.length > 0);
     expect(play.errors[0]).toContain("it was replaced. Load it again");

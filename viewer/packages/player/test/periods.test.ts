@@ -74,7 +74,7 @@ test("periods of a file are crossed without a break, and each init record is fet
   const stalls: boolean[] = [];
   play.engine.on("stall", ({ stalled }) => stalls.push(stalled));
   play.engine.play();
-  await play.until(() => (play.engine.buffered.at(-1)?.[1] ?? 0) > 0.5, "buffer");
+  await play.until(() => (play.engine.stored.times.at(-1)?.[1] ?? 0) > 0.5, "buffer");
   await playedOut(play, take);
   expect(headers).toEqual([6, 12, 18, 24]);
   expectFrame(fields, PERIODS * EACH - 1);

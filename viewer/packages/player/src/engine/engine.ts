@@ -8,11 +8,12 @@ import { demandOf } from "./ahead.js";
 import { MediaClock } from "./clock.js";
 import { Edge } from "./edge.js";
 import { Emitter } from "./emitter.js";
-import type { EngineEvents, TimeRange } from "./events.js";
+import type { EngineEvents } from "./events.js";
 import { type DueUpdate, FrameQueue } from "./frameQueue.js";
 import type { EngineOptions } from "./options.js";
 import { PacketLog } from "./packetLog.js";
 import type { Pipeline } from "./pipeline.js";
+import { Progress } from "./progress.js";
 import { Rebuffering } from "./rebuffering.js";
 import { StoredFrames } from "./storedFrames.js";
 import { Timeline } from "./timeline.js";
@@ -39,13 +40,9 @@ export class Engine extends Emitter<EngineEvents> {
   private readonly waiting = new Rebuffering(this.frames, this.stored, this.edge);
   private startSeconds: number | undefined;
   private name = "The stream";
-  private serial = 0;
-  private target = 0;
-  /** The last frame that can be drawn or need not be waited for. */
-  private reached = -1;
+  private readonly progress = new Progress();
   private demanded: Demand | undefined;
   private wantsToPlay = false;
-  private isSeeking = false;
   private isStalled = false;
   private hasEnded = false;
   private failed = false;
@@ -76,7 +73,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.wantsToPlay = true;
     if (this.hasEnded) this.seekFrame(0);
     else if (this.opened && this.edge.following) this.goLive();
-    else if (!this.isSeeking && this.frames.count) this.clock.start(this.now());
+    else if (!this.seeking && this.frames.count) this.clock.start(this.now());
     this.emit("state", {});
   }
 
@@ -153,11 +150,8 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** The frame that the clock is at, or that is sought. */
   get frameIndex(): number {
-    return this.isSeeking ? this.target : this.frames.frameAt(this.clock.at(this.now()));
-  }
-
-  get durationSeconds(): number {
-    return this.frames.duration;
+    const { seeking, target } = this.progress;
+    return seeking ? target : this.frames.frameAt(this.clock.at(this.now()));
   }
 
   get paused(): boolean {
@@ -165,7 +159,7 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   get seeking(): boolean {
-    return this.isSeeking;
+    return this.progress.seeking;
   }
 
   get stalled(): boolean {
@@ -176,18 +170,9 @@ export class Engine extends Emitter<EngineEvents> {
     return this.hasEnded;
   }
 
-  /** Whether frames may still be appended to the stream, and all that there are have been read. */
-  get growing(): boolean {
-    return this.edge.grows;
-  }
-
   /** Of a growing stream: seconds until its next frame, where its pace is known. */
   get nextFrameSeconds(): number | undefined {
     return this.edge.nextIn(this.now());
-  }
-
-  get buffered(): readonly TimeRange[] {
-    return this.stored.times;
   }
 
   /** The next picture comes with everything that can change: for a renderer that has lost what it had. */
@@ -200,10 +185,12 @@ export class Engine extends Emitter<EngineEvents> {
   tick(): DueUpdate | undefined {
     if (!this.opened || this.failed) return undefined;
     const now = this.now();
-    if (this.wantsToPlay && !this.isSeeking) this.advance(now);
+    if (this.wantsToPlay && !this.seeking) this.advance(now);
     this.ask();
     const update = this.queue.take(this.frames.frameAt(this.clock.at(now)));
-    if (update) this.emit("frame", { index: update.index, ptsSeconds: update.ptsSeconds });
+    if (!update) return undefined;
+    this.progress.shown = update.index;
+    this.emit("frame", { index: update.index, ptsSeconds: update.ptsSeconds });
     return update;
   }
 
@@ -216,10 +203,7 @@ export class Engine extends Emitter<EngineEvents> {
 
   private begin(frame: number, seconds: number): void {
     const now = this.now();
-    this.serial++;
-    this.target = frame;
-    this.reached = frame - 1;
-    this.isSeeking = true;
+    this.progress.seek(frame);
     this.hasEnded = false;
     this.clock.stop(now);
     this.clock.set(seconds, now);
@@ -229,26 +213,31 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   private advance(now: number): void {
-    const { clock, frames: timeline } = this;
+    const { clock, frames: timeline, progress } = this;
     const pace = this.edge.pace(clock.at(now), this.rate);
     if (pace.to !== undefined) {
       if (pace.why) this.emit("notice", { message: pace.why });
       this.setStalled(false);
-      this.begin(pace.to, timeline.ptsOf(pace.to));
+      if (pace.to > progress.reached) this.begin(pace.to, timeline.ptsOf(pace.to));
+      else {
+        // The decoder, which hears of frames sooner, has given it.
+        clock.set(timeline.ptsOf(pace.to), now);
+        clock.start(now);
+      }
       return;
     }
     if (pace.rate !== clock.rate) clock.setRate(pace.rate, now);
     const time = clock.at(now);
     const ahead = this.demanded?.ahead ?? 1;
-    if (this.isStalled && this.waiting.isOver(time, clock.rate, this.reached, ahead, now)) {
+    if (this.isStalled && this.waiting.isOver(time, clock.rate, progress.reached, ahead, now)) {
       this.setStalled(false);
       clock.start(now);
     }
     if (!clock.running) return;
     if (time >= timeline.duration) this.stopAtEnd(now);
-    else if (timeline.frameAt(time) > this.reached && !this.stored.has(this.reached + 1)) {
+    else if (timeline.frameAt(time) > progress.reached && !this.stored.has(progress.reached + 1)) {
       clock.stop(now);
-      clock.set(Math.min(time, Math.max(timeline.endOf(Math.max(this.reached, 0)) - 1e-3, 0)), now);
+      clock.set(Math.min(time, Math.max(timeline.endOf(Math.max(progress.reached, 0)) - 1e-3, 0)), now);
       this.setStalled(true);
     }
   }
@@ -276,8 +265,8 @@ export class Engine extends Emitter<EngineEvents> {
 
   /** Tells the decoder what is wanted, if that has changed. */
   private ask(): void {
-    const { frames: timeline, clock, serial } = this;
-    const at = this.isSeeking ? this.target : timeline.frameAt(clock.at(this.now()));
+    const { frames: timeline, clock, frameIndex: at } = this;
+    const { serial } = this.progress;
     const rate = this.wantsToPlay ? clock.rate : undefined;
     const { until, ahead } = demandOf(timeline, serial, at, rate, this.options.aheadSeconds);
     const last = this.demanded;
@@ -353,24 +342,24 @@ export class Engine extends Emitter<EngineEvents> {
     const { serial, exact, packets, header } = message;
     const update = { ...message.update, header };
     this.packets.take(packets, message.decodeMilliseconds);
-    if (serial !== this.serial) {
-      this.queue.carry(update);
+    const { progress, queue } = this;
+    if (serial !== progress.serial || progress.isBack(update.index, exact)) {
+      queue.carry(update);
       return;
     }
-    this.queue.add(update, this.isSeeking);
-    this.reached = Math.max(this.reached, update.index);
-    if (exact && this.isSeeking) this.arrive();
+    queue.add(update, progress.seeking);
+    progress.reach(update.index);
+    if (exact && progress.seeking) this.arrive();
   }
 
   private hearGap(serial: number, end: number): void {
-    if (serial !== this.serial) return;
-    this.reached = Math.max(this.reached, end - 1);
-    if (this.isSeeking) this.arrive();
+    if (serial !== this.progress.serial) return;
+    this.progress.reach(end - 1);
+    if (this.seeking) this.arrive();
   }
 
   private arrive(): void {
-    this.isSeeking = false;
-    this.reached = Math.max(this.reached, this.target);
+    this.progress.arrive();
     if (this.wantsToPlay) this.clock.start(this.now());
     this.emit("state", {});
   }
@@ -385,9 +374,9 @@ export class Engine extends Emitter<EngineEvents> {
 
   private tellProgress(): void {
     this.emit("progress", {
-      buffered: this.buffered,
+      buffered: this.stored.times,
       fetchedBytes: this.stored.fetchedBytes,
-      durationSeconds: this.durationSeconds,
+      durationSeconds: this.frames.duration,
       complete: this.frames.complete,
     });
   }

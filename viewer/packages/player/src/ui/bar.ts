@@ -110,7 +110,7 @@ export class Bar {
   private updateEdge(): void {
     const { engine } = this.player;
     const live = engine?.edge.live === true;
-    this.edge.hidden = !engine?.growing || (!live && engine.frameIndex >= engine.frames.count - 1);
+    this.edge.hidden = !engine?.edge.grows || (!live && engine.frameIndex >= engine.frames.count - 1);
     if (this.edge.hidden || !engine) return;
     const behind = Math.round(engine.behindSeconds);
     const distance = behind >= 60 ? timeText(behind, false) : `${behind} s`;
@@ -128,9 +128,9 @@ export class Bar {
       setText(this.time, "");
       return;
     }
-    const fine = engine.durationSeconds < 60;
+    const fine = engine.frames.duration < 60;
     const now = timeText(engine.currentTime, fine);
-    const total = timeText(engine.durationSeconds, fine);
+    const total = timeText(engine.frames.duration, fine);
     // Of a live stream the button beside it says how far its end is.
     const text = engine.edge.live ? now : `${now} / ${total}`;
     const frame = ` · frame ${engine.frameIndex}`;

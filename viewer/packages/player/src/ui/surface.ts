@@ -194,7 +194,7 @@ export class Surface {
     player.on("state", () => this.stateChanged());
     player.on("notice", ({ message }) => this.say(message));
     player.on("stall", ({ stalled }) => {
-      if (stalled && !player.engine?.growing) this.notes.speak("Waiting for data");
+      if (stalled && !player.engine?.edge.grows) this.notes.speak("Waiting for data");
     });
     player.on("error", ({ message, fatal }) => {
       if (fatal) this.fail(message);
@@ -208,7 +208,7 @@ export class Surface {
     const { engine } = this.options.player;
     this.playButton = made("button", { type: "button", class: "big glass", "aria-label": "Play" }, icon("play"));
     this.playButton.addEventListener("click", () => engine?.play());
-    if (engine?.paused && (!engine.growing || engine.edge.live) && engine.frames.count > 1)
+    if (engine?.paused && (!engine.edge.grows || engine.edge.live) && engine.frames.count > 1)
       this.notes.show(this.playButton);
     else this.notes.show();
   }
@@ -221,7 +221,7 @@ export class Surface {
 
   private tellEdge(): void {
     const { engine } = this.options.player;
-    if (!engine?.growing || engine.edge.flows || engine.paused || !engine.stalled) return;
+    if (!engine?.edge.grows || engine.edge.flows || engine.paused || !engine.stalled) return;
     const seconds = engine.nextFrameSeconds;
     const when = !seconds ? "the next is awaited" : `next in about ${Math.ceil(seconds)} s`;
     this.notes.status(`Frame ${engine.frames.count - 1}, ${when}`, performance.now() / 1000);

@@ -53,7 +53,7 @@ export class TimelineBar {
     const seconds = engine.currentTime;
     const scale = devicePixelRatio;
     const { start } = engine.frames;
-    const duration = engine.durationSeconds;
+    const { duration } = engine.frames;
     const span = Math.max(duration - start, 1e-6);
     const at = Math.round((Math.max(seconds - start, 0) / span) * width * scale);
     const state = `${this.version},${at},${width},${height},${scale},${duration},${getComputedStyle(root).color}`;
@@ -79,12 +79,12 @@ export class TimelineBar {
     };
     context.setTransform(scale, 0, 0, scale, 0, 0);
     context.clearRect(0, 0, width, height);
-    const { frames, durationSeconds } = engine;
-    const span = Math.max(durationSeconds - frames.start, 1e-6);
+    const { frames } = engine;
+    const span = Math.max(frames.duration - frames.start, 1e-6);
     const x = (seconds: number) => Math.min(Math.max((seconds - frames.start) / span, 0), 1) * width;
     const top = height / 2 - 2;
     fill("--rail", 0, width, top, 4);
-    for (const [start, end] of engine.buffered) fill("--buffer", x(start), x(end), top, 4);
+    for (const [start, end] of engine.stored.times) fill("--buffer", x(start), x(end), top, 4);
     fill("--accent", 0, at, top, 4);
     for (const [first, end] of frames.lost) fill("--lost", x(frames.ptsOf(first)), x(frames.endOf(end - 1)), top, 4);
     // More keys than this would be a bar of their own.
@@ -100,7 +100,7 @@ export class TimelineBar {
     const { left, width } = this.root.getBoundingClientRect();
     const share = Math.min(Math.max((event.clientX - left) / Math.max(width, 1), 0), 1);
     const from = this.engine?.frames.start ?? 0;
-    return from + share * ((this.engine?.durationSeconds ?? 0) - from);
+    return from + share * ((this.engine?.frames.duration ?? 0) - from);
   }
 
   private showTip(event: PointerEvent): void {
