@@ -3,7 +3,8 @@
 
 ``python -m benchmarks.preparation build/rigs [RIG ...] --work build/prepared --json results/preparation.json``
 prepares every rig, holds cameras and clocks against the truth, and makes two short streams with the same settings, one
-from the prepared capture and one from the same videos with the true calibration; their held-out PSNR is compared.
+from the prepared capture and one from the same videos with the true calibration; their held-out PSNR is compared, the
+mean over ``--seeds``. ``--how`` takes one of a rig's preparations, ``--keep`` the captures that ``--work`` has already.
 ``python -m benchmarks.preparation table FILE`` prints a result as Markdown.
 """
 
@@ -12,11 +13,12 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tools.rigs.truth import Truth, read_truth
 
 from benchmarks.exact import stream_scores, write_exact
@@ -103,13 +105,25 @@ def synchronization(truth: Truth) -> str:
     return "none" if set(true_clocks(truth).values()) == {Clock()} else "auto"
 
 
-def measured(run: Run, folder: Path, work: Path, *, frames: int, streams: bool) -> dict[str, Any]:
-    """One preparation against the truth, as plain JSON values; what fails is told in its ``error``."""
+def measured(
+    run: Run, folder: Path, work: Path, *, frames: int, seeds: Sequence[int], keep: bool = False
+) -> dict[str, Any]:
+    """One preparation against the truth, as plain JSON values; what fails is told in its ``error``.
+
+    Args:
+        run: what is prepared.
+        folder: of the rigs.
+        work: for captures and streams.
+        frames: of each stream.
+        seeds: of the streams; none are made without any.
+        keep: go on from a capture that is there instead of making it anew.
+    """
     truth = read_truth(folder / run.rig)
     videos = folder / run.rig / ("videos" if truth.held_out is not None else "board")
     name = f"{run.rig}-{run.how}".replace(",", "").replace(" ", "-")
     capture = work / name
-    shutil.rmtree(capture, ignore_errors=True)
+    if not keep:
+        shutil.rmtree(capture, ignore_errors=True)
     options = replace(run.options, field_of_view=FIELD_OF_VIEW_DEGREES, size=SIZE)
     if truth.held_out is not None:
         options = replace(options, held_out=(truth.held_out,))
@@ -127,14 +141,30 @@ def measured(run: Run, folder: Path, work: Path, *, frames: int, streams: bool) 
     }
     content = read_prepared(capture)
     found |= recovered(content, truth, find_footage(videos))
-    if streams and truth.held_out is not None:
+    if seeds and truth.held_out is not None:
         exact = work / f"{name}-exact"
         write_exact(capture, exact, true_cameras(truth), true_clocks(truth))
-        found["psnr"] = {
-            kind: stream_scores(folder, work / f"{folder.name}.sgs", preset=SHORT, frames=frames)["psnr"]
-            for kind, folder in {"prepared": capture, "exact": exact}.items()
-        }
+        found |= compared_streams({"prepared": capture, "exact": exact}, work, frames=frames, seeds=seeds)
     return found
+
+
+def compared_streams(
+    captures: Mapping[str, Path], work: Path, *, frames: int, seeds: Sequence[int]
+) -> dict[str, dict[str, Any]]:
+    """PSNR of a short stream of each capture: the mean over the seeds, and each."""
+    each = {
+        kind: [
+            stream_scores(folder, work / f"{folder.name}.sgs", preset=replace(SHORT, seed=seed), frames=frames)["psnr"]
+            for seed in seeds
+        ]
+        for kind, folder in captures.items()
+    }
+    return {
+        "psnr": {
+            kind: float(np.mean([value for value in values if value is not None])) for kind, values in each.items()
+        },
+        "psnr_by_seed": {kind: dict(zip(map(str, seeds), values, strict=True)) for kind, values in each.items()},
+    }
 
 
 def recovered(content: PreparedCapture, truth: Truth, footage: Footage) -> dict[str, Any]:
@@ -209,6 +239,9 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="file to write; runs of other rigs that it has are kept")
     parser.add_argument("--frames", type=int, default=4, help="of each stream")
     parser.add_argument("--streams", action=argparse.BooleanOptionalAction, default=True, help="compare PSNR")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the streams, whose mean is compared")
+    parser.add_argument("--how", nargs="+", help="only preparations that the tables call so")
+    parser.add_argument("--keep", action="store_true", help="go on from captures that are in --work")
     return parser.parse_args(arguments)
 
 
@@ -224,11 +257,15 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
     command = " ".join(["python -m benchmarks.preparation", *sys.argv[1:]])
     result: dict[str, Any] = {"command": command, "frames": options.frames, "machine": machine(), "runs": []}
+    asked = [run for run in runs(options.folder, rigs) if options.how is None or run.how in options.how]
     if options.json and options.json.is_file():
-        result["runs"] = [run for run in json.loads(options.json.read_text())["runs"] if run["rig"] not in rigs]
-    for run in runs(options.folder, rigs):
+        again = {(run.rig, run.how) for run in asked}
+        earlier = json.loads(options.json.read_text())["runs"]
+        result["runs"] = [run for run in earlier if (run["rig"], run["how"]) not in again]
+    seeds = options.seeds if options.streams else []
+    for run in asked:
         result["runs"].append(
-            measured(run, options.folder, options.work, frames=options.frames, streams=options.streams)
+            measured(run, options.folder, options.work, frames=options.frames, seeds=seeds, keep=options.keep)
         )
         print(_row(result["runs"][-1]), flush=True)
         if options.json:

@@ -23,6 +23,7 @@ from structgstream.data.prepared import (
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
 from structgstream.data.tone import ToneCurve
+from structgstream.data.wrappers import apart_seconds
 from structgstream.errors import CalibrationError, CaptureError, StorageError
 
 LENSES = (Pinhole(), RadialTangential(k1=-0.1, k2=0.02, p1=0.001), Fisheye(k1=0.02), Pinhole())
@@ -106,10 +107,14 @@ def test_folders_of_pictures(tmp_path: Path) -> None:
         for frame in range(5):
             write_picture(tmp_path / "pictures" / name / f"{frame:03d}.png", picture(number, frame))
     cameras = dict(capture.cameras)
-    cameras["cam01"] = replace(cameras["cam01"], clock=Clock(1 / 30))
+    cameras["cam01"] = replace(cameras["cam01"], clock=Clock(1.3 / 30))
     write_prepared(tmp_path, replace(capture, cameras=cameras))
     source = open_capture(tmp_path)
     assert len(source) == 4
+    apart = apart_seconds(source)
+    assert {name: list(own) for name, own in apart.items()} == {
+        name: pytest.approx([0.3 / 30 if name == "cam01" else 0.0] * 4) for name in cameras
+    }
     assert all_numbers(source.frames(0))[0] == [(0, 1), (1, 0), (2, 1), (3, 1)]
 
 

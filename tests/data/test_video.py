@@ -124,6 +124,8 @@ def test_half_a_period_is_a_warning_and_no_frame_is_lost(tmp_path: Path, caplog:
     caplog.clear()
     source = read(tmp_path)
     assert "lie up to 15.0 ms from their instants (camera 'cam01')" in caplog.text
+    np.testing.assert_allclose(source.apart_seconds["cam01"], 0.45 / 30, atol=1e-4)
+    np.testing.assert_allclose(source.apart_seconds["cam02"], 0.0, atol=1e-4)
     assert [numbers(frame.images["cam01"])[1] for frame in source.frames()] == list(range(8))
 
 
@@ -146,6 +148,7 @@ def test_clocks_move_and_stretch_the_time_stamps(tmp_path: Path) -> None:
     clocks = {"cam00": Clock(), "cam01": Clock(-7.3 / 30, 1.002), "cam02": Clock(0.004)}
     source = synchronised(scan_tracks(tmp_path), RIG, where=tmp_path, clocks=clocks)
     assert len(source) == 17
+    assert source.apart_seconds["cam02"] - source.apart_seconds["cam00"] == pytest.approx(0.004, abs=1e-4)
     seen = [[numbers(image)[1] for image in frame.images.values()] for frame in source.frames()]
     assert seen == [[n, n + 3, n] for n in range(17)]
 

@@ -10,7 +10,16 @@ from captures import all_numbers, numbers, write_clip, write_panoptic
 from structgstream.data.json_videos import open_json_videos
 from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig, every_nth_frame, resized, section, select_cameras
+from structgstream.data.wrappers import (
+    WithoutPoints,
+    WithRig,
+    apart_seconds,
+    every_nth_frame,
+    resized,
+    section,
+    select_cameras,
+    unwrapped,
+)
 from structgstream.errors import CaptureError, ConfigError
 
 
@@ -122,3 +131,17 @@ def test_steps_of_a_thinned_capture(source: FrameSource) -> None:
     for step in (0, -1):
         with pytest.raises(ConfigError, match="at least 1, got"):
             every_nth_frame(source, step)
+
+
+def test_times_of_pictures_are_those_of_the_source_below(tmp_path: Path) -> None:
+    write_clip(tmp_path)
+    videos = open_json_videos(tmp_path)
+    assert set(apart_seconds(WithoutPoints(videos))) == set(videos.rig)
+    assert all(len(apart) == len(videos) for apart in apart_seconds(WithoutPoints(videos)).values())
+    assert apart_seconds(section(videos, start=1)) == {}, "counted from another frame"
+    assert unwrapped(WithoutPoints(videos)) is videos
+
+
+def test_pictures_without_times(tmp_path: Path) -> None:
+    write_panoptic(tmp_path, frames=2)
+    assert apart_seconds(open_panoptic(tmp_path)) == {}

@@ -4,7 +4,7 @@
 import os
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -31,6 +31,8 @@ class ImageSource:
         files: camera name to its picture in each frame; None where it has none.
         points: ``[P, 3]`` points that came with the capture, or None.
         instants: name of each frame in the files; empty if frames have no names.
+        apart_seconds: camera name to how long after its instant its picture of each frame was taken, ``[N]``; empty
+            where that is not known.
     """
 
     name: str
@@ -39,6 +41,7 @@ class ImageSource:
     files: Mapping[str, tuple[Path | None, ...]]
     points: NDArray[np.float64] | None = None
     instants: tuple[str, ...] = ()
+    apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return min(len(files) for files in self.files.values())

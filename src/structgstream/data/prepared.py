@@ -215,7 +215,11 @@ def _of_folders(
                 f"The pictures of camera {name!r} in {files[name]} have {size[0]}x{size[1]} pixels, {path / FILE} is "
                 f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
             )
-    return ImageSource(path.name, rig, capture.fps, cut, points)
+    apart = {
+        name: np.full(last - first, capture.cameras[name].clock.offset_seconds - shift / capture.fps)
+        for name, shift in shifts.items()
+    }
+    return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=apart)
 
 
 def _rig(cameras: Mapping[str, Camera], capture: PreparedCapture, path: Path) -> CameraRig:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The protocols of captures: recordings, whose length is known, and streams that are still being filmed."""
 
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator, Mapping, Sized
 from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
@@ -51,6 +51,17 @@ class ArrivingFrames(Protocol):
     @property
     def newest_only(self) -> bool:
         """Whether a frame is the newest when it is asked for, so that one that is asked for early is old when used."""
+        ...
+
+
+@runtime_checkable
+class TimedPictures(Protocol):
+    """What a recording adds that knows when its pictures were taken."""
+
+    @property
+    def apart_seconds(self) -> Mapping[str, NDArray[np.float64]]:
+        """Camera name to how long after its instant its picture of each frame was taken, ``[N]``; NaN where it has
+        none; empty where that is not known."""
         ...
 
 

@@ -37,6 +37,8 @@ class VideoSource:
         stamps: camera name to the time stamp, in ticks of its video, of its picture in each frame; None where it has
             none.
         points: ``[P, 3]`` points that came with the capture, or None.
+        apart_seconds: camera name to how long after its instant its picture of each frame was taken, ``[N]`` by its own
+            time stamps; NaN where it has none.
     """
 
     name: str
@@ -45,6 +47,7 @@ class VideoSource:
     tracks: Mapping[str, VideoTrack]
     stamps: Mapping[str, tuple[int | None, ...]]
     points: NDArray[np.float64] | None = None
+    apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     _told: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -147,7 +150,8 @@ def synchronised(
     )
     tell_time_error(placed, common, fps=rate, where=str(where))
     stamps = {name: _stamps(tracks[name], own, common) for name, own in placed.items()}
-    return VideoSource(where.name, rig, rate, tracks, stamps, points)
+    apart = {name: _apart(own, common) / rate for name, own in placed.items()}
+    return VideoSource(where.name, rig, rate, tracks, stamps, points, apart)
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None = None) -> float | None:
@@ -180,3 +184,11 @@ def _stamps(track: VideoTrack, placed: Placed, common: range) -> tuple[int | Non
     """The time stamp of each slot of the range; None for those without a frame."""
     frame_of = dict(zip(placed.slots.tolist(), placed.frames.tolist(), strict=True))
     return tuple(track.stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
+
+
+def _apart(placed: Placed, common: range) -> NDArray[np.float64]:
+    """Time of the frame of each slot of the range minus the slot's instant, in periods; NaN for those without one."""
+    apart = np.full(len(common), np.nan)
+    inside = (placed.slots >= common.start) & (placed.slots < common.stop)
+    apart[placed.slots[inside] - common.start] = placed.errors[inside]
+    return apart

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wrappers of captures: resized, shortened, or with other cameras held out."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol, runtime_checkable
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.images import ImageSource, opencv, reduced_mask
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, TimedPictures
 from structgstream.data.video import VideoSource
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
@@ -80,6 +80,20 @@ class Resized(WithRig):
             }
             masks = {name: reduced_mask(mask, sizes[name]) for name, mask in frame.masks.items()}
             yield replace(frame, images=images, masks=masks)
+
+
+def unwrapped(source: FrameSource) -> FrameSource:
+    """The capture below those wrappers that pass on each of its frames."""
+    while isinstance(source, SourceWrapper) and len(source) == len(source.source):
+        source = source.source
+    return source
+
+
+def apart_seconds(source: FrameSource) -> Mapping[str, NDArray[np.float64]]:
+    """Camera name to how long after its instant its picture of each frame was taken, ``[N]`` by its own time stamps;
+    NaN where it has none; empty where that is not known, as for pictures without times."""
+    inner = unwrapped(source)
+    return inner.apart_seconds if isinstance(inner, TimedPictures) else {}
 
 
 @runtime_checkable

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether pictures of one frame are of one moment, and what is said of it."""
 
+from dataclasses import replace
+
 import pytest
 
 from memory_captures import MemoryCapture
@@ -66,3 +68,20 @@ def _rig(cameras):
     from structgstream.cameras import CameraRig
 
     return CameraRig(cameras)
+
+
+def test_what_may_be_less_than_half_a_frame_is_no_error() -> None:
+    """26.4 ms (5.1 ms): another choice of frames would mend it or make it worse."""
+    (finding,) = time_findings(measured(off=("b",), sigma=0.0051, a=0.0, b=0.0264))
+    assert finding.severity == "warning"
+    (finding,) = time_findings(measured(off=("b",), sigma=0.0045, a=0.0, b=0.0264))
+    assert finding.severity == "error"
+
+
+def test_pictures_between_those_of_the_others_are_one_warning() -> None:
+    check = replace(measured(a=0.0, b=0.001, c=0.0), apart_seconds={"a": 0.0, "b": -0.0167, "c": 0.0174})
+    (finding,) = time_findings(check)
+    assert (finding.severity, finding.cameras) == ("warning", ("b", "c"))
+    assert "those of 'c' 17.4 ms (0.52 frames) too late: less than a frame" in finding.sentence
+    unknown = replace(SynchronizationCheck({}, {}, (), ("a", "b"), PERIOD), apart_seconds={"a": 0.0, "b": 0.01})
+    assert [finding.severity for finding in time_findings(unknown)] == ["warning", "note"]

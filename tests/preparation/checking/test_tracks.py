@@ -2,6 +2,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from evidence_made import evidence_of, scattered, turned, wide_ring
 from structgstream.data.matching import project
@@ -76,3 +77,39 @@ def test_without_matches_there_are_no_points() -> None:
     tracks = build_tracks(replace(evidence_of(cameras, scattered(5)), matches=none), cameras)
     assert tracks.points.shape == (0, 3)
     assert len(tracks.residuals) == 0
+
+
+@pytest.mark.parametrize("wrong", [1, 2])
+def test_observations_that_are_far_off_take_no_point_with_them(wrong: int) -> None:
+    """Of seven cameras the last see another thing, far behind, on the same ray of the first camera."""
+    cameras, world = wide_ring(7), scattered(30)
+    evidence = evidence_of(cameras, world)
+    others = [f"cam{6 - number}" for number in range(wrong)]
+    keypoints = {name: pixels.copy() for name, pixels in evidence.keypoints.items()}
+    for number, name in enumerate(others):
+        behind = world[:1] + (0.4 + 0.3 * number) * (world[:1] - cameras["cam0"].center.numpy())
+        keypoints[name][0] = project(cameras[name], behind)[0][0]
+    spoiled = [pair for pair in evidence.matches if set(pair) & set(others) and "cam0" not in pair]
+    matches = {**evidence.matches, **{pair: evidence.matches[pair][1:] for pair in spoiled}}
+    tracks = build_tracks(replace(evidence, keypoints=keypoints, matches=matches), cameras)
+    assert len(tracks.points) == 30
+    place = tracks.points[tracks.point[tracks.of("cam1")]][truth_of(tracks, evidence, "cam1") == 0]
+    np.testing.assert_allclose(place, world[:1], atol=1e-5)
+    far = tracks.residuals > 9
+    assert sorted(tracks.names[number] for number in tracks.camera[far]) == sorted(others)
+    assert tracks.residuals[~far].max() < 1e-4
+
+
+def test_two_parties_of_one_size_are_not_decided() -> None:
+    """On one ray of the first camera two others see one thing, and two another."""
+    cameras, world = wide_ring(5), scattered(12)
+    evidence = evidence_of(cameras, world)
+    behind = world[:1] + 0.5 * (world[:1] - cameras["cam0"].center.numpy())
+    keypoints = {name: pixels.copy() for name, pixels in evidence.keypoints.items()}
+    for name in ("cam3", "cam4"):
+        keypoints[name][0] = project(cameras[name], behind)[0][0]
+    parted = [(one, other) for one in ("cam1", "cam2") for other in ("cam3", "cam4")]
+    matches = {**evidence.matches, **{pair: evidence.matches[pair][1:] for pair in parted}}
+    tracks = build_tracks(replace(evidence, keypoints=keypoints, matches=matches), cameras)
+    assert len(tracks.points) == 11
+    assert tracks.residuals.max() < 1e-4

@@ -100,7 +100,8 @@ class MadeStreams:
 
 @dataclass(frozen=True)
 class MadeSource:
-    """A capture of the room at 30 frames a second, some of whose cameras are late by ``late`` seconds."""
+    """A capture of the room at 30 frames a second, some of whose cameras are late by ``late`` seconds; of those in
+    ``apart_seconds`` time stamps say so."""
 
     rig: CameraRig
     late: Mapping[str, float]
@@ -109,6 +110,7 @@ class MadeSource:
     name: str = "room"
     points: None = None
     still: bool = False
+    apart_seconds: Mapping[str, Floats] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return self.count

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The check of captures that are said to be synchronous."""
 
+import numpy as np
 import pytest
 
 from structgstream.cameras import CameraRig
@@ -41,3 +42,22 @@ def test_the_bundled_clip_is_synchronous() -> None:
     check = check_synchronization(bundled_clip())
     assert check.conclusive
     assert not check.off
+
+
+def test_what_time_stamps_say_is_not_late() -> None:
+    """Half a frame that is known is no error of the clock; nor is it gone."""
+    stated = dict.fromkeys(RIG, np.zeros(40)) | {"cam2": np.full(40, 0.5 / 30)}
+    check = check_synchronization(MadeSource(RIG, {"cam2": 0.5 / 30}, apart_seconds=stated))
+    assert not check.off
+    assert abs(check.late_seconds["cam2"]) < 0.15 / 30
+    assert check.late_against_others["cam2"] == pytest.approx(0.5 / 30, abs=0.2 / 30)
+    assert check.between == {"cam2": pytest.approx(0.5 / 30)}
+    assert check.message.startswith("The clocks of the cameras agree within")
+    assert "the pictures of 'cam2' lie between those of the others" in check.message
+
+
+def test_time_stamps_that_are_wrong() -> None:
+    stated = dict.fromkeys(RIG, np.zeros(40)) | {"cam2": np.full(40, 0.4 / 30)}
+    check = check_synchronization(MadeSource(RIG, {"cam2": 1.4 / 30}, apart_seconds=stated))
+    assert check.off == ("cam2",)
+    assert check.late_seconds["cam2"] == pytest.approx(1 / 30, abs=0.2 / 30)

@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from properties import examples
-from structgstream.preparation.synchronization.correlation import Signal, best_lag, chance_deviation, resampled
+from structgstream.preparation.synchronization.correlation import (
+    Signal,
+    best_lag,
+    chance_deviation,
+    lag_changes,
+    resampled,
+)
 
 
 def smooth(times: np.ndarray, channels: int, seed: int = 0) -> np.ndarray:
@@ -77,3 +83,19 @@ def test_chance_of_independent_signals() -> None:
     found = [float(np.corrcoef(a[:, 0], b[:, 0])[0, 1]) for a, b in zip(made[::2], made[1::2])]
     stated = np.mean([chance_deviation(Signal(a, 0, 1), Signal(b, 0, 1)) for a, b in zip(made[::2], made[1::2])])
     assert np.std(found) == pytest.approx(float(stated), rel=0.4)
+
+
+def test_the_lag_without_each_part_of_the_take() -> None:
+    """In the last third the second signal is late by half a sample more."""
+    step = 1 / 30
+    first, second, later = (signal(0.0, 120, shift=shift) for shift in (0.0, 0.1, 0.1 + step / 2))
+    mixed = Signal(np.concatenate([second.values[:83], later.values[83:]]), 0.0, step)
+    lag = best_lag(first, mixed)
+    assert lag is not None
+    changes = lag_changes(first, mixed, lag.seconds, np.array([0.0, 40, 80, 120]) * step)
+    assert changes[2] == pytest.approx(0.1 - lag.seconds, abs=0.05 * step)
+    assert changes[0] > 0.05 * step
+    assert changes[1] > 0.05 * step
+    steady = best_lag(first, second)
+    assert steady is not None
+    assert np.abs(lag_changes(first, second, steady.seconds, np.array([0.0, 40, 80, 120]) * step)).max() < 0.02 * step

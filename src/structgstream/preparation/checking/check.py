@@ -185,6 +185,7 @@ def _camera_checks(
 ) -> dict[str, CameraCheck]:
     tracks, views = examined.tracks, examined.tracks.views
     counts = overlaps(examined.evidence.overlapping(), list(examined.cameras))
+    late = {} if times is None else times.late_against_others
     found = {}
     for name in source.rig:
         color = examined.colors.get(name)
@@ -199,10 +200,8 @@ def _camera_checks(
             exposure_stops=color.exposure_stops if color else None,
             red_stops=color.red_stops if color else None,
             blue_stops=color.blue_stops if color else None,
-            offset_ms=None if times is None or name not in times.late_seconds else 1e3 * times.late_seconds[name],
-            offset_uncertainty_ms=None
-            if times is None or name not in times.late_seconds
-            else 1e3 * times.uncertainty_seconds[name],
+            offset_ms=1e3 * late[name] if name in late else None,
+            offset_uncertainty_ms=1e3 * times.uncertainty_seconds[name] if times is not None and name in late else None,
             frames_lacking=int((~presence[name]).sum()),
         )
     return found

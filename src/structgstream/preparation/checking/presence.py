@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from structgstream.data.images import ImageSource
 from structgstream.data.source import FrameSource
 from structgstream.data.video import VideoSource
-from structgstream.data.wrappers import SourceWrapper
+from structgstream.data.wrappers import unwrapped
 from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.findings import Finding
 
@@ -21,9 +21,7 @@ LOST_SECONDS, LOST_SHARE, MOST_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of th
 
 def stated_presence(source: FrameSource) -> Presence:
     """For each camera whether it has a picture of each frame ``[N]``, as far as files say so without being decoded."""
-    inner = source
-    while isinstance(inner, SourceWrapper) and len(inner) == len(inner.source):
-        inner = inner.source
+    inner = unwrapped(source)
     pictures: Mapping[str, tuple[object, ...]] = {}
     if isinstance(inner, VideoSource):
         pictures = inner.stamps

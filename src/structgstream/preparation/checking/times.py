@@ -8,7 +8,7 @@ from structgstream.preparation.synchronization import SynchronizationCheck, chec
 FRAMES = 90
 LEAST_FRAMES = 8
 WARNED_SECONDS = 5e-3
-SIGMAS = 3.0
+SIGMAS, SURE_SIGMAS = 3.0, 2.0
 
 
 def measure_times(source: FrameSource) -> SynchronizationCheck | None:
@@ -22,18 +22,26 @@ def measure_times(source: FrameSource) -> SynchronizationCheck | None:
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
-    """An error for cameras that are off by a good part of a frame, a warning above 5 ms; a note if none can be told."""
+    """An error for cameras that are off by a good part of a frame, a warning above 5 ms; a note if none can be told.
+
+    Cameras are off whose pictures show another instant than their time stamps say. Pictures that by their stamps lie
+    between those of the others are warned of once.
+    """
     if measured is None:
         return []
-    if not measured.conclusive:
-        return [Finding("note", measured.message)]
     findings = []
+    if measured.between:
+        findings.append(Finding("warning", measured.between_message, tuple(measured.between)))
+    if not measured.conclusive:
+        return [*findings, Finding("note", measured.message)]
     for name, late in measured.late_seconds.items():
         if abs(late) < max(WARNED_SECONDS, SIGMAS * measured.uncertainty_seconds[name]):
             continue
         amount = f"{1e3 * abs(late):.1f} ms ({abs(late) / measured.period_seconds:.2f} frames)"
         which = "late" if late > 0 else "early"
-        if abs(late) > 0.6 * measured.period_seconds:
+        # What is surely more than half a frame another choice of frames mends.
+        surely = abs(late) - SURE_SIGMAS * measured.uncertainty_seconds[name]
+        if abs(late) > 0.6 * measured.period_seconds and surely > 0.5 * measured.period_seconds:
             told = f"Camera {name!r} is {amount} {which}; synchronise again, or correct its clock in capture.json."
             findings.append(Finding("error", told, (name,)))
         elif name in measured.off:

@@ -14,6 +14,7 @@ from structgstream.preparation.checking.evidence import Evidence
 
 AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
 LEAST_VIEWS = 3
+MOST_PAIRS = 45  # of a point's observations, from which it is looked for: all pairs of ten
 ROUNDS = 2
 
 
@@ -70,7 +71,8 @@ def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Coll
     """Points from the matches of cameras that are not ``off``; observations of those that are are kept, too.
 
     Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. Points lie
-    where the rays of their keypoints pass closest, in the sense of least squares.
+    where the rays of their keypoints pass closest, in the sense of least squares; of a point whose keypoints disagree
+    those count on which most of them agree.
     """
     names = tuple(name for name in cameras if name in evidence.keypoints)
     limit = AGREE_PIXELS * max(max((cameras[name].width for name in names), default=0) / 1000, 1)
@@ -83,6 +85,7 @@ def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Coll
     good = np.array([name not in off for name in names], bool)
     table = _Table(point, camera, pixels, good[camera] if len(camera) else np.empty(0, bool)).solvable()
     in_order = [cameras[name] for name in names]
+    table = _agreeing(table, in_order, 3 * limit)
     for _ in range(ROUNDS):  # once more without what disagrees
         points = _closest(table, in_order)
         residuals = _residuals(points, table, in_order)
@@ -136,6 +139,42 @@ def _components(
     twice[label[count[position] > 1]] = True
     kept = ~twice[label]
     return label[kept], camera[kept], node[kept] - first[camera[kept]]
+
+
+def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
+    """The table without those observations of points that others outvote.
+
+    Least squares of all would put a point with one far-off observation where none of them is. So where they disagree
+    the point of each pair is looked at, and that with most observations within ``limit`` pixels counts if these are
+    three or more, and most of all; of two equal parties neither is right.
+    """
+    wrong = table.used & (_residuals(_closest(table, cameras), table, cameras) >= limit)
+    doubted = np.unique(table.point[wrong])
+    used = table.used.copy()
+    rows = np.flatnonzero(table.used & np.isin(table.point, doubted))
+    for own in np.split(rows[order := np.argsort(table.point[rows], kind="stable")], _starts(table.point[rows][order])):
+        if len(own) <= LEAST_VIEWS:  # two of three always agree
+            continue
+        pairs = np.stack(np.triu_indices(len(own), 1), axis=1)
+        pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).round().astype(int))]
+        each = _Table(
+            np.repeat(np.arange(len(pairs)), len(own)),
+            np.tile(table.camera[own], len(pairs)),
+            np.tile(table.pixels[own], (len(pairs), 1)),
+            (np.arange(len(own)) == pairs[:, :1]).ravel() | (np.arange(len(own)) == pairs[:, 1:]).ravel(),
+        )
+        apart = _residuals(_closest(each, cameras), each, cameras).reshape(len(pairs), len(own))
+        within = apart < limit
+        best = np.lexsort((np.where(within, apart, limit).sum(1), -within.sum(1)))[0]
+        rivals = within[(within & ~within[best]).any(1)].sum(1).max(initial=0)
+        if within[best].sum() > max(rivals, LEAST_VIEWS - 1, len(own) / 2):
+            used[own] = within[best]
+    return replace(table, used=used)
+
+
+def _starts(ascending: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Where another number begins."""
+    return np.flatnonzero(np.diff(ascending)) + 1
 
 
 def _closest(table: _Table, cameras: list[Camera]) -> Floats:

@@ -3,7 +3,7 @@
 much each camera is late."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import apart_seconds
 from structgstream.preparation.synchronization.changes import Changes, reduced_changes, reduced_picture
 from structgstream.preparation.synchronization.correlation import demand_scipy
 from structgstream.preparation.synchronization.geometry import CalibratedGeometry
@@ -19,10 +20,11 @@ from structgstream.preparation.synchronization.motion import (
     pair_signals,
     solve_by_motion,
 )
+from structgstream.preparation.synchronization.result import WARNED_SECONDS
 
 OFF_PERIODS = 0.25  # of a camera's frames, from which on it is off; true synchronous captures show up to 0.16
 OFF_SIGMAS = 3.0
-MOST_SIGMA_PERIODS = 0.25
+MOST_SIGMA_PERIODS = 1 / 3  # so that a whole frame shows
 MOST_FRAMES = 300
 
 
@@ -32,12 +34,13 @@ class SynchronizationCheck:
 
     Args:
         late_seconds: camera to how much later than stated its pictures were taken, relative to most cameras; of the
-        cameras
-            that can be judged.
+            cameras that can be judged. Stated are their own time stamps, where the capture has them.
         uncertainty_seconds: the standard errors of these.
         off: cameras that are late or early by more than a quarter of a frame period, and more than chance.
         undecided: cameras in whose pictures too little moves that others see.
         period_seconds: the frame period.
+        apart_seconds: camera to how long after their instants its pictures were taken by their time stamps, relative to
+            most cameras; empty where the capture has no time stamps.
     """
 
     late_seconds: Mapping[str, float]
@@ -45,6 +48,18 @@ class SynchronizationCheck:
     off: tuple[str, ...]
     undecided: tuple[str, ...]
     period_seconds: float
+    apart_seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def between(self) -> dict[str, float]:
+        """Of :attr:`apart_seconds` those that count: cameras whose pictures lie between the instants of the others."""
+        return {name: apart for name, apart in self.apart_seconds.items() if abs(apart) > WARNED_SECONDS}
+
+    @property
+    def late_against_others(self) -> dict[str, float]:
+        """How much later than those of most cameras pictures of a frame were taken: what time stamps say, and what they
+        do not; of the cameras that can be judged."""
+        return {name: late + self.apart_seconds.get(name, 0.0) for name, late in self.late_seconds.items()}
 
     @property
     def conclusive(self) -> bool:
@@ -60,10 +75,26 @@ class SynchronizationCheck:
         if not said:
             worst = max(abs(late) for late in self.late_seconds.values())
             said = [f"The cameras are synchronous within {worst * 1e3:.1f} ms."]
+            if self.between:
+                said = [f"The clocks of the cameras agree within {worst * 1e3:.1f} ms.", self.between_message]
         if self.undecided:
             names = ", ".join(repr(name) for name in self.undecided)
             said.append(f"Too little moves before {names} to tell about them.")
         return " ".join(said)
+
+    @property
+    def between_message(self) -> str:
+        """What is said of :attr:`between`; empty for no camera."""
+        if not self.between:
+            return ""
+        worst = max(self.between, key=lambda name: abs(self.between[name]))
+        apart = self.between[worst]
+        return (
+            f"By their time stamps the pictures of {', '.join(map(repr, self.between))} lie between those of the "
+            f"others, those of {worst!r} {abs(apart) * 1e3:.1f} ms ({abs(apart) / self.period_seconds:.2f} frames) too "
+            f"{'late' if apart > 0 else 'early'}: less than a frame, which choosing frames cannot mend; what moves "
+            "fast will blur there. Cameras that one signal starts have no such rest."
+        )
 
     def _off_message(self, name: str) -> str:
         late = self.late_seconds[name]
@@ -88,8 +119,9 @@ def check_synchronization(source: FrameSource, *, frames: int = MOST_FRAMES) -> 
     pairs = [pair for pair in pairs if pair.epipolar]
     takes = {name: (float(own.times[0]), float(own.times[-1])) for name, own in changes.items() if len(own.times)}
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=period / 2) if pairs else ((), None, [])
+    apart = _apart(source, frames)
     if coarse is None:
-        return SynchronizationCheck({}, {}, (), tuple(source.rig), period)
+        return SynchronizationCheck({}, {}, (), tuple(source.rig), period, apart)
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
     # A clock that is unsure by a good part of a frame tells nothing, however far it is from the others.
@@ -97,15 +129,29 @@ def check_synchronization(source: FrameSource, *, frames: int = MOST_FRAMES) -> 
     late = {name: solution.offsets[name] - middle for name in told}
     errors = {name: solution.sigmas[name] for name in told}
     off = tuple(name for name in told if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
-    return SynchronizationCheck(late, errors, off, tuple(name for name in source.rig if name not in told), period)
+    undecided = tuple(name for name in source.rig if name not in told)
+    return SynchronizationCheck(late, errors, off, undecided, period, apart)
 
 
 def _changes(source: FrameSource, frames: int) -> dict[str, Changes]:
     reduced: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in source.rig}
     stamps: dict[str, list[float]] = {name: [] for name in source.rig}
+    apart = apart_seconds(source)
     for frame in islice(source.frames(), frames):
         for name, picture in frame.images.items():
             reduced[name].append(reduced_picture(picture))
-            stamps[name].append(frame.index / source.fps)
+            later = float(apart[name][frame.index]) if name in apart else 0.0
+            stamps[name].append(frame.index / source.fps + later)
     sizes = {name: (source.rig[name].width, source.rig[name].height) for name in source.rig}
     return {name: reduced_changes(reduced[name], np.array(stamps[name]), sizes[name]) for name in source.rig}
+
+
+def _apart(source: FrameSource, frames: int) -> dict[str, float]:
+    """The median over the first frames for each camera, relative to the median camera."""
+    usual = {
+        name: float(np.median(own))
+        for name, all_ in apart_seconds(source).items()
+        if name in source.rig and len(own := all_[:frames][~np.isnan(all_[:frames])])
+    }
+    middle = float(np.median(list(usual.values()))) if usual else 0.0
+    return {name: apart - middle for name, apart in usual.items()}

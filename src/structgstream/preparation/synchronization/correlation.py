@@ -120,6 +120,40 @@ def best_lag(
     )
 
 
+def lag_changes(first: Signal, second: Signal, lag_seconds: float, edges: Floats) -> Floats:
+    """By how much the lag of the largest correlation grows without each block of the take, ``[K]`` seconds.
+
+    Blocks that all pairs of cameras share tell errors that all pairs of a camera share: of things that move for less
+    than a frame one camera's frames see other parts than another's. Leaving out channels does not show these.
+
+    Args:
+        first: a signal.
+        second: another, of the same step and channels.
+        lag_seconds: what :func:`best_lag` found.
+        edges: ``[K + 1]`` bounds of the blocks by the first signal's time.
+    """
+    best = round((lag_seconds - second.start + first.start) / first.step)
+    blocks = len(edges) - 1
+    sums = np.zeros((3, 3, blocks))  # lag; product and energies; block
+    for row, lag in enumerate((best - 1, best, best + 1)):
+        low, high = max(0, -lag), min(len(first.values), len(second.values) - lag)
+        x = first.values[low:high] - first.values[low:high].mean(0)
+        y = second.values[low + lag : high + lag] - second.values[low + lag : high + lag].mean(0)
+        times = first.start + first.step * np.arange(low, high)
+        block = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, blocks - 1)
+        for column, one, other in ((0, x, y), (1, x, x), (2, y, y)):
+            sums[row, column] = np.bincount(block, np.einsum("tb,tb->t", one, other), minlength=blocks)
+    whole = sums.sum(2, keepdims=True)
+    without = np.concatenate([whole, whole - sums], axis=2)  # all blocks, and all but each
+    energy = np.sqrt(np.maximum(without[:, 1] * without[:, 2], 0.0))
+    score = without[:, 0] / np.where(energy > 0, energy, np.inf)
+    curvature = score[0] - 2 * score[1] + score[2]
+    peaked = curvature < 0
+    top = np.clip((score[0] - score[2]) / np.where(peaked, 2 * curvature, 1.0), -1, 1)
+    top = np.where(peaked, top, 1.0)  # without a peak it may be anywhere
+    return (top[1:] - top[0]) * first.step
+
+
 def chance_deviation(first: Signal, second: Signal) -> float:
     """Standard deviation that the correlation of two independent signals with these autocorrelations would have
     (Bartlett's formula); of the first channels."""
