@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
@@ -22,6 +23,8 @@ from structgstream.training.views import View, mean_of_counting
 
 LEAST_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
+DEPTH_WIDTH = 240
+"""Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without births."""
 
 
 @dataclass(frozen=True)
@@ -166,10 +169,14 @@ def _blamed_mask(
 
 def _depth_map(parts: Sequence[Scene], camera: Camera, backend: Backend) -> Tensor:
     """Mean depth along z ``[h, w]`` of scenes drawn together; infinite where coverage is low."""
+    size = (camera.height, camera.width)
+    scale = min(1.0, DEPTH_WIDTH / camera.width)
+    camera = camera.resized(*(max(1, round(pixels * scale)) for pixels in (camera.width, camera.height)))
     first, second = (part.gaussians(camera, backend) for part in parts)
     gaussians = concatenate(first, second)
     viewmat = camera.viewport(gaussians.means).viewmat
     z = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
     rendering = draw(replace(gaussians, colors=z[:, None].expand(-1, 3).contiguous()), camera, backend)
     depth = rendering.image[..., 0] / rendering.alpha.clamp(min=LEAST_COVERAGE)
-    return torch.where(rendering.alpha > LEAST_COVERAGE, depth, torch.inf)
+    depth = torch.where(rendering.alpha > LEAST_COVERAGE, depth, torch.inf)
+    return interpolate(depth[None, None], size=size)[0, 0]
