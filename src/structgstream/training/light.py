@@ -45,8 +45,8 @@ class LightConfig:
     the same as in frame 0."""
     least_share: float = 0.2
     """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
-    least_change: float = 1 / 512
-    """Smallest change of a bias that is made: below it light only flickers, as sensors' noise does."""
+    least_change: float = 1 / 256
+    """Smallest change of a bias that is made, at most a quarter of an 8-bit level: flicker below it costs no bits."""
 
 
 @dataclass(frozen=True)

@@ -347,9 +347,10 @@ def _fit_moving_part(
             partition, trusted, displacements, config=config.start, motion=config.motion, backend=backend
         )
     with watch.stage("renew"):
+        chosen = segmentation.views_with_flow
         new = renew_free_gaussians(
             replace(partition, moving=with_displacements(partition.moving, start.displacements)),
-            trusted,
+            [view for view in trusted if view.index in chosen] if chosen else trusted,
             start.focuses,
             first_birth=fit.frame_index * BIRTHS_PER_FRAME,
             floor=floor,
