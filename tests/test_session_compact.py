@@ -219,5 +219,5 @@ def test_the_preset() -> None:
     assert PRESETS["compact"] is COMPACT
     assert COMPACT.codec == "compact"
     assert COMPACT.online.motion.enabled
-    assert COMPACT.online.dynamic == PAPER_DYNAMIC - {"covariance_mlp"} | {"base_scales", "appearance"}
+    assert COMPACT.online.dynamic == PAPER_DYNAMIC - {"covariance_mlp"} | {"base_scales", "appearance", "color_mlp"}
     assert {name for name, config in PRESETS.items() if config.codec == "compact"} == {"compact", "fast", "tiny"}

@@ -16,6 +16,7 @@ from structgstream.training.births import BirthConfig
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
+from structgstream.training.light import LightConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
 from structgstream.training.motion_start import MotionStartConfig
@@ -278,7 +279,8 @@ COMPACT = replace(
             final_share=0.4,
         ),
         patching=replace(MOTION.online.patching, spawn="off"),
-        dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance"]),
+        dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance", "color_mlp"]),
+        light=LightConfig(enabled=True),
         motion=replace(
             MOTION.online.motion,
             moved_ease=0.5,
@@ -289,7 +291,15 @@ COMPACT = replace(
             rest_every=3,
         ),
         start=MotionStartConfig(enabled=True),
-        births=BirthConfig(enabled=True),
+        births=BirthConfig(
+            enabled=True,
+            picture_width=480,
+            missing_threshold=0.04,
+            pixel_step=1,
+            most_contradictions=0.5,
+            most_cost=0.2,
+            least_hits=3,
+        ),
         motion_prior=0.7,
         rounding=RoundingConfig(free_priced=True),
     ),

@@ -16,6 +16,7 @@ from structgstream.scene.state import on_device
 from structgstream.scene_codecs import scene_codec
 from structgstream.training.environment import fit_environment
 from structgstream.training.initial import fit_first_frame, fit_first_frame_again
+from structgstream.training.light import LightReference, light_reference
 from structgstream.training.online import fit_next_frame, needs_older
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
@@ -23,8 +24,21 @@ from structgstream.training.result import FitResult
 
 
 @dataclass(frozen=True)
+class FirstFrame:
+    """What later frames need of a period's first frame besides its scene, if they use it.
+
+    Args:
+        floor: its residuals.
+        light: its pictures and F_c.
+    """
+
+    floor: ResidualFloor | None = None
+    light: LightReference | None = None
+
+
+@dataclass(frozen=True)
 class StructGStream:
-    """The method. Its memory is the residual floor of frame 0, if later frames use it.
+    """The method. Its memory is :class:`FirstFrame`.
 
     Args:
         config: of the stream.
@@ -77,16 +91,19 @@ class StructGStream:
         found = fit_environment(fit.scene, views, config=config.environment, backend=backend)
         return replace(fit, scene=replace(fit.scene, environment=found))
 
-    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> ResidualFloor | None:
-        """The residual floor of frame 0, if residuals are used."""
-        motion = self.config.online.motion
-        if motion.residual_threshold <= 0.0:
-            return None
+    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FirstFrame:
+        """The residual floor of frame 0, if residuals are used, and its light, if that is followed."""
+        motion, light = self.config.online.motion, self.config.online.light
+        if motion.residual_threshold <= 0.0 and not light.enabled:
+            return FirstFrame()
         first = task()
-        scene, backend = on_device(state, first.backend.device), first.backend
-        return residual_floor(scene, first.pictures.views, scale=motion.picture_scale, backend=backend)
+        scene, views, backend = on_device(state, first.backend.device), first.pictures.views, first.backend
+        floor = None
+        if motion.residual_threshold > 0.0:
+            floor = residual_floor(scene, views, scale=motion.picture_scale, backend=backend)
+        return FirstFrame(floor, light_reference(scene, views, config=light) if light.enabled else None)
 
-    def next(self, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
+    def next(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         """Fit a later frame."""
         if task.begins is not None:
             return self._anew(past.state, task)
@@ -100,7 +117,8 @@ class StructGStream:
             seed=task.seed,
             pictures=task.pictures,
             steps=task.steps,
-            floor=past.memory,
+            floor=past.memory.floor,
+            light=past.memory.light,
             older=None if past.older is None else on_device(past.older, device),
             on_step=task.on_step,
         )
@@ -130,7 +148,7 @@ class StructGStream:
 
 def stream_pipeline(
     config: StreamConfig, *, fitted: Callable[[], FitResult[Scene]] | None = None
-) -> Pipeline[Scene, ResidualFloor | None]:
+) -> Pipeline[Scene, FirstFrame]:
     """The pipeline of a configuration; see :class:`StructGStream`.
 
     Raises:

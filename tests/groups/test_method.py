@@ -14,6 +14,7 @@ from structgstream.groups import method
 from structgstream.groups.method import GroupEntry, GroupMethod, lowered_budget, lowered_start
 from structgstream.pipeline import Past
 from structgstream.presets import TINY
+from structgstream.struct_gstream import FirstFrame
 from structgstream.training.group_start import GroupStartConfig
 from structgstream.training.result import FitResult
 
@@ -80,7 +81,7 @@ def test_frame_0_is_the_headers() -> None:
 
 
 def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual) -> None:
-    found = group().next(Past(SCENE, None), task(FIRST))
+    found = group().next(Past(SCENE, FirstFrame()), task(FIRST))
     ((kind, given),) = usual.asked
     assert (kind, given.frame_index, given.seed, given.start) == ("start", FIRST, 3, START)
     assert torch.equal(given.displacements, torch.arange(21, dtype=torch.float32).reshape(7, 3))
@@ -91,7 +92,7 @@ def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual)
 def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(usual: Usual) -> None:
     made = group()
     for index in (FIRST + 1, FIRST + 2):
-        made.next(Past(SCENE, None), task(index))
+        made.next(Past(SCENE, FirstFrame()), task(index))
     (_, second), (_, third) = usual.asked
     assert third.older is None
     moved = SCENE.anchors.positions - second.older.anchors.positions
@@ -102,7 +103,7 @@ def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(u
 
 def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
     made = group(first=None)
-    past: Past[Any, Any] = Past(SCENE, None)
+    past: Past[Any, Any] = Past(SCENE, FirstFrame())
     for index in (1, 2):
         made.next(past, task(index))
     assert usual.asked == [("next", past)] * 2
@@ -122,14 +123,14 @@ def test_short_memory_lowers_the_budget_once_and_is_told(
     usual: Usual, index: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     made, usual.fails = group(), 1
-    found = made.next(Past(SCENE, None), task(index))
+    found = made.next(Past(SCENE, FirstFrame()), task(index))
     assert found.counts == {"jumps": 2, "lowered budgets": 1}
     assert (made.lowered, made.start, made.config.online) == (True, lowered_start(START), lowered_budget(TINY.online))
     assert f"Frame {index}: not enough memory." in caplog.text
-    assert made.next(Past(SCENE, None), task(index)).counts == {"jumps": 2}
+    assert made.next(Past(SCENE, FirstFrame()), task(index)).counts == {"jumps": 2}
     usual.fails = 1
     with pytest.raises(OutOfMemoryError):
-        made.next(Past(SCENE, None), task(index))
+        made.next(Past(SCENE, FirstFrame()), task(index))
     assert made.start == lowered_start(START)
 
 

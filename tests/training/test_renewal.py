@@ -66,7 +66,7 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         return draw(*arguments, **options)
 
     monkeypatch.setattr("structgstream.training.renewal.draw", counting)
-    assert not len(renewed(reference_backend(), config=replace(CONFIG, residual_threshold=10.0)).new_free)
+    assert not len(renewed(reference_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
     assert len(renewed(reference_backend()).new_free)
     assert drawn, "where something is missing it is"

@@ -60,7 +60,11 @@ def test_there_is_a_step_for_everything_that_can_change() -> None:
 def test_one_more_of_quality_is_twice_as_fine_and_a_quarter_as_dear(quality: float) -> None:
     plain, other = RoundingConfig(rate_weight=3e-4), RoundingConfig(rate_weight=3e-4, quality=quality)
     ratios = {name: step / plain.steps(0.01)[name] for name, step in other.steps(0.01).items()}
-    assert ratios == pytest.approx(dict.fromkeys(plain.steps(0.01), 2.0**-quality))
+    wanted = dict.fromkeys(plain.steps(0.01), 2.0**-quality)
+    mlps = ("opacity_mlp", "color_mlp", "covariance_mlp")
+    wanted |= dict.fromkeys(mlps, 2.0 ** (-quality / 2))
+    assert ratios == pytest.approx(wanted)
+    assert {other.steps(0.01)[name] for name in mlps} == {other.resolved().first_weight_step}, "frame 0's, for its bits"
     assert other.resolved().rate_weight == pytest.approx(3e-4 * 4.0**-quality)
 
 
@@ -75,7 +79,7 @@ def test_every_field_follows_the_quality() -> None:
     assert resolved.quality == 0.0
     assert resolved.resolved() == resolved
     others = {field.name for field in fields(plain)} - {"quality", "rate_weight", "free_priced"}
-    first = {"first_noise_levels", "first_weight_step"}
+    first = {"first_noise_levels", "first_weight_step", "weight_step"}
     assert all(getattr(resolved, name) == getattr(plain, name) / 2 for name in others - first)
     assert all(getattr(resolved, name) == pytest.approx(getattr(plain, name) / 2**0.5) for name in first)
 

@@ -17,11 +17,10 @@ from structgstream.presets import StreamConfig
 from structgstream.rate_control import with_rate_control
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.struct_gstream import StructGStream
+from structgstream.struct_gstream import FirstFrame, StructGStream
 from structgstream.training.group_start import GroupStartConfig, fit_group_start
 from structgstream.training.online import OnlineConfig
 from structgstream.training.pictures import FramePictures, pictures_of
-from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult
 
 _log = logging.getLogger(__name__)
@@ -98,11 +97,11 @@ class GroupMethod:
         """
         raise ConfigError("A group begins from a header that has frame 0; give one with --init.")
 
-    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> ResidualFloor | None:
+    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FirstFrame:
         """See ``StructGStream.prepare``."""
         return self._usual.prepare(state, task)
 
-    def next(self, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
+    def next(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         """Fit a frame of the group."""
         try:
             return self._fit(past, task)
@@ -119,7 +118,7 @@ class GroupMethod:
         found = self._fit(past, task)
         return replace(found, counts={**found.counts, "lowered budgets": 1})
 
-    def _fit(self, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
+    def _fit(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         entry = self.entry
         if entry is not None and task.frame.index == entry.frame:
             return self._begin(entry, past, task)
@@ -127,7 +126,7 @@ class GroupMethod:
             past = replace(past, older=_older(past.state, entry.velocities))
         return self._usual.next(past, task)
 
-    def _begin(self, entry: GroupEntry, past: Past[Scene, ResidualFloor | None], task: FrameTask) -> FitResult[Scene]:
+    def _begin(self, entry: GroupEntry, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         pictures, device = task.pictures, task.backend.device
         return fit_group_start(
             on_device(past.state, device),
@@ -140,7 +139,8 @@ class GroupMethod:
             backend=task.backend,
             seed=task.seed,
             steps=task.steps,
-            floor=past.memory,
+            floor=past.memory.floor,
+            light=past.memory.light,
             on_step=task.on_step,
         )
 

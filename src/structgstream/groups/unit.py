@@ -20,9 +20,8 @@ from structgstream.kernels.backend import Backend
 from structgstream.pipeline import Pipeline
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.struct_gstream import FirstFrame, stream_pipeline
 from structgstream.training.group_start import GroupStartConfig
-from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import StepListener
 from structgstream.whole_files import partial_path
 
@@ -158,7 +157,7 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
     return GroupEntry(start.frame, displacements, velocities, first_pictures)
 
 
-def _pipeline(base: GroupBase, method: GroupMethod) -> Pipeline[Scene, ResidualFloor | None]:
+def _pipeline(base: GroupBase, method: GroupMethod) -> Pipeline[Scene, FirstFrame]:
     """The pipeline of the stream with the group's method."""
     return replace(stream_pipeline(base.config), method=method)
 

@@ -8,6 +8,7 @@ ray of such a pixel, in front of the rendered depth, at the depth where other vi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +25,8 @@ from structgstream.training.views import View, area_mean
 
 MASK_PIXELS = 5
 HIT_VOXELS = 1.8
+COARSEST = 8.0
+"""Births are coarser than the swept rays by at most about this."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,9 @@ class BirthConfig:
     picture_width: int = 320
     """Pictures are reduced to at most this width, pixels."""
     residual_threshold: float = 0.10
-    """Residual, 0 to 1, above which a pixel counts as wrong, and as missing if it exceeds frame 0's by this much."""
+    """Residual, 0 to 1, above which a pixel counts as wrong."""
+    missing_threshold: float = 0.10
+    """Excess of the residual over frame 0's, 0 to 1, above which a pixel counts as missing."""
     pixel_step: int = 2
     """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48
@@ -47,7 +52,7 @@ class BirthConfig:
     least_hits: int = 4
     """Least number of ray points within 1.8 voxels for a birth."""
     most: int = 500
-    """Largest number of births per frame; those with most hits are taken."""
+    """Largest number of births per frame: for more, voxels and births are larger."""
     most_missing_share: float = 0.25
     """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
     size: float = 0.7
@@ -81,7 +86,7 @@ def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, c
     size = (small.camera.height, small.camera.width)
     seen = area_mean(picture.permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
     off = residual(seen, small.image, small.mask)
-    limit = off.new_full((), config.residual_threshold)
+    limit = off.new_full((), config.missing_threshold)
     if floor is not None and view.index not in floor.maps:  # Absent from frame 0: nothing here is known to be new.
         nothing = torch.zeros_like(off, dtype=torch.bool)
         return ViewResidual(View(small.index, small.camera, small.image, nothing), nothing, torch.zeros_like(off))
@@ -185,18 +190,19 @@ def _merge_points(
         from scipy.spatial import KDTree
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
-    voxel = float(spacings.median())
-    cells, of = (points / voxel).round().to(torch.int64).unique(dim=0, return_inverse=True)
-    counts = points.new_zeros(len(cells)).index_add_(0, of, torch.ones_like(spacings))
-    values = torch.cat([points, colors, spacings[:, None]], dim=1)
-    means = values.new_zeros(len(cells), 7).index_add_(0, of, values) / counts[:, None]
+    values, voxel = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
     tree = KDTree(points.double().numpy(force=True))
-    hits = tree.query_ball_point(means[:, :3].double().numpy(force=True), HIT_VOXELS * voxel, return_length=True)
-    hits = torch.from_numpy(np.asarray(hits)).to(points.device)
+    while True:
+        means, hits = _cells(values, tree, voxel)
+        enough = hits >= config.least_hits
+        if int(enough.sum()) <= config.most or voxel > COARSEST * float(spacings.median()):
+            break
+        voxel *= 2.0**0.5  # Too many: what is missing is large, and is born coarser.
     order = hits.argsort(descending=True, stable=True)
-    chosen = order[hits[order] >= config.least_hits][: config.most].sort().values
+    chosen = order[enough[order]][: config.most].sort().values
     count = len(chosen)
     centers, looks, sizes = means[chosen].split([3, 3, 1], dim=1)
+    sizes = sizes * (voxel / float(spacings.median()))
     unit = points.new_tensor([1.0, 0.0, 0.0, 0.0])
     opacity = torch.logit(torch.tensor(config.opacity)).to(points)
     return FreeGaussians(
@@ -207,3 +213,13 @@ def _merge_points(
         colors=looks.contiguous(),
         births=first_birth + torch.arange(count, device=points.device),
     )
+
+
+def _cells(values: Tensor, tree: Any, voxel: float) -> tuple[Tensor, Tensor]:
+    """Means ``[C, 7]`` of the rows of ``values`` in each cell of side ``voxel``, and how many points of ``tree`` lie
+    around each, ``[C]``."""
+    cells, of = (values[:, :3] / voxel).round().to(torch.int64).unique(dim=0, return_inverse=True)
+    counts = values.new_zeros(len(cells)).index_add_(0, of, torch.ones_like(values[:, 0]))
+    means = values.new_zeros(len(cells), values.shape[1]).index_add_(0, of, values) / counts[:, None]
+    hits = tree.query_ball_point(means[:, :3].double().numpy(force=True), HIT_VOXELS * voxel, return_length=True)
+    return means, torch.from_numpy(np.asarray(hits)).to(values.device)

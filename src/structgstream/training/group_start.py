@@ -16,6 +16,7 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
+from structgstream.training.light import LightReference, with_light_of
 from structgstream.training.motion import segment_motion
 from structgstream.training.motion_start import flow_views, residual_motion, with_displacements
 from structgstream.training.next_frame import StartingPoint
@@ -57,6 +58,7 @@ def fit_group_start(
     seed: int,
     steps: Mapping[str, float] | None = None,
     floor: ResidualFloor | None = None,
+    light: LightReference | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult[Scene]:
     """Fit ``scene``, the decoded scene of frame 0, to a later frame.
@@ -73,6 +75,7 @@ def fit_group_start(
         seed: of all random numbers.
         steps: quantization steps (Note [Bins]).
         floor: residuals of frame 0; None for none.
+        light: of frame 0, for ``config.light``; None for none.
         on_step: called after every iteration.
     """
     each = replace(
@@ -80,6 +83,9 @@ def fit_group_start(
         iterations=-(-start.iterations // start.rounds),
         births=replace(config.births, most=start.births),
     )
+    if config.light.enabled and light is not None:
+        step = None if steps is None else steps.get("color_mlp")
+        scene = with_light_of(scene, views, light, config=config.light, step=step)
 
     def fit_with(fit: FrameFit) -> FitResult[Scene]:
         rounds = _Rounds(fit, start, scene, views, changes, floor)

@@ -34,7 +34,8 @@ class MotionStartConfig:
     rounds: int = 2
     """1: flow between pictures only; 2: also from the rendering to the pictures."""
     views: int = 14
-    """Approximate upper bound of the views in which flow is estimated; of more views every second or third, in turn."""
+    """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
+    every second or third, in turn."""
     lift: LiftConfig = field(default_factory=LiftConfig)
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
+from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import run_with_pair_budget
@@ -24,6 +25,7 @@ from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, Par
 from structgstream.training.births import BirthConfig
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
+from structgstream.training.light import LightConfig, LightReference, with_light_of
 from structgstream.training.losses import LossWeights
 from structgstream.training.mean_of_steps import MeanOfSteps
 from structgstream.training.motion import SHARED_FIELDS, MotionConfig, segment_motion
@@ -93,10 +95,21 @@ class OnlineConfig:
     """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
     mean_of_last: float = 0.0
     """The result is the mean of this share of the iterations, the last ones (paper: 0, the last step)."""
+    light: LightConfig = field(default_factory=LightConfig)
+    """Following the global light by the output biases of F_c."""
     least_gain: float = 0.0
     """Early stopping (and early patching): when ``iterations`` steps at the present rate would lower the loss by less
     than this share (paper: 0, never)."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
+
+    def __post_init__(self) -> None:
+        if self.light.enabled and "color_mlp" not in self.dynamic:
+            raise ConfigError("online.light changes F_c, which packets do not carry; add color_mlp to online.dynamic.")
+
+    @property
+    def trained(self) -> frozenset[FieldName]:
+        """The dynamic fields that optimisation changes: F_c, if it follows the light, is not among them."""
+        return self.dynamic.difference(["color_mlp"]) if self.light.enabled else self.dynamic
 
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
@@ -123,6 +136,7 @@ def fit_next_frame(
     steps: Mapping[str, float] | None = None,
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
+    light: LightReference | None = None,
     on_step: StepListener | None = None,
 ) -> FitResult[Scene]:
     """Fit ``scene``, the decoded scene of the previous frame, to ``frame``.
@@ -137,6 +151,7 @@ def fit_next_frame(
         steps: quantization steps (Note [Bins]); the parameters it names are drawn and returned quantized.
         older: the decoded scene two frames before, if :func:`needs_older`; None for none.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for births; None for none.
+        light: frame 0's, for ``config.light``; None for none.
         before: the previous frame, for motion segmentation (``config.motion``); without it everything is trained.
         pictures: of ``frame`` and their changes since ``before``
             (:func:`~structgstream.training.pictures.pictures_of`), if computed already.
@@ -146,6 +161,9 @@ def fit_next_frame(
         scene = scene.without_free()
     if pictures is None:
         pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
+    if config.light.enabled and light is not None:
+        step = None if steps is None else steps.get("color_mlp")
+        scene = with_light_of(scene, pictures.views, light, config=config.light, step=step)
 
     def fit_with(fit: FrameFit) -> FitResult[Scene]:
         if pictures.changes is None:
@@ -273,7 +291,7 @@ class FrameFit:
     def _parameters(self, start: StartingPoint) -> tuple[Parameters, BitPrice | None]:
         """The leaves of the scene as it was, and the price of changing their bins since then or ``start.reference``."""
         config = self.config
-        dynamic = config.dynamic if start.partition is None else config.dynamic.difference(SHARED_FIELDS)
+        dynamic = config.trained if start.partition is None else config.trained.difference(SHARED_FIELDS)
         trained = parameters_of_fields(dynamic)
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(start.scene, trained=trained, steps=steps)
@@ -329,9 +347,10 @@ def _fit_moving_part(
             partition, trusted, displacements, config=config.start, motion=config.motion, backend=backend
         )
     with watch.stage("renew"):
+        chosen = segmentation.views_with_flow
         new = renew_free_gaussians(
             replace(partition, moving=with_displacements(partition.moving, start.displacements)),
-            trusted,
+            [view for view in trusted if view.index in chosen] if chosen else trusted,
             start.focuses,
             first_birth=fit.frame_index * BIRTHS_PER_FRAME,
             floor=floor,

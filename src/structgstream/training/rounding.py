@@ -49,8 +49,8 @@ class RoundingConfig:
     """Step of the logarithms of anchors' scales."""
     appearance_step: float = 1 / 16
     """Step of appearance, in standard deviations of the features along a row of the basis."""
-    weight_step: float = 0.002
-    """Step of the MLPs' weights."""
+    weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
+    """Step of the MLPs' weights after frame 0: that of frame 0, so that its weights stay as they are."""
     free_log_scale_step: float = 0.05
     """Step of the logarithms of free Gaussians' scales."""
     free_quat_step: float = 1 / 64
@@ -68,7 +68,8 @@ class RoundingConfig:
     free_priced: bool = field(default=False, metadata=_NO_STEP)
     """Whether bits of free Gaussians that existed in the last frame are priced too."""
     quality: float = field(default=0.0, metadata=_NO_STEP)
-    """Steps are multiplied by 2^-quality and ``rate_weight`` by 4^-quality; frame 0's steps by 2^(-quality / 2)."""
+    """Steps are multiplied by 2^-quality and ``rate_weight`` by 4^-quality; frame 0's steps and those of MLPs by
+    2^(-quality / 2)."""
 
     def resolved(self) -> "RoundingConfig":
         """The configuration with the quality applied to the other fields and set to 0."""

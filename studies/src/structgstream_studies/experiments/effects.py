@@ -7,6 +7,7 @@ from dataclasses import replace
 from structgstream.errors import ConfigError
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
+from structgstream.training.births import BirthConfig
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
 from structgstream.training.rounding import RoundingConfig
@@ -25,6 +26,8 @@ OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """Values of switches that are off in the whole preset."""
 PAPER_ITERATIONS = 100
+FINE_BIRTHS = ("picture_width", "missing_threshold", "pixel_step", "most_contradictions", "most_cost", "least_hits")
+"""Switches that make births of thin and faint content."""
 REFRESH_FRAMES = 5
 """Interval of frames in which everything is trained, for the variant that trains an MLP."""
 
@@ -63,6 +66,7 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     _of_iterations(rows)
     _of_the_start(rows)
     _of_free_gaussians(rows)
+    _of_the_light(rows)
     _of_a_trained_covariance(rows)
     return rows.found
 
@@ -165,9 +169,19 @@ def _of_free_gaussians(rows: _Rows) -> None:
     births = replace(whole.births, enabled=False)
     none = replace(whole, births=births, patching=replace(patching, spawn="off"))
     rows.online("without-free", "w/o free 3DGs", none, "births.enabled", "patching.spawn")
+    older = BirthConfig(enabled=True)
+    coarse = replace(whole.births, **{name: getattr(older, name) for name in FINE_BIRTHS})
+    changes = [f"births.{name}" for name in FINE_BIRTHS]
+    rows.online("coarse-births", "births of large, bright content only", replace(whole, births=coarse), *changes)
     rows.priced("free-unpriced", "free 3DGs not priced", replace(whole.rounding, free_priced=False), "free_priced")
     kept = replace(whole.motion, unseen_pixels=0.0)
     rows.gated("unseen-kept", "unseen free 3DGs are kept", kept, "unseen_pixels")
+
+
+def _of_the_light(rows: _Rows) -> None:
+    whole = rows.whole
+    dark = replace(whole, light=replace(whole.light, enabled=False), dynamic=whole.dynamic.difference(["color_mlp"]))
+    rows.online("without-light", "global light not followed", dark, "light.enabled", "dynamic")
 
 
 def _of_a_trained_covariance(rows: _Rows) -> None:
