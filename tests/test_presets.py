@@ -6,6 +6,7 @@ import pytest
 
 from structgstream.errors import ConfigError
 from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_METHOD_PRESET, PRESETS, from_json, to_json
+from structgstream.training.initial import InitialRates
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -34,10 +35,18 @@ def test_configurations_are_values() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_schedules_fit_their_length(name: str) -> None:
     initial, online = PRESETS[name].initial, PRESETS[name].online
-    assert initial.coarse_iterations < initial.iterations
+    assert initial.coarse_iterations + initial.medium_iterations < initial.iterations
     assert initial.growth.collect_from <= initial.growth.start < initial.growth.last(initial.iterations)
+    assert initial.growth.room_until <= initial.growth.last(initial.iterations)
     assert all(at < initial.iterations for at in initial.growth.contribution_at)
     assert online.patching.iteration < online.iterations
+
+
+@pytest.mark.parametrize("name", ["paper-n3dv", "paper-meetroom", "paper-immersive"])
+def test_paper_presets_keep_the_published_rates(name: str) -> None:
+    initial = PRESETS[name].initial
+    assert initial.rates == InitialRates()
+    assert (initial.iterations, initial.schedule_iterations, initial.seed_voxels) == (4000, 30_000, 1)
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -24,7 +24,7 @@ def test_frame_0(name: str) -> None:
     assert not initial.camera_color
     assert not initial.random_background
     assert not PRESETS[name].environment.enabled
-    assert initial.coarse_iterations == 0
+    assert initial.coarse_iterations == initial.medium_iterations == 0
 
 
 @pytest.mark.parametrize("name", PAPERS)

@@ -10,6 +10,7 @@ from backends import quickest_backend
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.presets import PRESETS
 from structgstream.scene.state import state_of
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
@@ -81,7 +82,13 @@ def test_exposures_are_learned_with_their_gauge() -> None:
 
 def test_small_pictures_first() -> None:
     world = moving_world(1)
-    assert fit(world, config=replace(QUICK, coarse_iterations=80)).train_psnr > 15.0
+    assert fit(world, config=replace(QUICK, coarse_iterations=60, medium_iterations=20)).train_psnr > 15.0
+
+
+def test_stages_of_a_fit_that_begins_late() -> None:
+    config = replace(QUICK, coarse_iterations=50, medium_iterations=30)
+    for done, counts in ((0, (50, 30)), (20, (30, 30)), (60, (0, 20)), (100, (0, 0))):
+        assert config.stages(done=done) == [(counts[0], 0.5), (counts[1], 0.7)]
 
 
 def test_solid_surfaces_and_few_anchors() -> None:
@@ -106,6 +113,26 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     config = replace(QUICK, iterations=50)
     one, two = (state_of(fit(world, config=config).scene) for _ in range(2))
     assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+def test_rates_of_a_short_frame_0_learn_more_than_those_of_a_long_one() -> None:
+    """At a camera that trains nothing, after equally many iterations."""
+    world = moving_world(1)
+    scores = {
+        name: psnr(
+            rendered(
+                fit(
+                    world,
+                    config=replace(QUICK, iterations=200, schedule_iterations=200, rates=PRESETS[name].initial.rates),
+                ).scene,
+                world,
+                "cam00",
+            ),
+            world.frames[0].images["cam00"],
+        )
+        for name in ("rig", "compact")
+    }
+    assert scores["compact"] > scores["rig"] + 1.5
 
 
 def test_too_few_points_are_refused() -> None:

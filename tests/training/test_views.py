@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from collections.abc import Iterator, Mapping
+from itertools import islice
 
 import numpy as np
 import torch
 
 from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
-from structgstream.training.views import View, reduced, shuffled_views, training_views
+from structgstream.training.views import View, coarse_to_fine, reduced, shuffled_views, training_views
 
 RIG = arc_rig()
 
@@ -41,6 +42,25 @@ def test_every_view_comes_once_before_any_comes_twice() -> None:
     seen = [next(order).index for _ in range(15)]
     for start in (0, 5, 10):
         assert sorted(seen[start : start + 5]) == [0, 1, 2, 3, 4]
+
+
+def test_pictures_grow_stage_by_stage() -> None:
+    camera = arc_rig()["cam01"]
+    views = [View(i, camera, torch.zeros(32, 48, 3, dtype=torch.uint8)) for i in range(3)]
+    drawn = coarse_to_fine(views, [(4, 0.25), (0, 0.5), (3, 0.75)], generator=torch.Generator().manual_seed(3))
+    heights = [view.image.shape[0] for view in islice(drawn, 9)]
+    assert heights == [8] * 4 + [24] * 3 + [32] * 2
+
+
+def test_a_stage_without_pictures_draws_no_random_number() -> None:
+    """So that fits without it are the same bits."""
+    camera = arc_rig()["cam01"]
+    views = [View(i, camera, torch.zeros(32, 48, 3, dtype=torch.uint8)) for i in range(7)]
+    orders = [
+        [view.index for view in islice(coarse_to_fine(views, stages, generator=torch.Generator().manual_seed(3)), 20)]
+        for stages in ([(9, 0.5)], [(9, 0.5), (0, 0.7)])
+    ]
+    assert orders[0] == orders[1]
 
 
 def test_reduction_averages_areas_and_keeps_the_camera() -> None:

@@ -18,11 +18,7 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.images import reduced_mask
 from structgstream.data.matching import back_project, inside, load_cv2, project
-
-FloatImage = NDArray[np.float32]
-
-# Far below any grey value, so that interpolation with a pixel outside the picture is detectable.
-_OUTSIDE = -1e6
+from structgstream.data.plane_correlation import FloatImage, Neighbour, ReferenceWindow, plane_score
 
 
 @dataclass(frozen=True)
@@ -295,16 +291,22 @@ def _search(
     """
     offsets = family.inverse_offsets
     tilt = _rays_of_pixels(reference.camera) @ family.normal
-    scores = np.stack([_plane_score(reference, neighbours, family.normal * each, config) for each in offsets])
-    inverse_depths = tilt * offsets[:, None, None]
+    window = ReferenceWindow.of(reference.grey, size=config.window, noise=config.noise)
+    pairs = [Neighbour.of(reference.camera, view.camera, view.grey) for view in neighbours]
+    scores = np.empty((len(offsets), *reference.grey.shape), np.float32)
     margin = 0.01 * limits[1]
-    scores[(inverse_depths < limits[0] - margin) | (inverse_depths > limits[1] + margin)] = -1
+    for score, offset in zip(scores, offsets, strict=True):
+        score[:] = plane_score(window, pairs, family.normal * offset)
+        inverse_depth = tilt * offset
+        score[(inverse_depth < limits[0] - margin) | (inverse_depth > limits[1] + margin)] = -1
     last = len(offsets) - 1
     best = scores.argmax(0)
     peak = np.take_along_axis(scores, best[None], 0)[0]
-    rival = np.where(np.abs(np.arange(last + 1)[:, None, None] - best) > 2, scores, -1.0).max(0)
     before = np.take_along_axis(scores, np.maximum(best - 1, 0)[None], 0)[0]
     after = np.take_along_axis(scores, np.minimum(best + 1, last)[None], 0)[0]
+    for apart in range(-2, 3):  # Clipped indices lie among the five, too.
+        np.put_along_axis(scores, np.clip(best + apart, 0, last)[None], -1, 0)
+    rival = scores.max(0)
     interior = (best > 0) & (best < last) & (before > -1) & (after > -1)
     bend = np.maximum(2 * peak - before - after, 1e-6)
     shift = np.where(interior, np.clip((after - before) / (2 * bend), -0.5, 0.5), 0.0)
@@ -317,59 +319,3 @@ def _rays_of_pixels(camera: Camera) -> Floats:
     """Directions ``[H, W, 3]`` through the pixel centres in the camera's own axes, of length one along z."""
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     return np.stack([column, row, np.ones_like(column)], -1) @ np.linalg.inv(camera.K.numpy()).T
-
-
-def _plane_score(
-    reference: SweepView, neighbours: Sequence[SweepView], plane: Floats, config: SweepConfig
-) -> FloatImage:
-    """Mean correlation ``[H, W]`` of the better half of the neighbours on a plane; -1 where none sees it."""
-    scores = np.stack([_correlation(reference, view, plane, config) for view in neighbours])
-    half = max(1, (len(neighbours) + 1) // 2)
-    best = np.partition(scores, len(scores) - half, axis=0)[-half:]
-    # A view that does not see the plane counts half of the best one: a single match is more likely chance.
-    return np.where(best == -1, best.max(0) / 2, best).mean(0, dtype=np.float32)
-
-
-def _correlation(reference: SweepView, other: SweepView, plane: Floats, config: SweepConfig) -> FloatImage:
-    """Correlation ``[H, W]`` of the reference with a picture seen through ``plane . x = 1``, else -1."""
-    cv2 = load_cv2()
-    height, width = reference.grey.shape
-    homography, facing = _plane_homography(reference.camera, other.camera, plane)
-    if not facing.any():
-        return np.full((height, width), -1, np.float32)
-    warped = cv2.warpPerspective(
-        other.grey,
-        homography,
-        (width, height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(_OUTSIDE,),
-    )
-    warped[~facing] = _OUTSIDE
-    seen = warped >= 0
-    # Out of the sums before any is formed: they run in single precision.
-    warped[~seen] = 0
-    window = (config.window, config.window)
-
-    def mean(image: FloatImage) -> FloatImage:
-        return np.asarray(cv2.boxFilter(image, -1, window, borderType=cv2.BORDER_REFLECT), np.float32)
-
-    grey, noise = reference.grey, config.noise**2
-    mean_own, mean_other = mean(grey), mean(warped)
-    covariance = mean(grey * warped) - mean_own * mean_other
-    variances = (mean(grey * grey) - mean_own**2 + noise) * (mean(warped * warped) - mean_other**2 + noise)
-    score = covariance / np.sqrt(np.maximum(variances, noise**2))
-    score[cv2.erode(seen.astype(np.uint8), np.ones(window, np.uint8)) == 0] = -1
-    return score.astype(np.float32, copy=False)
-
-
-def _plane_homography(reference: Camera, other: Camera, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """From the reference's pixel indices to the other's; which pixels it shows in front of the other."""
-    relative = other.viewmat.numpy() @ np.linalg.inv(reference.viewmat.numpy())
-    induced = relative[:3, :3] + relative[:3, 3:] * plane
-    # cv2 puts the first pixel's centre at 0, the cameras at 0.5.
-    centred = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    to_ray = np.linalg.inv(reference.K.numpy()) @ centred
-    homography = np.linalg.inv(centred) @ other.K.numpy() @ induced @ to_ray
-    row, column = np.mgrid[: reference.height, : reference.width]
-    return homography, homography[2, 0] * column + homography[2, 1] * row + homography[2, 2] > 1e-6

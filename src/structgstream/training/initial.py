@@ -75,6 +75,10 @@ class InitialConfig:
     """Number of first iterations on pictures reduced by ``coarse_scale``, which cost less (paper: 0)."""
     coarse_scale: float = 0.5
     """Scale of width and height of the pictures in these iterations."""
+    medium_iterations: int = 0
+    """Number of iterations after these on pictures reduced by ``medium_scale`` (paper: 0)."""
+    medium_scale: float = 0.7
+    """Scale of width and height of the pictures in these iterations."""
     schedule_iterations: int = 30_000
     """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
     random_background: bool = False
@@ -88,6 +92,12 @@ class InitialConfig:
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
+
+    def stages(self, *, done: int = 0) -> list[tuple[int, float]]:
+        """Number and scale of the iterations on reduced pictures that are left after the first ``done``."""
+        coarse = max(self.coarse_iterations - done, 0)
+        medium = max(self.coarse_iterations + self.medium_iterations - max(done, self.coarse_iterations), 0)
+        return [(coarse, self.coarse_scale), (medium, self.medium_scale)]
 
 
 def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[ParameterName, float]:
@@ -257,12 +267,7 @@ def _fit(
     hooks = _FirstFrameHooks(
         config, backend, template, parameters, adam, densifier, views, extent, generator, watch, last_pass
     )
-    samples = coarse_to_fine(
-        views,
-        coarse_iterations=max(config.coarse_iterations - done, 0),
-        coarse_scale=config.coarse_scale,
-        generator=generator,
-    )
+    samples = coarse_to_fine(views, config.stages(done=done), generator=generator)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
     iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     return FitResult(

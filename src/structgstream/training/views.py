@@ -11,7 +11,7 @@ view-space gradients, then mean the same with and without a mask. Scores, shares
 count. A pixel of a reduced picture counts if all of its pixels do.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, islice
 
@@ -106,8 +106,12 @@ def shuffled_views(views: list[View], generator: torch.Generator) -> Iterator[Vi
 
 
 def coarse_to_fine(
-    views: list[View], *, coarse_iterations: int, coarse_scale: float, generator: torch.Generator
+    views: list[View], stages: Sequence[tuple[int, float]], *, generator: torch.Generator
 ) -> Iterator[View]:
-    """Endless shuffled views, the first ``coarse_iterations`` of them reduced by ``coarse_scale``."""
-    coarse = [reduced(view, coarse_scale) for view in views] if coarse_iterations else views
-    return chain(islice(shuffled_views(coarse, generator), coarse_iterations), shuffled_views(views, generator))
+    """Endless shuffled views: for each stage its number of views, reduced by its scale, then whole ones."""
+    small = (
+        islice(shuffled_views([view.reduced(scale) for view in views], generator), count)
+        for count, scale in stages
+        if count > 0
+    )
+    return chain(chain.from_iterable(small), shuffled_views(views, generator))

@@ -172,12 +172,7 @@ def fit_gaussians(
         start = initial_gaussians(points, views, config)
         identity = CameraColor.identity(len(rig.training), start.means)
         camera = {p.name: getattr(identity, p.attribute) for p in CAMERA} if config.camera_color else {}
-        samples = coarse_to_fine(
-            views,
-            coarse_iterations=config.coarse_iterations,
-            coarse_scale=config.coarse_scale,
-            generator=generator,
-        )
+        samples = coarse_to_fine(views, [(config.coarse_iterations, config.coarse_scale)], generator=generator)
     adam = Adam(backend, leaves(start.tensors() | camera))
     statistics, last_pass = GradientStatistics(len(start), backend.device), LastPass(config.iterations - len(views))
     hooks = _FromScratchHooks(config, adam, identity, statistics, extent, generator, watch, last_pass)
