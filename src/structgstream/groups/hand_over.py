@@ -27,9 +27,9 @@ from structgstream.scene.state import FieldName, fields_of, scene_of, state_of
 from structgstream.training.motion import changed_movers
 from structgstream.training.patching import BIRTHS_PER_FRAME
 
-NEIGHBOURS = 17
+NEIGHBOURS = 65
 """Anchors, itself included, that are handed over together."""
-MOVING_SHARE = 0.5
+MOVING_SHARE = 0.6
 """An anchor is in motion if this share of its neighbours, or more, is."""
 
 
