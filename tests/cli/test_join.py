@@ -9,6 +9,7 @@ from quick_streams import error_of
 from small_segments import FIRST, FROM_FRAME_0, encoded, write
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
+from structgstream.groups.join import join_segments
 
 
 @pytest.fixture
@@ -28,6 +29,13 @@ def test_segments_become_a_stream_in_any_order(
         assert (len(reader), reader.complete) == (7, True)
     assert main(["join", segments[0], "-o", str(out), "--overwrite"]) == 0
     assert "3 frames of 1 groups" in capsys.readouterr().out
+
+
+def test_plain_copies_the_packets_of_every_group(segments: list[str], tmp_path: Path) -> None:
+    out, copied = tmp_path / "out.sgs", tmp_path / "copied.sgs"
+    assert main(["join", *segments, "-o", str(out), "--plain"]) == 0
+    join_segments([Path(segment) for segment in segments], copied)
+    assert out.read_bytes() == copied.read_bytes()
 
 
 def test_what_is_there_is_replaced_only_when_told(

@@ -4,8 +4,11 @@
 import cv2
 import numpy as np
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from structgstream.training.flow_maps import flow_map
+from structgstream.training.flow_maps import _parts, flow_map
 
 
 def textured(height: int = 120, width: int = 160) -> np.ndarray:
@@ -48,3 +51,41 @@ def test_flow_is_repeated_bit_for_bit() -> None:
     changed = torch.ones(120, 160, dtype=torch.bool)
     given = (torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
     assert torch.equal(flow_map(*given), flow_map(*given))
+
+
+def test_parts_that_changed_are_searched_apart() -> None:
+    first = textured(192, 320)
+    second = first.copy()
+    second[24:56, 36:76] = first[24:56, 32:72]  # four to the right, up on the left
+    second[140:172, 250:290] = first[146:178, 250:290]  # six up, down on the right
+    changed = torch.from_numpy(np.abs(first.astype(int) - second).sum(2) > 0)
+    pictures = torch.from_numpy(first), torch.from_numpy(second)
+    one, apart = (flow_map(*pictures, changed, (192, 320), apart=value) for value in (False, True))
+    left, right = (slice(32, 50), slice(44, 66)), (slice(152, 166), slice(262, 278))
+    for (rows, columns), flow in ((left, [4.0, 0.0]), (right, [0.0, -6.0])):
+        for maps in (one, apart):
+            found = maps[rows, columns]
+            assert found[..., 0].mean() > 0.9
+            moved = found[..., 1:].flatten(0, 1).median(0).values
+            torch.testing.assert_close(moved, torch.tensor(flow), atol=0.3, rtol=0)
+    assert one[96:110, 150:170, 0].mean() > 0.9  # between the two nothing changed, which a search tells, too
+    assert not apart[96:110, 150:170].any()
+
+
+def test_parts_near_each_other_are_searched_together() -> None:
+    first = textured()
+    second = np.roll(first, 2, 1)
+    changed = torch.zeros(120, 160, dtype=torch.bool)
+    changed[40:60, 40:60] = changed[40:60, 90:110] = True
+    pictures = torch.from_numpy(first), torch.from_numpy(second)
+    one, apart = (flow_map(*pictures, changed, (120, 160), apart=value) for value in (False, True))
+    assert torch.equal(one, apart)
+
+
+@given(cells=st.integers(1, 12).flatmap(lambda n: arrays(np.bool_, (n, 13), elements=st.booleans())))
+def test_boxes_of_parts_are_disjoint_and_hold_every_part(cells: np.ndarray) -> None:
+    covered = np.zeros(cells.shape, int)
+    for top, bottom, left, right in _parts(cells):
+        covered[top:bottom, left:right] += 1
+    assert covered.max(initial=0) <= 1
+    assert (covered[cells] == 1).all()

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import parse_options
+from structgstream.cli.options import Device, parse_options
 from structgstream.cli.progress import human_bytes
 
 
@@ -17,7 +17,8 @@ from structgstream.cli.progress import human_bytes
 class Join:
     """Puts groups of frames that were fitted apart together to one stream (docs/groups.md).
 
-    Every checksum is verified, and that the segments have one header and every frame once.
+    Every checksum is verified, and that the segments have one header and every frame once. What stands still at the
+    border of two groups is handed over from one to the next, so that it does not flicker there.
 
     Example: structgstream join groups/*.sgs -o ball.sgs
     """
@@ -28,6 +29,10 @@ class Join:
     """The stream file to write."""
     check: bool = False
     """Decode every frame of the result, too."""
+    plain: bool = False
+    """Copy the packets of every group as they are, without a hand-over."""
+    device: Device = "auto"
+    """Compute back-end of the hand-over."""
     overwrite: bool = False
     """Replace OUT.sgs when it exists."""
 
@@ -41,8 +46,10 @@ def main(arguments: list[str]) -> None:
     if output.exists() and not options.overwrite:
         raise UsageError(f"{output} exists; replace it with --overwrite, or choose another name.")
     from structgstream.groups.join import join_segments
+    from structgstream.kernels.backend import select_backend
 
-    frames = join_segments(options.segments, output, check=options.check)
+    backend = None if options.plain or len(options.segments) < 2 else select_backend(options.device)
+    frames = join_segments(options.segments, output, check=options.check, backend=backend)
     what = "1 frame" if frames == 1 else f"{frames} frames"
     text = f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}"
     Console().print(text, highlight=False, markup=False, soft_wrap=True)

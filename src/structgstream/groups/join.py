@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segments put together to one stream file: a concatenation of their packets."""
+"""Segments put together to one stream file, with or without a hand-over at their borders."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -7,22 +7,30 @@ from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.codec.container.index import pack_index
+from structgstream.codec.container.records import PREFIX, read_record
+from structgstream.codec.header import unpack_header
+from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError
+from structgstream.groups.handing import Handing
 from structgstream.groups.segment_file import Segment, open_segment
+from structgstream.kernels.backend import Backend
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.whole_files import whole_file
 
 
-def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False) -> int:
+def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False, backend: Backend | None = None) -> int:
     """Writes the stream of these segments, in order of their frames, and returns how many frames it has.
 
     ``output`` is replaced only by a whole stream. One segment is in memory at a time, and of it one packet.
+    With a back-end, what stands still at a border is handed over from group to group (``hand_over``), for which packets
+    are coded again; otherwise they are copied.
 
     Args:
         paths: of finished segments, in any order.
         output: the stream file.
-        check: decode every frame of the result, and check that free Gaussians were born in their own group.
+        check: decode every frame of the result, and check the births of free Gaussians.
+        backend: the compute back-end of the hand-over, which draws the frames around borders; None for a plain copy.
 
     Raises:
         StreamError: a segment is damaged or not finished, or frames are missing, or there twice.
@@ -33,11 +41,13 @@ def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False) -
     with whole_file(output) as file:
         written = _Written(file)
         written.add(segments[0][1])
+        handing = None if backend is None else Handing(_header(segments[0][1]), backend)
         for path, _, _ in segments:
-            written.segment(path)
+            written.segment(path, handing)
         file.write(pack_index(written.entries, file.tell()))
     if check:
-        check_births(output, [first for _, _, first in segments])
+        # Free Gaussians that stand still outlive their group when they are handed over.
+        check_births(output, [first for _, _, first in segments] if backend is None else [0])
     return len(written.entries)
 
 
@@ -52,13 +62,21 @@ class _Written:
         """Appends bytes that are no packet."""
         self._file.write(data)
 
-    def segment(self, path: Path) -> None:
-        """Appends the packets of a segment."""
+    def segment(self, path: Path, handing: Handing | None) -> None:
+        """Appends the packets of a segment, as they are or as they are handed over."""
         found = open_segment(path)
-        for number, (frame, kind, _) in enumerate(found.entries):
+        own = (found.record(number) for number in range(len(found.entries)))
+        for (frame, kind, _), record in zip(found.entries, own if handing is None else handing.records(found)):
             self.entries.append((frame, kind, self._file.tell()))
-            self._file.write(found.record(number))
+            self._file.write(record)
         found.close()
+
+
+def _header(init: bytes) -> StreamHeader:
+    """The header in the bytes of prefix and init record."""
+    record = read_record(init, PREFIX.size)
+    assert record is not None, "verified when the segment was opened"
+    return unpack_header(record.payload)
 
 
 def _in_order(paths: Sequence[Path]) -> list[tuple[Path, bytes, int]]:

@@ -3,13 +3,17 @@
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from structgstream.flow import consistency_mask, dis_search
 from structgstream.training.views import area_mean
 
 CONTEXT_PIXELS = 16
 """Margin in pixels around the bounding box of the changed pixels, in which flow is estimated."""
+LEAST_SAVING = 0.8
+"""Boxes around parts have to be together smaller than this share of the box around all."""
 
 
 def flow_map(
@@ -20,11 +24,12 @@ def flow_map(
     *,
     mask: Tensor | None = None,
     finest_level: int = 1,
+    apart: bool = False,
 ) -> Tensor:
     """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
 
     c is the share of consistent pixels (``flow.consistency_mask``), zero outside a box around
-    ``changed``.
+    ``changed``, or with ``apart`` outside boxes around its parts, where these are small.
 
     Args:
         first: ``[H, W, 3]`` uint8.
@@ -33,12 +38,11 @@ def flow_map(
         size: h and w of the maps; flow is in pixels of the pictures.
         mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
         finest_level: of the flow search's pyramid (``flow.dis_search``).
+        apart: search in a box for each part, which takes less time where things move far from each other.
     """
     height, width = changed.shape
     maps = torch.zeros(height, width, 3)
-    box = _box(changed)
-    if box is not None:
-        rows, columns = box
+    for rows, columns in _boxes(changed) if apart else _box(changed):
         search = dis_search("capture", refined=False, finest_level=finest_level)
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
         forward, backward = search(earlier, later), search(later, earlier)
@@ -50,15 +54,63 @@ def flow_map(
     return small[0].permute(1, 2, 0).to(first.device)
 
 
-def _box(mask: Tensor) -> tuple[slice, slice] | None:
-    """Bounding box of the mask ``[H, W]`` with margin; None if it is empty or too small for the flow search."""
+Box = tuple[slice, slice]
+
+
+def _box(mask: Tensor) -> list[Box]:
+    """Bounding box of the mask ``[H, W]`` with margin; none if it is empty or too small for the flow search."""
     if not mask.any():
-        return None
+        return []
     spans = []
     for axis in (1, 0):
         hit = mask.any(axis).nonzero()[:, 0]
         low, high = int(hit[0]) - CONTEXT_PIXELS, int(hit[-1]) + 1 + CONTEXT_PIXELS
         spans.append(slice(max(0, low), min(mask.shape[1 - axis], high)))
     if min(span.stop - span.start for span in spans) < 2 * CONTEXT_PIXELS:
-        return None
-    return spans[0], spans[1]
+        return []
+    return [(spans[0], spans[1])]
+
+
+def _boxes(mask: Tensor) -> list[Box]:
+    """Disjoint boxes with margin around the parts of the mask ``[H, W]``; one around all if that is hardly larger."""
+    one = _box(mask)
+    cells = max_pool2d(mask[None, None].float(), CONTEXT_PIXELS, ceil_mode=True)
+    near = max_pool2d(cells, 3, stride=1, padding=1)[0, 0].bool().numpy(force=True)
+    found = [_pixels(box, mask) for box in _parts(near)]
+    if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
+        return one
+    return [box for box in found if min(span.stop - span.start for span in box) >= 2 * CONTEXT_PIXELS]
+
+
+def _parts(cells: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
+    """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells``."""
+    from scipy.ndimage import find_objects, label
+
+    labels, _ = label(cells, np.ones((3, 3)))
+    left = [(rows.start, rows.stop, columns.start, columns.stop) for rows, columns in find_objects(labels)]
+    done: list[tuple[int, int, int, int]] = []
+    while left:
+        box = left.pop()
+        hit = [other for other in done if _overlap(box, other)]
+        if not hit:
+            done.append(box)
+            continue
+        done = [other for other in done if other not in hit]
+        together = np.array([box, *hit])
+        low, high = together.min(0), together.max(0)
+        left.append((int(low[0]), int(high[1]), int(low[2]), int(high[3])))
+    return sorted(done)
+
+
+def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> bool:
+    return one[0] < other[1] and other[0] < one[1] and one[2] < other[3] and other[2] < one[3]
+
+
+def _pixels(box: tuple[int, int, int, int], mask: Tensor) -> Box:
+    top, bottom, left, right = (CONTEXT_PIXELS * edge for edge in box)
+    return slice(top, min(bottom, mask.shape[0])), slice(left, min(right, mask.shape[1]))
+
+
+def _area(box: Box) -> int:
+    rows, columns = box
+    return (rows.stop - rows.start) * (columns.stop - columns.start)

@@ -41,6 +41,7 @@ def detect_picture_changes(
     backend: Backend,
     flow_from: Collection[int] = (),
     finest_level: int = 1,
+    apart: bool = False,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -56,6 +57,7 @@ def detect_picture_changes(
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
         finest_level: of the flow search's pyramid (``flow.dis_search``).
+        apart: search for flow in a box for each part that changed (``flow_maps.flow_map``).
     """
     changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
@@ -71,7 +73,8 @@ def detect_picture_changes(
             changed = changed if both is None else changed & both
             small, flow = view.reduced(scale).camera, None
             if view.index in flow_from:
-                maps = flow_map(then, now, changed, (small.height, small.width), mask=both, finest_level=finest_level)
+                size = (small.height, small.width)
+                maps = flow_map(then, now, changed, size, mask=both, finest_level=finest_level, apart=apart)
                 flow = torch.cat([maps, last.reduced(scale).colors], dim=-1)
             changes.append(PictureChange(changed, torch.equal(then, now), flow))
     return changes

@@ -44,9 +44,11 @@ class TrackConfig:
     """Scale, relative to these pictures, at which coverage is computed."""
     finest_level: int = 1
     """Of the flow search's pyramid: 0 is the size of these pictures, 1 half of it."""
+    apart: bool = True
+    """Search for flow in a box for each part of a picture that changed, instead of one around all."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
-    correct_every: int = 1
+    correct_every: int = 2
     """Flow from the rendering in every frame of so many."""
 
 
@@ -106,6 +108,7 @@ class Tracker:
             backend=self.backend,
             flow_from=[view.index for view in taken],
             finest_level=self.config.finest_level,
+            apart=self.config.apart,
         )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
@@ -222,8 +225,8 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     picture = torch.where(counting[..., None], rendered, view.image)
     small = view.reduced(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    level = tracker.config.finest_level
-    flow = flow_map(picture, view.image, counting, size, mask=counting, finest_level=level)
+    level, apart = tracker.config.finest_level, tracker.config.apart
+    flow = flow_map(picture, view.image, counting, size, mask=counting, finest_level=level, apart=apart)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([flow, inside[..., None], small.colors], dim=-1)
     sums = gather_maps(moved, scene, small.camera, maps, backend) * _enlarged(tracker, view, size)

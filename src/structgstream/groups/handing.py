@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The packets of groups one after the other, each coded again after what stands still was handed over to it."""
+
+from collections.abc import Iterator
+from itertools import chain
+
+from structgstream.codec.container.payload import parse_packet
+from structgstream.codec.container.records import RecordType, packed, read_record
+from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.groups.border import moving_at_border
+from structgstream.groups.hand_over import HandOver
+from structgstream.groups.segment_file import Segment
+from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+
+_TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
+_KINDS = {record: kind for kind, record in _TYPES.items()}
+
+
+class Handing:
+    """The records of a stream's groups, which are given in order; of the scenes of a group two are in memory.
+
+    Args:
+        header: of the stream.
+        backend: the compute back-end, which draws the frames around borders.
+    """
+
+    def __init__(self, header: StreamHeader, backend: Backend) -> None:
+        self._header = header
+        self._backend = backend
+        self._rig = header.similarity.rig(header.rig)
+        self._last: Scene | None = None
+
+    def records(self, segment: Segment) -> Iterator[bytes]:
+        """The records of the packets of ``segment``; those of the first group are its own.
+
+        Raises:
+            StreamError: a packet is damaged.
+        """
+        if self._last is None:
+            for number, (_, scene) in enumerate(self._decoded(segment)):
+                self._last = scene
+                yield segment.record(number)
+            return
+        frames = self._decoded(segment)
+        begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
+        hand_over = self._begin(self._last, [scene for _, scene in begun])
+        encoder = SceneEncoder(self._header)
+        for packet, scene in chain(begun, frames):
+            shown = scene if hand_over is None else hand_over.scene(scene, index=packet.index)
+            made = encoder.encode(shown, index=packet.index, pts_seconds=packet.pts_seconds, kind=packet.kind)
+            self._last = made.reconstruction
+            yield packed(_TYPES[packet.kind], made.packet.payload)
+
+    def _begin(self, before: Scene, begun: list[Scene]) -> HandOver | None:
+        """The hand-over to a group from its first one or two frames; None where everything changes."""
+        there = [on_device(scene, self._backend.device) for scene in (before, *begun)]
+        second = there[2] if len(there) > 2 else None
+        moving = moving_at_border(there[0], there[1], second, self._rig, self._backend)
+        return None if moving is None else HandOver(before, begun[0], moving.cpu(), steps=self._header.steps)
+
+    def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
+        decoder = SceneDecoder(self._header)
+        for number in range(len(segment.entries)):
+            record = read_record(segment.record(number), 0)
+            assert record is not None, "verified when the segment was opened"
+            packet = parse_packet(record.payload, _KINDS[RecordType(record.type)])
+            yield packet, decoder.decode(packet)

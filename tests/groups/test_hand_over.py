@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands still is handed over from group to group: exactly, and only for as long as it stands still."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from streams import STEPS, small_scene
+from structgstream.codec.scene.bins import dequantize, quantize
+from structgstream.groups.hand_over import NEIGHBOURS, HandOver
+from structgstream.scene.scene import Scene
+from structgstream.training.patching import BIRTHS_PER_FRAME
+
+SIDE = 2 * NEIGHBOURS
+"""Anchors of each of two heaps far apart, so that each is a neighbourhood of its own."""
+STEP = STEPS["anchor_positions"]
+LEFT = torch.arange(2 * SIDE) < SIDE
+NONE = torch.zeros(2 * SIDE, dtype=torch.bool)
+
+
+def two_heaps(*, seed: int = 0, free: int = 0) -> Scene:
+    """Two heaps of anchors, 100 apart, on the bins; free Gaussians alternate between the heaps."""
+    scene = small_scene(2 * SIDE, seed=seed, free=free)
+    positions = small_scene(2 * SIDE).anchors.positions.clone()
+    positions[SIDE:, 0] += 100.0
+    means = scene.free.means.clone()
+    means[1::2, 0] += 100.0
+    scales = on_bins(scene.anchors.log_offset_scales)
+    anchors = replace(scene.anchors, positions=on_bins(positions), log_offset_scales=scales)
+    return replace(scene, anchors=anchors, free=replace(scene.free, means=means))
+
+
+def on_bins(values: Tensor) -> Tensor:
+    return dequantize(quantize(values, STEP), STEP)
+
+
+def shifted(scene: Scene, rows: Tensor, bins: int) -> Scene:
+    positions = scene.anchors.positions + bins * STEP * rows[:, None]
+    return replace(scene, anchors=replace(scene.anchors, positions=positions))
+
+
+def born_in(scene: Scene, frame: int) -> Scene:
+    births = frame * BIRTHS_PER_FRAME + torch.arange(len(scene.free))
+    return replace(scene, free=replace(scene.free, births=births))
+
+
+def test_what_stands_still_has_the_bits_of_the_frame_before() -> None:
+    own = two_heaps()
+    before = shifted(own, ~NONE, 5)
+    hand_over = HandOver(before, own, NONE, steps=STEPS)
+    for index in (8, 9):
+        shown = hand_over.scene(own, index=index)
+        assert torch.equal(shown.anchors.positions, before.anchors.positions)
+        assert torch.equal(shown.anchors.log_offset_scales, before.anchors.log_offset_scales)
+
+
+def test_what_moves_at_the_border_is_the_groups_own() -> None:
+    own = two_heaps()
+    before = shifted(own, ~NONE, 5)
+    shown = HandOver(before, own, LEFT, steps=STEPS).scene(own, index=8)
+    assert torch.equal(shown.anchors.positions[LEFT], own.anchors.positions[LEFT])
+    assert torch.equal(shown.anchors.positions[~LEFT], before.anchors.positions[~LEFT])
+
+
+def test_differences_halve_towards_zero_where_the_group_moves() -> None:
+    own = two_heaps()
+    hand_over = HandOver(shifted(own, ~NONE, -5), own, NONE, steps=STEPS)
+    hand_over.scene(own, index=8)
+    left = []
+    for index in range(9, 13):
+        own = shifted(own, LEFT, 1)
+        shown = hand_over.scene(own, index=index)
+        differences = ((shown.anchors.positions - own.anchors.positions) / STEP).round()
+        assert (differences[~LEFT] == -5).all()
+        left.append(differences[LEFT].unique().tolist())
+    assert left == [[-2.0], [-1.0], [0.0], [0.0]]
+
+
+def test_a_few_movers_keep_their_neighbourhood_and_fade_themselves() -> None:
+    own = two_heaps()
+    hand_over = HandOver(shifted(own, ~NONE, 4), own, NONE, steps=STEPS)
+    hand_over.scene(own, index=8)
+    one = torch.arange(2 * SIDE) == 3
+    shown = hand_over.scene(shifted(own, one, 1), index=9)
+    differences = ((shown.anchors.positions - own.anchors.positions) / STEP).round()[:, 0]
+    assert differences[one].tolist() == [3.0]  # one of its own, and half of four
+    assert (differences[~one] == 4).all()
+
+
+def test_free_gaussians_change_places_when_their_surroundings_move() -> None:
+    before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
+    hand_over = HandOver(before, own, NONE, steps=STEPS)
+    shown = hand_over.scene(own, index=8)
+    assert torch.equal(shown.free.births, before.free.births)
+    later = shifted(own, LEFT, 1)
+    fresh = replace(own.free.select(torch.tensor([1])), births=torch.tensor([9 * BIRTHS_PER_FRAME]))
+    later = replace(later, free=later.free.append(fresh))
+    shown = hand_over.scene(later, index=9)
+    # On the right those of before stay; on the left the group's three get identities after the birth of this frame.
+    number = 9 * BIRTHS_PER_FRAME
+    assert shown.free.births.tolist() == [*before.free.births[1::2].tolist(), *range(number, number + 4)]
+    assert torch.equal(shown.free.means[2], fresh.means[0])
+    assert torch.equal(shown.free.means[3:], own.free.means[0::2])
+    dead = replace(later, free=later.free.select(torch.tensor([0, 1, 3, 5, 6])))
+    again = hand_over.scene(dead, index=10)
+    assert again.free.births.tolist() == [*before.free.births[1::2].tolist(), number, number + 1]
+
+
+def test_moving_free_gaussians_are_the_groups_own_at_once() -> None:
+    before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
+    shown = HandOver(before, own, ~NONE, steps=STEPS).scene(own, index=8)
+    assert torch.equal(shown.free.births, own.free.births)
+    assert torch.equal(shown.anchors.positions, own.anchors.positions)
