@@ -74,7 +74,9 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
 
 def test_births_keep_to_the_room_there_is() -> None:
     everything = renewed(reference_backend())
-    assert len(renewed(reference_backend(), config=replace(CONFIG, most=2)).new_free) == 2
+    few = renewed(reference_backend(), config=replace(CONFIG, most=2)).new_free
+    assert len(few) == 2
+    assert float(few.log_scales.min()) > float(everything.new_free.log_scales.max()), "what is missing is born coarser"
     assert len(renewed(reference_backend(), room=1).new_free) == 1
     assert len(renewed(reference_backend(), room=0).new_free) == 0
     assert len(everything.new_free) > 2
