@@ -5,7 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
+from footage_made import still_room
 from rooms import write_room
 from structgstream.data.posed import Calibration
 from structgstream.data.timeline import Clock
@@ -133,3 +135,21 @@ def test_another_calibration_is_another_result(room: Path, tmp_path: Path) -> No
     run(changed)
     assert changed.steps.skipped == []
     assert isinstance(chosen_method(CameraSteps(changed).find(), options), Calibration)
+
+
+def test_focal_lengths_that_pictures_state_are_told(tmp_path: Path) -> None:
+    """Pictures of 290 pixels on a diagonal of 400, which is 31.4 mm on film; one camera was held upright."""
+    rig, pictures = still_room(4)
+    for name in rig:
+        exif = Image.Exif()
+        exif[0x0112] = 6 if name == "cam02" else 1
+        exif.get_ifd(0x8769)[0xA405] = 31
+        Image.fromarray(pictures[name]).save(tmp_path / f"{name}.png", exif=exif)
+    one = job(tmp_path, tmp_path / "out")
+    _, solved = run(one)
+    assert list(solved.cameras) == list(rig)
+    assert "began with the focal lengths that the pictures of 4 of 4 cameras state (0.896 of" in one.told["calibrate"]
+    assert "the files of camera 'cam02' say that pictures are to be turned" in one.told["find"]
+    again = job(tmp_path, tmp_path / "out")
+    run(again)
+    assert again.told["calibrate"] == one.told["calibrate"]

@@ -33,6 +33,7 @@ from structgstream.preparation.solvers import (
     synchronized,
     tone_curves,
 )
+from structgstream.preparation.stated import focals_told, stated_focals, turns_told
 from structgstream.preparation.steps import Stored, fingerprint
 
 
@@ -59,7 +60,8 @@ class CameraSteps:
         )
         check_enough(footage)
         claim(self.capture, self.videos)
-        self.listener.end("find", _described(footage))
+        turns = turns_told(footage)
+        self.listener.end("find", _described(footage) + (f"; {turns}" if turns else ""))
         return footage
 
     def _check_names(self, names: Collection[str], footage: Footage, *, purpose: str) -> None:
@@ -125,11 +127,14 @@ class CameraSteps:
             "board_videos": None if options.board_videos is None else fingerprint({"board": options.board_videos}),
             "instants": options.instants,
         }
+        focals = stated_focals(footage) if method == "sfm" else {}
+        if focals:
+            inputs["focals"] = focals
         solved = self._solved(
             "calibrate",
             inputs,
-            lambda: (_first(method, footage, clocks, options), ""),
-            said=lambda found, told: f"{name}: {summary(found)}",
+            lambda: (_first(method, footage, clocks, options, focals), focals_told(focals, footage)),
+            said=lambda found, told: f"{name}: {summary(found)}" + (f"; {told}" if told else ""),
             after="synchronize",
         )
         last = "calibrate"
@@ -194,9 +199,15 @@ class CameraSteps:
         return curves
 
 
-def _first(method: str | Calibration, footage: Footage, clocks: Clocks, options: PrepareOptions) -> SolvedCalibration:
+def _first(
+    method: str | Calibration,
+    footage: Footage,
+    clocks: Clocks,
+    options: PrepareOptions,
+    focals: Mapping[str, float],
+) -> SolvedCalibration:
     if isinstance(method, str):
-        return check_complete(solved_by(method, footage, clocks, options), footage)
+        return check_complete(solved_by(method, footage, clocks, options, focals=focals), footage)
     return from_other_tool(method, footage)
 
 

@@ -119,8 +119,22 @@ def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
         return Clocks({name: Clock() for name in footage.cameras}, "motion", told, sure=False)
 
 
-def solved_by(method: str, footage: Footage, clocks: Clocks, options: PrepareOptions) -> SolvedCalibration:
+def solved_by(
+    method: str,
+    footage: Footage,
+    clocks: Clocks,
+    options: PrepareOptions,
+    *,
+    focals: Mapping[str, float] | None = None,
+) -> SolvedCalibration:
     """Cameras by ``sfm`` or ``board``.
+
+    Args:
+        method: either.
+        footage: what the cameras filmed.
+        clocks: of the cameras.
+        options: what is asked for.
+        focals: focal lengths in pixels that cameras state, with which structure from motion begins.
 
     Raises:
         CalibrationError: the cameras see too little in common, or too little of the board.
@@ -129,7 +143,7 @@ def solved_by(method: str, footage: Footage, clocks: Clocks, options: PrepareOpt
     """
     if method == "sfm":
         pictures = matched_pictures(footage, clocks, options)
-        return solve_structure(pictures, lens=options.lens or "radial", intrinsics=options.intrinsics)
+        return solve_structure(pictures, lens=options.lens or "radial", intrinsics=options.intrinsics, focals=focals)
     if options.board_videos is not None:
         footage = board_footage(footage, options)
         clocks = synchronized(footage, options)

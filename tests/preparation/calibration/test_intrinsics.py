@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from structgstream.preparation.calibration.colmap import LensModel, filmed_camera, pycolmap_module
-from structgstream.preparation.calibration.intrinsics import guessed_camera
+from structgstream.preparation.calibration.intrinsics import field_of_view, guessed_camera
 
 
 @pytest.mark.parametrize(("lens", "degrees"), [("pinhole", 60), ("radial", 85), ("opencv", 40), ("fisheye", 150)])
@@ -12,6 +12,7 @@ def test_the_longer_side_spans_the_angle(lens: LensModel, degrees: float, size: 
     camera = guessed_camera(lens, 3, size, degrees)
     assert (camera.camera_id, camera.width, camera.height) == (3, *size)
     assert camera.has_prior_focal_length
+    assert field_of_view(lens, camera.mean_focal_length(), size) == pytest.approx(degrees)
     filmed = filmed_camera(camera, pycolmap_module().Rigid3d())
     middle = np.array(size) / 2
     rim = np.where(np.arange(2) == np.argmax(size), 0.0, middle)

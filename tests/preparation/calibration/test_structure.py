@@ -4,6 +4,7 @@
 import logging
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from filmed import Film, noise_texture, ring, room
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.errors import CalibrationError, CaptureError
+from structgstream.preparation.calibration import structure
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.structure import solve_structure
 
@@ -140,3 +142,32 @@ def test_observations_are_of_the_pictures_as_filmed() -> None:
     found = solve_structure(pictures, known=rig)
     straight = {name: replace(one, lens=RadialTangential()) for name, one in found.cameras.items()}
     assert np.nanmedian(replace(found, cameras=straight).errors()) > 2 * np.nanmedian(found.errors())
+
+
+def test_focal_lengths_that_files_state_are_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Telephoto cameras of 18 degrees: what is stated places them at once; one camera states nothing."""
+    rig = ring(4, radius=9.0, arc_degrees=40, focal=1000, size=(320, 240))
+    pictures: Pictures = {
+        name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
+    }
+    starts: list[dict[str, float]] = []
+    attempt = structure._attempt
+
+    def noted(*arguments: Any, **options: Any) -> Any:
+        starts.append({name: camera.mean_focal_length() for name, camera in arguments[2].items()})
+        return attempt(*arguments, **options)
+
+    monkeypatch.setattr(structure, "_attempt", noted)
+    found = solve_structure(pictures, lens="pinhole", focals={"cam00": 980.0, "cam01": 1010.0, "cam03": 990.0})
+    assert starts == [pytest.approx({"cam00": 980.0, "cam01": 1010.0, "cam02": 990.0, "cam03": 990.0}, rel=1e-3)]
+    assert found.missing == ()
+    focal = [camera.camera.K[0, 0].item() for camera in found.cameras.values()]
+    assert np.median(focal) == pytest.approx(1000, rel=0.05)
+
+
+def test_what_is_stated_wrongly_is_not_the_last_word() -> None:
+    rig, pictures = filmed()
+    found = solve_structure(pictures, lens="radial", focals=dict.fromkeys(rig, 3000.0))
+    assert found.missing == ()
+    for error in calibration_errors(found.cameras, rig).values():
+        assert abs(error.focal_percent) < 1.5

@@ -14,3 +14,9 @@ def guessed_camera(lens: LensModel, number: int, size: tuple[int, int], degrees:
     camera = pycolmap_module().Camera.create_from_model_name(number, MODELS[lens], focal, *size)
     camera.has_prior_focal_length = True
     return camera
+
+
+def field_of_view(lens: LensModel, focal: float, size: tuple[int, int]) -> float:
+    """Degrees that the longer side spans of a picture without distortion of this focal length in pixels."""
+    half = max(size) / 2 / focal
+    return 2 * math.degrees(half if lens == "fisheye" else math.atan(half))

@@ -25,7 +25,7 @@ from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, pycolmap_module
 from structgstream.preparation.calibration.coordinates import normalized
-from structgstream.preparation.calibration.intrinsics import guessed_camera
+from structgstream.preparation.calibration.intrinsics import field_of_view, guessed_camera
 from structgstream.preparation.calibration.keypoint_matches import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
@@ -93,6 +93,7 @@ def solve_structure(
     lens: LensModel = "radial",
     intrinsics: Intrinsics = "own",
     field_of_view: float | Mapping[str, float] | None = None,
+    focals: Mapping[str, float] | None = None,
     centers: bool = True,
     known: Mapping[str, LensCamera] | None = None,
     masks: Masks | None = None,
@@ -107,6 +108,8 @@ def solve_structure(
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
         field_of_view: degrees across the longer side, for all cameras or by name, to begin with; by default some are
             tried.
+        focals: focal lengths in pixels by name, of those cameras that state one. Fields of view that are tried begin
+            with these; cameras that state none take the median one.
         centers: whether principal points are estimated, as those of cameras that are alike (lens_prior.py, Note [Alike
             lenses]); otherwise they are the centres.
         known: cameras whose intrinsics and lens are known and stay; their poses are not read.
@@ -132,7 +135,9 @@ def solve_structure(
     keypoints = all_keypoints(pictures, masks, workers=workers, config=config.keypoints)
     matches = all_matches(keypoints, workers=workers, config=config.matching)
     best: _Attempt | None = None
-    for cameras in _starts(pictures, lens, intrinsics, field_of_view, known or {}):
+    sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
+    degrees = _fields_of_view(sizes, lens, field_of_view, focals or {}, known or {})
+    for cameras in _starts(sizes, lens, intrinsics, degrees, known or {}):
         attempt = _attempt(keypoints, matches, cameras, known or {}, seed=seed, workers=workers, config=config)
         best = attempt if best is None or attempt.size > best.size else best
         if best.size[0] == len(pictures):
@@ -178,35 +183,51 @@ class _Attempt:
         return (0, 0) if self.model is None else size_of(self.model)
 
 
+def _fields_of_view(
+    sizes: Mapping[str, tuple[int, int]],
+    lens: LensModel,
+    stated: float | Mapping[str, float] | None,
+    focals: Mapping[str, float],
+    known: Mapping[str, LensCamera],
+) -> list[dict[str, float]]:
+    """Degrees by camera, for each start that is tried."""
+    usual = FIELDS_OF_VIEW[lens]
+    if isinstance(stated, Mapping):
+        return [{name: stated.get(name, usual[0]) for name in sizes}]
+    if stated is not None or len(known) == len(sizes):
+        return [dict.fromkeys(sizes, usual[0] if stated is None else stated)]
+    tried = [dict.fromkeys(sizes, degrees) for degrees in usual]
+    if likely := {name: field_of_view(lens, focal, sizes[name]) for name, focal in focals.items() if name in sizes}:
+        middle = float(np.median(list(likely.values())))
+        tried.insert(0, {name: likely.get(name, middle) for name in sizes})
+    return tried
+
+
 def _starts(
-    pictures: Pictures,
+    sizes: Mapping[str, tuple[int, int]],
     lens: LensModel,
     intrinsics: Intrinsics,
-    field_of_view: float | Mapping[str, float] | None,
+    tried: Sequence[Mapping[str, float]],
     known: Mapping[str, LensCamera],
 ) -> list[dict[str, Any]]:
-    """Cameras of pycolmap to begin with, for each field of view that is tried."""
-    sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
+    """Cameras of pycolmap to begin with, for each start that is tried."""
     if intrinsics == "shared" and (len(set(sizes.values())) > 1 or known):
         raise CalibrationError(
             f"Shared intrinsics need pictures of one size and no known ones, got "
             f"{', '.join(sorted({f'{w}x{h}' for w, h in sizes.values()}))}"
             f"{' and known intrinsics' if known else ''}; use own intrinsics."
         )
-    if field_of_view is None:
-        tried: tuple[float | Mapping[str, float], ...] = FIELDS_OF_VIEW[lens] if len(known) < len(pictures) else (60.0,)
-    else:
-        tried = (field_of_view,)
     starts = []
     for degrees in tried:
+        middle = float(np.median(list(degrees.values())))
         cameras = {}
         for number, (name, size) in enumerate(sizes.items(), 1):
-            number = 1 if intrinsics == "shared" else number
             if name in known:
                 cameras[name] = colmap_camera(known[name], number)
-                continue
-            angle = degrees.get(name, FIELDS_OF_VIEW[lens][0]) if isinstance(degrees, Mapping) else degrees
-            cameras[name] = guessed_camera(lens, number, size, angle)
+            elif intrinsics == "shared":
+                cameras[name] = guessed_camera(lens, 1, size, middle)
+            else:
+                cameras[name] = guessed_camera(lens, number, size, degrees[name])
         starts.append(cameras)
     return starts
 

@@ -39,7 +39,7 @@ RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
 LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
 LEAST_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
 BLOCK_SECONDS, MOST_BLOCKS = 1.0, 12
-NEAR_BLOCKS = 6  # of shorter takes, left out one by one
+NEAR_BLOCKS, NEAR_SAMPLES = 6, 8  # most blocks of shorter takes, left out one by one, and least samples of each
 NEAR_PERIODS = 2.0
 LEAST_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
 # Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
@@ -96,7 +96,9 @@ def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -
     ]
     low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
     if high - low < LEAST_DRIFT_SECONDS:
-        edges = np.linspace(low, high, NEAR_BLOCKS + 1)
+        count = min(int((high - low) / max(pair.signals[0].step for pair in pairs)) // NEAR_SAMPLES, NEAR_BLOCKS)
+        # Of a second, what is left without a block has no peak of its own.
+        edges = np.linspace(low, high, count + 1) if count > 2 else None
         return [tie for pair in pairs for tie in _near(pair, near, edges)]
     edges = np.linspace(low, high, min(int((high - low) / BLOCK_SECONDS), MOST_BLOCKS) + 1)
     return [tie for pair in pairs for tie in _along(pair, near, edges)]
@@ -203,10 +205,13 @@ def _control(pair: PairSignals, least: int) -> float:
     return max((lag.judged for lag in lags if lag is not None), default=0.0)
 
 
-def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list[Tie]:
-    """The tie of a whole take near known clocks, and how it changes without each block and with the shapes of
-    ``lines.py``: an event that is shorter than a frame lies on one of two frames, so that the peak of few such events
-    is that of the majority, whichever block is left out."""
+def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) -> list[Tie]:
+    """The tie of a whole take near known clocks.
+
+    Where there are blocks it says how it changes without each of them and with the shapes of ``lines.py``: an event
+    that is shorter than a frame lies on one of two frames, so that the peak of few such events is that of the majority,
+    whichever block is left out.
+    """
     one, other = pair.signals
     expected = _expected(pair, near)
     reach = NEAR_PERIODS * one.step
@@ -218,10 +223,12 @@ def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list
     lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
     if lag is None or lag.peak < LEAST_PEAK or abs(lag.seconds - expected) >= reach - one.step / 2:
         return []
+    tie = _tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak)
+    if edges is None:
+        return [tie]
     own = edges - near.offsets[pair.first]
     line = fitted_line(one, other, expected_seconds=expected, edges=own, rates=False)
     apart = 0.0 if line is None else line.lag_seconds - lag.seconds
-    tie = _tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak)
     return [replace(tie, changes=(*lag_changes(*cut, lag.seconds, own).tolist(), apart))]
 
 
