@@ -85,11 +85,10 @@ class Troubled:
         """Answers, or not."""
         kind = self.kind
         self._count += 1
-        if kind in ("answers 503", "loses its files") or (
-            kind == "answers 503 to every third" and self._count % 3 == 0
-        ):
+        if kind == "answers 503" or (kind == "answers 503 to every third" and self._count % 3 == 0):
             return _refused(environment, respond, "503 Slow Down", "SlowDown")
-        if kind == "denies access":
+        # An S3 client tries again after a 503, which the thread that copies may then know nothing of.
+        if kind in ("denies access", "loses its files"):
             return _refused(environment, respond, "403 Forbidden", "AccessDenied")
         if kind == "never answers":
             while self.kind == kind:
