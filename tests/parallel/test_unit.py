@@ -68,6 +68,7 @@ def test_frame_0_may_be_resumed_and_all_segments_are_joined(tmp_path: Path, part
     found = parse_options(Join, "join", arguments=after(task.command, "join"))
     assert found.segments == (parts.segment(0, 8), parts.segment(8, 16))
     assert (found.output, found.overwrite) == (tmp_path / "out.sgs", True)
+    assert (found.device, found.plain) == ("cpu", False)
 
 
 def test_without_a_number_all_frames_are_tracked_with_as_many_threads_as_asked(tmp_path: Path, parts: Parts) -> None:

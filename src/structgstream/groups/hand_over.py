@@ -16,6 +16,7 @@ the frame in which it appears, since births of a stream ascend.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -108,7 +109,8 @@ class _Nearest:
             raise MissingExtraError("scipy", "capture") from error
         points = positions.double().numpy(force=True)
         self._tree = KDTree(points)
-        _, rows = self._tree.query(points, k=[*range(1, min(NEIGHBOURS, len(points)) + 1)])
+        ranks: Any = [*range(1, min(NEIGHBOURS, len(points)) + 1)]  # A list, so that the result has two dimensions.
+        _, rows = self._tree.query(points, k=ranks)
         self._rows = torch.from_numpy(rows).long()
 
     def share(self, mask: Tensor) -> Tensor:

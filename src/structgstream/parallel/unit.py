@@ -107,5 +107,5 @@ class Unit:
     def join_task(self, parts: Parts, groups: Groups, output: Path) -> Task:
         """The stream, of all segments."""
         segments = [str(parts.segment(first, end)) for first, end in groups]
-        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite")
+        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.device)
         return Task(JOIN, command, str(output), parts.log(JOIN))

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from structgstream.errors import MissingExtraError
 from structgstream.flow import consistency_mask, dis_search
 from structgstream.training.views import area_mean
 
@@ -84,10 +85,13 @@ def _boxes(mask: Tensor) -> list[Box]:
 
 def _parts(cells: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
     """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells``."""
-    from scipy.ndimage import find_objects, label
-
-    labels, _ = label(cells, np.ones((3, 3)))
-    left = [(rows.start, rows.stop, columns.start, columns.stop) for rows, columns in find_objects(labels)]
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", "capture") from None
+    _, _, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
+    boxes = np.asarray(stats)[1:, :4].tolist()  # The first is what is no part.
+    left = [(top, top + height, first, first + width) for first, top, width, height in boxes]
     done: list[tuple[int, int, int, int]] = []
     while left:
         box = left.pop()
