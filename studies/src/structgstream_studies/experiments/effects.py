@@ -53,129 +53,84 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
         ConfigError: ``full`` is no compact stream.
     """
     require_compact(full)
-    rows = _Rows(full)
-    rows.add(Variant(FULL, "paper mode", paper))
-    rows.add(Variant(WHOLE, "compact, with everything", full))
-    rows.add(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
-    _of_frame_0(rows)
-    _of_the_gate(rows)
-    _of_coding(rows)
-    _of_iterations(rows)
-    _of_the_start(rows)
-    _of_free_gaussians(rows)
-    _of_a_trained_covariance(rows)
-    return rows.found
+    rows = [Variant(FULL, "paper mode", paper), Variant(WHOLE, "compact, with everything", full)]
 
+    def row(key: str, title: str, config: StreamConfig, *changes: str) -> None:
+        rows.append(Variant(key, title, config, frozenset(changes)))
 
-class _Rows:
-    """Collects the rows of the table.
+    def online(key: str, title: str, config: OnlineConfig, *changes: str) -> None:
+        row(f"{WHOLE}-{key}", title, replace(full, online=config), *(f"online.{change}" for change in changes))
 
-    Args:
-        full: what each of them changes.
-    """
+    def dynamic(key: str, title: str, fields: frozenset[FieldName]) -> None:
+        online(key, title, replace(whole, dynamic=fields), "dynamic")
 
-    def __init__(self, full: StreamConfig) -> None:
-        self.full, self.whole = full, full.online
-        self.found: dict[str, Variant] = {}
+    def priced(key: str, title: str, rounding: RoundingConfig, change: str) -> None:
+        online(key, title, replace(whole, rounding=rounding), f"rounding.{change}")
 
-    def add(self, row: Variant) -> None:
-        self.found[row.key] = row
+    def gated(key: str, title: str, motion: MotionConfig, change: str) -> None:
+        online(key, title, replace(whole, motion=motion), f"motion.{change}")
 
-    def row(self, key: str, title: str, config: StreamConfig, *changes: str) -> None:
-        """A change of any field."""
-        self.add(Variant(f"{WHOLE}-{key}", title, config, frozenset(changes)))
-
-    def online(self, key: str, title: str, config: OnlineConfig, *changes: str) -> None:
-        """A change of later frames."""
-        self.row(key, title, replace(self.full, online=config), *(f"online.{change}" for change in changes))
-
-    def dynamic(self, key: str, title: str, fields: frozenset[FieldName]) -> None:
-        """A change of the fields that frames change."""
-        self.online(key, title, replace(self.whole, dynamic=fields), "dynamic")
-
-    def priced(self, key: str, title: str, rounding: RoundingConfig, change: str) -> None:
-        """A change of quantization and its price."""
-        self.online(key, title, replace(self.whole, rounding=rounding), f"rounding.{change}")
-
-    def gated(self, key: str, title: str, motion: MotionConfig, change: str) -> None:
-        """A change of the gate."""
-        self.online(key, title, replace(self.whole, motion=motion), f"motion.{change}")
-
-
-def _of_frame_0(rows: _Rows) -> None:
-    full = rows.full
+    whole = full.online
+    motion, rounding, patching = whole.motion, whole.rounding, whole.patching
+    rows.append(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
     undisturbed = replace(full.initial.disturbance, dropped_share=0.0, noise_scales=0.0)
-    calm = replace(full, initial=replace(full.initial, disturbance=undisturbed))
-    rows.row("without-disturbance", "frame 0 w/o dropout and perturbation", calm, *DISTURBANCE_FIELDS)
-    lively = replace(full, initial=replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False))
+    calm = replace(full.initial, disturbance=undisturbed)
+    row(
+        f"{WHOLE}-without-disturbance",
+        "frame 0 w/o dropout and perturbation",
+        replace(full, initial=calm),
+        *DISTURBANCE_FIELDS,
+    )
+    lively = replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False)
     title = f"{PAPER_OFFSETS} Gaussians an anchor, of which about half are never drawn"
-    rows.row("offsets", title, lively, *OFFSET_FIELDS)
-
-
-def _of_the_gate(rows: _Rows) -> None:
-    motion = rows.whole.motion
-    rows.gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
+    row(f"{WHOLE}-offsets", title, replace(full, initial=lively), *OFFSET_FIELDS)
+    gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
     share = 0.0 if motion.least_views_share else VIEWS_SHARE
-    title = f"movers cover changed pixels in {f'{share:.0%} of their' if share else 'two'} views"
-    rows.gated("views-share", title, replace(motion, least_views_share=share), "least_views_share")
+    title = (
+        f"movers cover changed pixels in {share:.0%} of their views"
+        if share
+        else "movers cover changed pixels in two views"
+    )
+    gated("views-share", title, replace(motion, least_views_share=share), "least_views_share")
     eased = EASED if motion.moved_ease == 1.0 else 1.0
     title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
-    rows.gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
-
-
-def _of_coding(rows: _Rows) -> None:
-    whole = rows.whole
-    rows.priced("without-rate", "w/o rate penalty", replace(whole.rounding, rate_weight=0.0), "rate_weight")
-    rows.dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
-    rank = replace(whole, appearance_rank=OTHER_RANK)
-    rows.online(f"rank-{OTHER_RANK}", f"appearance in {OTHER_RANK} directions", rank, "appearance_rank")
-    rows.dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
+    gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
+    priced("without-rate", "w/o rate penalty", replace(rounding, rate_weight=0.0), "rate_weight")
+    dynamic("without-appearance", "w/o appearance", whole.dynamic.difference(["appearance"]))
+    rank = OTHER_RANK
+    online(f"rank-{rank}", f"appearance in {rank} directions", replace(whole, appearance_rank=rank), "appearance_rank")
+    dynamic("without-base-scales", "base scales held", whole.dynamic.difference(["base_scales"]))
     prior = 0.0 if whole.motion_prior else 1.0
     title = "with motion prior" if prior else "w/o motion prior"
-    rows.online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
-
-
-def _of_iterations(rows: _Rows) -> None:
-    whole = rows.whole
+    online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
     gain = 0.0 if whole.least_gain else LEAST_GAIN
     title = "early stopping of frames" if gain else "all iterations in every frame"
-    rows.online("settling", title, replace(whole, least_gain=gain), "least_gain")
-    patching = replace(whole.patching, iteration=PAPER_ITERATIONS // 2)
-    paced = replace(whole, iterations=PAPER_ITERATIONS, patching=patching)
-    title = f"{PAPER_ITERATIONS} iterations in a frame"
-    rows.online("more-iterations", title, paced, "iterations", "patching.iteration")
-
-
-def _of_the_start(rows: _Rows) -> None:
-    whole, start = rows.whole, rows.whole.start
-    off, single = replace(start, enabled=False), replace(start, rounds=1)
-    rows.online("without-start", "w/o motion start", replace(whole, start=off), "start.enabled")
-    rows.online("one-round", "motion start in one round", replace(whole, start=single), "start.rounds")
-    alike = replace(whole, start=replace(start, lift=replace(start.lift, color_bandwidth=0.0)))
-    rows.online("colors-alike", "displacements w/o weights by colour", alike, "start.lift.color_bandwidth")
-    motion = replace(whole.motion, residual_threshold=0.0)
-    rows.gated("without-residuals", "gate w/o residuals", motion, "residual_threshold")
-
-
-def _of_free_gaussians(rows: _Rows) -> None:
-    whole, patching = rows.whole, rows.whole.patching
+    online("settling", title, replace(whole, least_gain=gain), "least_gain")
+    paced = replace(whole, iterations=PAPER_ITERATIONS, patching=replace(patching, iteration=PAPER_ITERATIONS // 2))
+    online("more-iterations", f"{PAPER_ITERATIONS} iterations in a frame", paced, "iterations", "patching.iteration")
+    start, births = whole.start, whole.births
+    online("without-start", "w/o motion start", replace(whole, start=replace(start, enabled=False)), "start.enabled")
+    online("one-round", "motion start in one round", replace(whole, start=replace(start, rounds=1)), "start.rounds")
+    alike = replace(start, lift=replace(start.lift, color_bandwidth=0.0))
+    online(
+        "colors-alike", "displacements w/o weights by colour", replace(whole, start=alike), "start.lift.color_bandwidth"
+    )
+    gated("without-residuals", "gate w/o residuals", replace(motion, residual_threshold=0.0), "residual_threshold")
     spawn = "gradient" if patching.spawn == "off" else "off"
     title = "births by gradients too" if spawn == "gradient" else "w/o births by gradients"
-    rows.online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
-    births = replace(whole.births, enabled=False)
-    none = replace(whole, births=births, patching=replace(patching, spawn="off"))
-    rows.online("without-free", "w/o free 3DGs", none, "births.enabled", "patching.spawn")
-    rows.priced("free-unpriced", "free 3DGs not priced", replace(whole.rounding, free_priced=False), "free_priced")
-    kept = replace(whole.motion, unseen_pixels=0.0)
-    rows.gated("unseen-kept", "unseen free 3DGs are kept", kept, "unseen_pixels")
-
-
-def _of_a_trained_covariance(rows: _Rows) -> None:
-    whole = rows.whole
-    motion = replace(whole.motion, full_every_frames=REFRESH_FRAMES)
-    refreshed = replace(whole, dynamic=whole.dynamic.union(["covariance_mlp"]), motion=motion)
+    online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
+    spawnless = replace(whole, births=replace(births, enabled=False), patching=replace(patching, spawn="off"))
+    online("without-free", "w/o free 3DGs", spawnless, "births.enabled", "patching.spawn")
+    priced("free-unpriced", "free 3DGs not priced", replace(rounding, free_priced=False), "free_priced")
+    gated("unseen-kept", "unseen free 3DGs are kept", replace(motion, unseen_pixels=0.0), "unseen_pixels")
+    refreshed = replace(
+        whole,
+        dynamic=whole.dynamic.union(["covariance_mlp"]),
+        motion=replace(motion, full_every_frames=REFRESH_FRAMES),
+    )
     title = f"F_Sigma trained in every {REFRESH_FRAMES}th frame, ungated"
-    rows.online("with-covariance-mlp", title, refreshed, "dynamic", "motion.full_every_frames")
+    online("with-covariance-mlp", title, refreshed, "dynamic", "motion.full_every_frames")
+    return {row.key: row for row in rows}
 
 
 def require_compact(config: StreamConfig) -> None:
