@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,3 +90,20 @@ def test_a_disk_that_is_full_does_not_end_the_run(tmp_path: Path) -> None:
     (tmp_path / "x.metrics.json.partial").mkdir()
     RunMetrics(tmp_path / "x.sgs", fps=30.0).write()
     assert free_bytes(tmp_path / "not" / "yet" / "there") == pytest.approx(free_bytes(tmp_path), rel=0.2)
+
+
+def test_threads_that_write_at_a_time_leave_one_whole_file(tmp_path: Path) -> None:
+    """The one that beats, and the one that has made a frame."""
+    metrics = RunMetrics(tmp_path / "x.sgs", fps=30.0)
+    metrics.write()
+
+    def write() -> None:
+        for _ in range(100):
+            metrics.write()
+
+    threads = [threading.Thread(target=write) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        assert read(tmp_path / "x.sgs")["state"] == "waiting"
+    assert [path.name for path in tmp_path.iterdir()] == ["x.metrics.json"]

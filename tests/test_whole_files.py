@@ -113,6 +113,36 @@ def test_a_disk_that_fails_at_a_step_is_told_and_leaves_what_was_there(
     assert [(entry.name, entry.read_bytes()) for entry in tmp_path.iterdir()] == [("a", OLD)]
 
 
+def test_a_device_stays_one(tmp_path: Path) -> None:
+    """Of ``--json /dev/stdout`` root would make a file."""
+    path = tmp_path / "a"
+    path.symlink_to("/dev/null")
+    write_whole(path, NEW)
+    assert path.is_char_device()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_pipe_gets_what_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_whole(path, NEW)
+        assert os.read(reader, 100) == NEW
+    finally:
+        os.close(reader)
+    assert path.is_fifo()
+
+
+def test_a_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "a").symlink_to(tmp_path / "folder" / "file")
+    for content in (OLD, NEW):
+        write_whole(tmp_path / "a", content)
+        assert (tmp_path / "a").is_symlink()
+        assert [(each.name, each.read_bytes()) for each in (tmp_path / "folder").iterdir()] == [("file", content)]
+
+
 def test_a_real_disk_without_room(tmp_path: Path) -> None:
     """``/dev/full`` in the place of the file that is written."""
     if not os.access("/dev/full", os.W_OK):

@@ -87,6 +87,11 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
         OSError: it cannot be written; what was there before stays.
         StorageError: another process writes it.
     """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with path.open("wb") as file:  # a pipe or a device, such as /dev/stdout, which must not become a file
+            yield file
+        return
+    path = path.resolve() if path.is_symlink() else path  # The link stays.
     partial = partial or partial_path(path)
     file = open_alone(partial, of=path)
     try:

@@ -102,3 +102,20 @@ def test_what_a_manifest_that_is_taken_up_does_not_name_leaves(store: FolderStor
     now[0] = 5.0
     publish(retention, manifest(3))
     assert there(store) == [0, 1, 2]
+
+
+def test_what_a_stream_that_is_taken_up_needed_goes_when_another_period_runs(store: FolderStore) -> None:
+    options, last = SegmentsOptions(window_seconds=4.0, grace_seconds=0.0), None
+    before = Retention(store, options, lambda: 0.0)
+    for segments in range(1, 5):
+        last = publish(before, manifest(segments, after=last))
+    assert last is not None
+    assert there(store) == [0, 2, 3, 4, 5, 6, 7]
+    retention = Retention(store, options, lambda: 0.0)
+    retention.take_up(last)
+    last = publish(retention, manifest(4, after=last))
+    assert there(store) == [0, 2, 3], "those after it were written too early"
+    for segments in (5, 6):
+        store.put(segment(segments - 1).file, b"")
+        last = publish(retention, manifest(segments, periods=(FIRST, SECOND), after=last))
+    assert there(store) == [4, 5]

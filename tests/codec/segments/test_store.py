@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from killed import folders_of_the_killed
 from structgstream.codec.segments.store import FolderStore, is_ours
 from structgstream.errors import StorageError, StreamError
 
@@ -65,6 +66,19 @@ def test_content_and_folder_are_synced_before_and_after_the_rename(
     monkeypatch.setattr(Path, "replace", replaced)
     FolderStore(tmp_path).put("manifest.json", b"x")
     assert steps == ["sync file", "rename", "sync folder"]
+
+
+def test_killed_at_any_step_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
+    def begin(path: Path) -> None:
+        FolderStore(path).put("manifest.json", b"old")
+
+    killed = folders_of_the_killed(tmp_path, lambda path: FolderStore(path).put("manifest.json", b"new"), begin=begin)
+    found = [FolderStore(path).get("manifest.json") for path in killed]
+    assert found == sorted(found, reverse=True)
+    assert {*found} == {b"old", b"new"}
+    for path in killed:
+        FolderStore(path).prepare()
+        assert os.listdir(path) == ["manifest.json"]
 
 
 def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ class Retention:
         there = self._store.names()
         if self._options.window_seconds is not None:
             first, needed = manifest.window.first_segment, running_period(manifest).first_segment
-            listed = segments_from(self._store, manifest.history, manifest.segments, first=min(first, needed))
+            listed = [*segments_from(self._store, manifest.history, manifest.segments, first=min(first, needed))]
             self._present = tuple(entry for entry in listed if entry.segment >= first)
             self._needed = tuple(entry for entry in listed if entry.segment == needed < first)
         self._leaving = dict.fromkeys(sorted(stale_files(manifest, there)), self._elapsed())
