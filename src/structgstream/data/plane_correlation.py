@@ -136,7 +136,7 @@ def _correlation(window: ReferenceWindow, neighbour: Neighbour, plane: Floats) -
     mean = _window_means(warped, window.size)
     covariance = _window_means(window.grey * warped, window.size) - window.mean * mean
     variances = window.variance * (_window_means(warped * warped, window.size) - mean**2 + window.noise)
-    score = covariance / np.sqrt(np.maximum(variances, window.noise**2))
+    score = np.asarray(covariance / np.sqrt(np.maximum(variances, window.noise**2)), np.float32)
     if not seen.all():
         score[cv2.erode(seen.astype(np.uint8), np.ones((window.size, window.size), np.uint8)) == 0] = -1
     return score

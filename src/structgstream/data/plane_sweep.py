@@ -295,10 +295,10 @@ def _search(
     pairs = [Neighbour.of(reference.camera, view.camera, view.grey) for view in neighbours]
     scores = np.empty((len(offsets), *reference.grey.shape), np.float32)
     margin = 0.01 * limits[1]
-    for score, offset in zip(scores, offsets, strict=True):
-        score[:] = plane_score(window, pairs, family.normal * offset)
+    for number, offset in enumerate(offsets):
         inverse_depth = tilt * offset
-        score[(inverse_depth < limits[0] - margin) | (inverse_depth > limits[1] + margin)] = -1
+        outside = (inverse_depth < limits[0] - margin) | (inverse_depth > limits[1] + margin)
+        scores[number] = np.where(outside, -1, plane_score(window, pairs, family.normal * offset))
     last = len(offsets) - 1
     best = scores.argmax(0)
     peak = np.take_along_axis(scores, best[None], 0)[0]
