@@ -57,6 +57,18 @@ def test_a_near_plane_that_cuts_gets_one_that_does_not() -> None:
     assert "look like different units of length" in told(with_near(3000.0))
 
 
+def test_a_near_plane_in_metres_before_positions_in_millimetres_is_told() -> None:
+    depths = depths_of(wide_ring(4))
+    nearest = nearest_depth(depths)
+    assert nearest is not None
+    cameras = with_near(0.5 * nearest)
+    assert scale_findings(100 * depths, None, cameras, radius=300.0, unit=None) == []
+    (found,) = scale_findings(1000 * depths, None, cameras, radius=3000.0, unit=None)
+    assert found.severity == "warning"
+    assert "positions in millimetres beside a near plane in metres" in found.sentence
+    assert float(found.sentence.split("--near ")[1].rstrip(".")) == pytest.approx(500 * nearest, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("radius", "unit", "sentence"),
     [

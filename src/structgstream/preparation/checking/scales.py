@@ -15,6 +15,7 @@ from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
 NEAR_PERCENTILE = 0.5
 LEAST_POINTS = 30
 CUT_SHARE = 0.02
+CLOSEST_NEAR = 0.0007  # of the depth of the nearest points: a near plane any closer looks like one in another unit
 PLAUSIBLE_METRES = (0.03, 60.0)  # of a rig's radius: a desk, a stadium's corner
 FACTORS = (1000.0, 0.001, 100.0, 0.01)
 UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000 times too large (millimetres among "
@@ -72,6 +73,15 @@ def scale_findings(
                 f"The near plane lies at {near:.4g}, beyond {cut:.0%} of the points, whose nearest are at "
                 f"{np.percentile(depths, NEAR_PERCENTILE):.4g} and whose median is at {typical:.4g}{hint}; set --near "
                 f"{0.5 * np.percentile(depths, NEAR_PERCENTILE):.3g}.",
+            )
+        )
+    elif (nearest := nearest_depth(depths)) is not None and near < CLOSEST_NEAR * nearest:
+        findings.append(
+            Finding(
+                "warning",
+                f"The near plane lies at {near:.4g}, and the nearest points at {nearest:.4g}: poses and near plane look"
+                " like different units of length, as of positions in millimetres beside a near plane in metres; convert"
+                f" one of them, or set --near {0.5 * nearest:.3g}.",
             )
         )
     if unit == "metres" and not PLAUSIBLE_METRES[0] <= radius <= PLAUSIBLE_METRES[1]:
