@@ -12,7 +12,7 @@ from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
 from structgstream.periods import PeriodConfig
 from structgstream.rate_control import RateConfig
-from structgstream.training.births import BirthConfig
+from structgstream.training.births import BirthConfig, ThinBirthConfig
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
@@ -301,7 +301,7 @@ COMPACT = replace(
             rest_every=3,
         ),
         start=MotionStartConfig(enabled=True),
-        births=BirthConfig(enabled=True),
+        births=BirthConfig(enabled=True, thin=ThinBirthConfig(enabled=True)),
         motion_prior=0.7,
         rounding=RoundingConfig(free_priced=True),
     ),

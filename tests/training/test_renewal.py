@@ -10,7 +10,7 @@ from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.births import BirthConfig
+from structgstream.training.births import BirthConfig, ThinBirthConfig
 from structgstream.training.motion import MotionConfig
 from structgstream.training.partition import Partition, focus_views
 from structgstream.training.patching import BIRTHS_PER_FRAME
@@ -65,7 +65,7 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         drawn.append("once")
         return draw(*arguments, **options)
 
-    monkeypatch.setattr("structgstream.training.renewal.draw", counting)
+    monkeypatch.setattr("structgstream.training.birth_sweep.draw", counting)
     assert not len(renewed(reference_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
     assert len(renewed(reference_backend()).new_free)
@@ -133,3 +133,30 @@ def test_a_ghost_dies() -> None:
         backend=backend,
     )
     assert found.kept.tolist() == [False]
+
+
+BLIND = replace(CONFIG, missing_threshold=0.9)
+"""By these rules nothing is missing."""
+THIN = ThinBirthConfig(
+    enabled=True, picture_width=96, missing_threshold=0.10, most_contradictions=0.34, most_cost=0.12, least_hits=2
+)
+
+
+def test_what_the_first_sweep_does_not_see_the_second_one_bears() -> None:
+    assert not len(renewed(reference_backend(), config=BLIND).new_free)
+    found = renewed(reference_backend(), config=replace(BLIND, thin=THIN))
+    assert found.thin_count == len(found.new_free) > 0
+    ball = emerging_ball(0.95)
+    near = (found.new_free.means - ball.means).norm(dim=1)
+    assert int((near < ball.scales[0, 0]).sum()) >= 2, "within the ball"
+
+
+def test_the_second_sweep_is_left_out_where_the_first_one_bears() -> None:
+    alone, both = (renewed(reference_backend(), config=config) for config in (CONFIG, replace(CONFIG, thin=THIN)))
+    assert torch.equal(alone.new_free.means, both.new_free.means)
+    assert both.thin_count == 0
+
+
+def test_the_second_sweep_bears_nothing_when_too_much_is_missing() -> None:
+    config = replace(BLIND, thin=THIN, most_missing_share=1e-4)
+    assert not len(renewed(reference_backend(), config=config).new_free)

@@ -7,7 +7,7 @@ ray of such a pixel, in front of the rendered depth, at the depth where other vi
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,25 @@ MASK_PIXELS = 5
 HIT_VOXELS = 1.8
 COARSEST = 8.0
 """Births are coarser than the swept rays by at most about this."""
+
+
+@dataclass(frozen=True)
+class ThinBirthConfig:
+    """A second sweep, for thin and faint content such as a stream of water, in frames in which the first bears nothing.
+
+    Its fields replace those of :class:`BirthConfig`: finer pictures, every ray, lower thresholds. Where something large
+    emerges they would build it of many small Gaussians, which are worse and dearer than few large ones.
+    """
+
+    enabled: bool = False
+    picture_width: int = 480
+    missing_threshold: float = 0.04
+    pixel_step: int = 1
+    most_contradictions: float = 0.5
+    most_cost: float = 0.2
+    least_hits: int = 3
+    most_covered: float = 1.0
+    """Only pixels that moving content covers by less than this count; 1: all."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +81,21 @@ class BirthConfig:
     """A free Gaussian is an outlier in a view if more than this share of its pixels is wrong."""
     blame_views: int = 2
     """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
+    thin: ThinBirthConfig = field(default_factory=ThinBirthConfig)
+
+    @property
+    def for_thin(self) -> "BirthConfig":
+        """The rules of the second sweep."""
+        thin = self.thin
+        return replace(
+            self,
+            picture_width=thin.picture_width,
+            missing_threshold=thin.missing_threshold,
+            pixel_step=thin.pixel_step,
+            most_contradictions=thin.most_contradictions,
+            most_cost=thin.most_cost,
+            least_hits=thin.least_hits,
+        )
 
 
 @dataclass(frozen=True)

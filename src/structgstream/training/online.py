@@ -161,9 +161,12 @@ def fit_next_frame(
         scene = scene.without_free()
     if pictures is None:
         pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
+    counts: dict[str, int] = {}
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
-        scene = with_light_of(scene, pictures.views, light, config=config.light, step=step)
+        lit = with_light_of(scene, pictures.views, light, config=config.light, step=step)
+        counts["light changed"] = int(lit is not scene)
+        scene = lit
 
     def fit_with(fit: FrameFit) -> FitResult[Scene]:
         if pictures.changes is None:
@@ -172,7 +175,7 @@ def fit_next_frame(
             )
         return _fit_moving_part(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
 
-    return run_frame_fit(
+    result = run_frame_fit(
         fit_with,
         config=config,
         backend=backend,
@@ -182,6 +185,7 @@ def fit_next_frame(
         on_step=on_step,
         slots=slot_count(scene),
     )
+    return replace(result, counts={**result.counts, **counts})
 
 
 def needs_older(config: OnlineConfig) -> bool:
@@ -374,6 +378,7 @@ def _fit_moving_part(
             "lifted": start.lifted_count,
             "corrected": start.corrected_count,
             "born": len(new.new_free),
+            "born thin": new.thin_count,
             "blamed": died,
             "births refused": int(new.refused),
             "views left out": len(views) - len(trusted),

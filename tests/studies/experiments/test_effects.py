@@ -13,7 +13,6 @@ from structgstream_studies.experiments.effects import (
     EASED,
     LEAST_GAIN,
     REFRESH_FRAMES,
-    THIN_BIRTHS,
     VIEWS_SHARE,
     WHOLE,
     effects,
@@ -31,7 +30,7 @@ def test_a_row_differs_from_the_whole_in_the_fields_it_names_and_no_others(key: 
     row = ROWS[key]
     assert differing(to_json(COMPACT), to_json(row.config)) <= row.changes
     assert (to_json(COMPACT) != to_json(row.config)) == bool(row.changes) == (key != WHOLE)
-    assert len(row.changes) <= 3 or key in ("compact-without-disturbance", "compact-thin-births")
+    assert len(row.changes) <= 3 or key == "compact-without-disturbance"
 
 
 def test_what_the_switches_are() -> None:
@@ -75,7 +74,8 @@ def test_what_the_switches_are() -> None:
     assert whole.light.enabled
     assert not dark.light.enabled
     assert whole.dynamic - dark.dynamic == {"color_mlp"}
-    assert online["compact-thin-births"].births == replace(whole.births, **THIN_BIRTHS) != whole.births
+    assert whole.births.thin.enabled
+    assert not online["compact-without-thin-births"].births.thin.enabled
     trained = online["compact-with-covariance-mlp"]
     assert trained.dynamic - whole.dynamic == {"covariance_mlp"}
     assert trained.motion.full_every_frames == REFRESH_FRAMES, "otherwise nothing that all anchors share is trained"

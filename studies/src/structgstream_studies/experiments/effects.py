@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
 
 from structgstream.errors import ConfigError
 from structgstream.presets import StreamConfig
@@ -26,15 +25,6 @@ OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """Values of switches that are off in the whole preset."""
 PAPER_ITERATIONS = 100
-THIN_BIRTHS: Mapping[str, Any] = {
-    "picture_width": 480,
-    "missing_threshold": 0.04,
-    "pixel_step": 1,
-    "most_contradictions": 0.5,
-    "most_cost": 0.2,
-    "least_hits": 3,
-}
-"""With these, thin and faint content is born, too."""
 REFRESH_FRAMES = 5
 """Interval of frames in which everything is trained, for the variant that trains an MLP."""
 
@@ -176,9 +166,10 @@ def _of_free_gaussians(rows: _Rows) -> None:
     births = replace(whole.births, enabled=False)
     none = replace(whole, births=births, patching=replace(patching, spawn="off"))
     rows.online("without-free", "w/o free 3DGs", none, "births.enabled", "patching.spawn")
-    thin = replace(whole, births=replace(whole.births, **THIN_BIRTHS))
-    changes = [f"births.{name}" for name in THIN_BIRTHS]
-    rows.online("thin-births", "births of thin and faint content, too", thin, *changes)
+    large = replace(whole.births, thin=replace(whole.births.thin, enabled=False))
+    rows.online(
+        "without-thin-births", "w/o births of thin content", replace(whole, births=large), "births.thin.enabled"
+    )
     rows.priced("free-unpriced", "free 3DGs not priced", replace(whole.rounding, free_priced=False), "free_priced")
     kept = replace(whole.motion, unseen_pixels=0.0)
     rows.gated("unseen-kept", "unseen free 3DGs are kept", kept, "unseen_pixels")
