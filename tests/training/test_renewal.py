@@ -157,6 +157,6 @@ def test_the_second_sweep_is_left_out_where_the_first_one_bears() -> None:
     assert both.thin_count == 0
 
 
-def test_the_second_sweep_bears_nothing_when_too_much_is_missing() -> None:
-    config = replace(BLIND, thin=THIN, most_missing_share=1e-4)
-    assert not len(renewed(reference_backend(), config=config).new_free)
+def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:
+    few = replace(THIN, most_missing_share=1e-4)
+    assert not len(renewed(reference_backend(), config=replace(BLIND, thin=few)).new_free)

@@ -94,16 +94,12 @@ class Sweep:
         residuals = [entry.residual for entry in missing]
         return sweep_births(
             residuals,
-            {entry.view.index: self._depth_map(entry.view) for entry in residuals},
+            {entry.view.index: self.depth_map(entry.view) for entry in residuals},
             self.moving.camera_color,
             first_birth=first_birth,
             config=replace(self.config, most=min(self.config.most, room)),
             backend=self.backend,
         )
-
-    def uncovered(self, missing: Sequence[Missing]) -> list[Missing]:
-        """The same without the pixels that moving content covers."""
-        return [self._uncovered(entry) for entry in missing]
 
     def _enough(self, missing: Sequence[Missing]) -> bool:
         """Whether enough views have missing pixels for a birth."""
@@ -138,15 +134,7 @@ class Sweep:
             picture = torch.where(inside, apply_camera_color(image, self.moving.camera_color, view.index), picture)
         return view_residual(picture.clamp(0.0, 1.0), view, floor=self.floor, config=self.config)
 
-    def _uncovered(self, entry: Missing) -> Missing:
-        view = entry.residual.view
-        camera = _reduced(view.camera)
-        covered = draw(self.moving.gaussians(camera, self.backend), camera, self.backend).alpha
-        covered = interpolate(covered[None, None], size=entry.residual.missing_share.shape)[0, 0]
-        share = entry.residual.missing_share * (covered < self.config.thin.most_covered)
-        return replace(entry, residual=replace(entry.residual, missing_share=share))
-
-    def _depth_map(self, view: View) -> Tensor:
+    def depth_map(self, view: View) -> Tensor:
         """Mean depth along z ``[h, w]`` of both parts drawn together; infinite where coverage is low.
 
         Of the still part only what reaches the focus is drawn, if there is one: beyond it nothing has changed, so a

@@ -33,8 +33,8 @@ COARSEST = 8.0
 class ThinBirthConfig:
     """A second sweep, for thin and faint content such as a stream of water, in frames in which the first bears nothing.
 
-    Its fields replace those of :class:`BirthConfig`: finer pictures, every ray, lower thresholds. Where something large
-    emerges they would build it of many small Gaussians, which are worse and dearer than few large ones.
+    Its fields replace those of :class:`BirthConfig`: finer pictures, every ray, lower thresholds. By these rules,
+    something large would be born of many small Gaussians, which follow it worse than few large ones and cost more.
     """
 
     enabled: bool = False
@@ -44,8 +44,8 @@ class ThinBirthConfig:
     most_contradictions: float = 0.5
     most_cost: float = 0.2
     least_hits: int = 3
-    most_covered: float = 1.0
-    """Only pixels that moving content covers by less than this count; 1: all."""
+    most_missing_share: float = 0.02
+    """Thin content is little: 0.0005 of the pictures where a pitcher pours. More is light that changed."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ class BirthConfig:
             most_contradictions=thin.most_contradictions,
             most_cost=thin.most_cost,
             least_hits=thin.least_hits,
+            most_missing_share=thin.most_missing_share,
         )
 
 

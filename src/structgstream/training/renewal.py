@@ -93,7 +93,7 @@ def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> FreeGaussians:
     missing = sweep.missing()
     if missing_share(missing) > sweep.config.most_missing_share:
         return FreeGaussians.empty(sweep.moving.free.means)
-    return sweep.births(sweep.uncovered(missing), first_birth=first_birth, room=room)
+    return sweep.births(missing, first_birth=first_birth, room=room)
 
 
 def _blamed_mask(

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a rendering lacks in each view, and the depth in front of which it is looked for."""
+
+from dataclasses import replace
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.birth_sweep import Sweep, missing_share
+from structgstream.training.births import BirthConfig
+from structgstream.training.motion import MotionConfig
+from structgstream.training.partition import Partition, focus_views
+from structgstream.training.residuals import residual_floor
+from structgstream.training.views import training_views
+from worlds import emerging_ball, moved_since, moving_world
+
+CPU = torch.device("cpu")
+WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
+CONFIG = BirthConfig(enabled=True, least_hits=2)
+
+
+def sweep(config: BirthConfig = CONFIG) -> Sweep:
+    """Over the frame in which a ball emerges."""
+    backend, motion = reference_backend(), MotionConfig(enabled=True, picture_scale=1.0)
+    first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
+    partition = Partition.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
+    focuses = focus_views(partition, views, config=motion, backend=backend)
+    floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
+    return Sweep(partition.moving, partition.still, views, focuses, floor, config, backend)
+
+
+def test_missing_is_the_ball_in_the_views_that_show_it() -> None:
+    found, ball = sweep().missing(), emerging_ball(0.95)
+    assert len(found) == len(WORLD.rig.training)
+    showing = 0
+    for entry in found:
+        rows, columns = (entry.residual.missing_share > 0.5).nonzero().unbind(1)
+        if not entry.any:
+            assert not len(rows)
+            continue
+        showing += 1
+        viewport = entry.view.camera.viewport(ball.means)
+        local = viewport.viewmat[:3, :3] @ ball.means[0] + viewport.viewmat[:3, 3]
+        center = (viewport.K @ local)[:2] / local[2]
+        middle = torch.stack([columns.float().mean(), rows.float().mean()]) + 0.5
+        assert (middle - center).norm() < 6.0, "pixels of 96"
+    assert showing >= 3
+    assert 0.0 < missing_share(found) < 0.1
+
+
+def test_drawn_again_the_same_is_missing() -> None:
+    swept = sweep()
+    found = swept.missing()
+    for before, after in zip(found, swept.drawn(found), strict=True):
+        if before.any:
+            assert torch.equal(before.residual.missing_share, after.residual.missing_share)
+
+
+def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> None:
+    swept = sweep()
+    missing = swept.missing()
+    assert not len(swept.births(missing, first_birth=0, room=0))
+    assert len(swept.births(missing, first_birth=0, room=2)) == 2
+    assert not len(sweep(replace(CONFIG, least_supports=6)).births(missing, first_birth=0, room=9)), "six others of six"
+
+
+def test_a_depth_map_is_infinite_where_nothing_is_drawn() -> None:
+    swept = sweep()
+    camera = swept.views[0].camera
+    depth = swept.depth_map(swept.views[0])
+    assert depth.shape == (camera.height, camera.width)
+    assert bool(depth.isinf().any())
+    solid = depth[depth.isfinite()]
+    assert len(solid)
+    assert float(solid.min()) > camera.near
