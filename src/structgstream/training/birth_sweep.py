@@ -34,7 +34,7 @@ class Missing:
     Args:
         view: in full size.
         residual: of the rendering.
-        tiles: those in which something is wrong, or all; None for a view without a focus.
+        tiles: those in which something is missing or wrong, or all; None for a view without a focus.
     """
 
     view: View
@@ -75,13 +75,18 @@ class Sweep:
     config: BirthConfig
     backend: Backend
 
-    def missing(self) -> list[Missing]:
-        """Missing pixels of every view, none outside its focus."""
+    def missing(self, *, blames: bool = True) -> list[Missing]:
+        """Missing pixels of every view, none outside its focus.
+
+        Args:
+            blames: whether free Gaussians will be blamed for wrong pixels, which then have to be right too.
+        """
         # ``focuses`` are from before the second round: tiles without missing pixels then are assumed to have none now.
-        found = [self._before(view) for view in self.views]
-        if not len(self.moving.free) and not self._enough(found):
+        found = [self._before(view, wrong=blames) for view in self.views]
+        every = blames and len(self.moving.free) > 0
+        if not every and not self._enough(found):
             return found
-        return [self._drawn(entry) if len(self.moving.free) or entry.any else entry for entry in found]
+        return [self._drawn(entry) if every or entry.any else entry for entry in found]
 
     def drawn(self, missing: Sequence[Missing]) -> list[Missing]:
         """The same views, drawn again."""
@@ -105,14 +110,14 @@ class Sweep:
         """Whether enough views have missing pixels for a birth."""
         return sum(entry.any for entry in missing) > self.config.least_supports
 
-    def _before(self, view: View) -> Missing:
-        """By the picture of the focus, which is drawn already."""
+    def _before(self, view: View, *, wrong: bool) -> Missing:
+        """By the picture of the focus, which is drawn already; ``wrong`` pixels make their tiles suspect, too."""
         focus = self.focuses.get(view.index)
         residual = self._residual(view, None if focus is None else focus.picture)
         if focus is None:
             return Missing(view, residual, None)
-        suspect = residual.wrong | (residual.missing_share > 0.5)
-        return Missing(view, residual, changed_tiles(focus.tiles, suspect))
+        suspect = residual.missing_share > 0.5
+        return Missing(view, residual, changed_tiles(focus.tiles, suspect | residual.wrong if wrong else suspect))
 
     def _drawn(self, entry: Missing) -> Missing:
         """By a rendering, in the suspect tiles."""

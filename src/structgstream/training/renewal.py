@@ -90,7 +90,7 @@ def renew_free_gaussians(
 
 def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> FreeGaussians:
     """Births of thin content, where nothing large is born."""
-    missing = sweep.missing()
+    missing = sweep.missing(blames=False)
     if missing_share(missing) > sweep.config.most_missing_share:
         return FreeGaussians.empty(sweep.moving.free.means)
     return sweep.births(missing, first_birth=first_birth, room=room)
