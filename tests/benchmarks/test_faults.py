@@ -14,21 +14,9 @@ from benchmarks.fault_fits import added_up
 from benchmarks.fault_report import table
 from benchmarks.fault_viewers import ViewerRow, killed_servers, killed_trainers
 from benchmarks.faults import parsed
-from benchmarks.stream_writers import Sent, repeated
 
-from segment_streams import header, packets
-from structgstream.codec.reader import StreamReader
-from structgstream.codec.sinks import MemorySink
+from repeated_streams import small_sent
 from structgstream.frames import MultiViewFrame
-
-
-def sent() -> Sent:
-    sink = MemorySink()
-    sink.open(header())
-    for packet in packets(6):
-        sink.write(packet)
-    sink.close()
-    return repeated(StreamReader(sink.data, name="small"), frames=6)
 
 
 def test_moments_are_those_of_the_seed_and_leave_time_for_recovering() -> None:
@@ -91,7 +79,7 @@ def test_what_was_not_counted_or_did_not_come_back_or_hit_another_is_seen() -> N
 
 @pytest.mark.parametrize("killed", [partial(killed_servers, down_seconds=0.1), killed_trainers])
 def test_players_go_on_after_kills(tmp_path: Path, killed: Callable[..., ViewerRow]) -> None:
-    row = killed(sent(), kills=2, seed=0, folder=tmp_path, players=2, page=False)
+    row = killed(small_sent(6), kills=2, seed=0, folder=tmp_path, players=2, page=False)
     assert (row.kills, row.equal, row.exact, row.reported_frames_lost) == (2, True, 2, 0)
     assert len(row.seconds_until_normal) == 2
     assert "| 2 of 2 |" in table({"cameras": [], "viewers": [asdict(row)]})
