@@ -60,7 +60,7 @@ def files(folder: Path, frames: int = 30, **troubles: str) -> Path:
 def sending(transport: str, *troubles: str) -> Iterator[dict[str, str]]:
     """Three cameras that send until the end of the block, and their URLs."""
     module, stop = sender(), threading.Event()
-    lines, urls = module._lines(transport, NAMES)
+    lines, urls = module.opened_lines(transport, NAMES)
     parsed = [module.Trouble.parsed(trouble) for trouble in troubles]
     cameras = [
         module.SentCamera(name, sent_loops(), lines[name], FPS, [one for one in parsed if one.camera == name])
