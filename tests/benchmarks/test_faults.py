@@ -85,6 +85,14 @@ def test_players_go_on_after_kills(tmp_path: Path, killed: Callable[..., ViewerR
     assert "| 2 of 2 |" in table({"cameras": [], "viewers": [asdict(row)]})
 
 
+def test_players_go_on_where_the_trainer_is_killed_at_a_border_of_periods(tmp_path: Path) -> None:
+    sent = small_sent(12, each_a_period=True)
+    assert [index for index in range(1, 25) if sent.begins_period(index)] == [6, 12, 18, 24]
+    row = killed_trainers(sent, kills=2, seed=1, folder=tmp_path, players=2, page=False)
+    assert (row.what, row.kills, row.equal, row.exact) == ("trainer across periods", 2, True, 2)
+    assert 0 <= row.borders <= 2
+
+
 def test_rows_of_several_seeds_are_added_up() -> None:
     film = Film(("a", "b"), (Moment("a", "cut", 1.0, 0.5),))
     row = asdict(camera_row(film, seen_as("." * 12 + "_" * 5 + "." * 20, counted_from=12), begun=100.0, lost=0))
@@ -94,7 +102,7 @@ def test_rows_of_several_seeds_are_added_up() -> None:
 
 def test_all_is_asked_for_by_default() -> None:
     options = parsed([])
-    assert set(options.only) == {*FILMED, "server", "trainer", "trainer that fits"}
+    assert set(options.only) == {*FILMED, "server", "trainer", "trainer across periods", "trainer that fits"}
     assert options.moments >= 200
     assert options.kills >= 200
     assert np.isfinite(options.down_seconds)
