@@ -98,6 +98,9 @@ def test_rows_of_several_seeds_are_added_up() -> None:
     row = asdict(camera_row(film, seen_as("." * 12 + "_" * 5 + "." * 20, counted_from=12), begun=100.0, lost=0))
     text = table({"cameras": [row, {**row, "seed": 1, "smeared": 3}], "viewers": []})
     assert "| cut | 2 | 0 | 3 | 0 | 2 | 5.0 |" in text
+    later = asdict(ViewerRow("server", kills=2, seed=1, frames=5, equal=True))
+    earlier = {name: value for name, value in {**later, "seed": 0}.items() if name != "borders"}
+    assert "| server | 4 | 10 | 0 | yes |" in table({"cameras": [], "viewers": [earlier, later]})
 
 
 def test_all_is_asked_for_by_default() -> None:
