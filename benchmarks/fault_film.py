@@ -116,7 +116,7 @@ def send(folder: Path) -> None:
     """Sends the film of a folder until the process is ended."""
     module, film = senders(), read_film(folder)
     loops = module.loops_of([*pictures()])
-    lines, urls = module._lines(film.transport, film.cameras)
+    lines, urls = module.opened_lines(film.transport, film.cameras)
     troubles = {name: _troubles(module, film.moments, name) for name in film.cameras}
     cameras = [
         module.SentCamera(name, loops, lines[name], film.fps, troubles[name], seed)

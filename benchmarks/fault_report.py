@@ -32,7 +32,9 @@ def _merged(rows: Sequence[Row]) -> Iterable[dict[str, Any]]:
             continue
         kept = found[row["what"]]
         for name, value in row.items():
-            if name.startswith("longest"):
+            if name not in kept:
+                kept[name] = value  # an earlier version did not count it
+            elif name.startswith("longest"):
                 kept[name] = max(kept[name], value)
             elif name == "equal":
                 kept[name] = kept[name] and value

@@ -59,6 +59,7 @@ class ViewerRow:
         kills: how many.
         seed: of their moments.
         frames: of the stream in the end.
+        borders: kills after which the next frame is the first of a period.
         reported_frames_lost: that were reported as written and not there after a kill.
         equal: whether the stream has the bytes of one that was never interrupted.
         players: that check bytes.
@@ -76,6 +77,7 @@ class ViewerRow:
     kills: int = 0
     seed: int = 0
     frames: int = 0
+    borders: int = 0
     reported_frames_lost: int = 0
     equal: bool = False
     players: int = 0
@@ -169,6 +171,8 @@ def _write(folder: Path, sent: Sent, writing: int) -> None:
 
 
 def _send(sink: PacketSink, sent: Sent, index: int) -> None:
+    if sent.begins_period(index):
+        sink.begin(sent.header)
     sink.write(renumbered(sent.packets[index % len(sent.packets)], index, fps=sent.header.fps))
 
 
@@ -265,15 +269,20 @@ def killed_servers(
 
 
 def killed_trainers(sent: Sent, *, kills: int, seed: int, folder: Path, players: int, page: bool) -> ViewerRow:
-    """The trainer is killed at random moments, and another goes on at once."""
-    row, rng = ViewerRow("trainer", seed=seed, players=players), random.Random(f"trainer {seed}")
+    """The trainer is killed at random moments, in a stream of periods near their borders; another goes on at once."""
+    what = "trainer across periods" if sent.begins else "trainer"
+    row, rng = ViewerRow(what, seed=seed, players=players), random.Random(f"{what} {seed}")
     stream = folder / "streams" / NAME
     with watched(folder, partial(_write, stream, sent), players=players, page=page) as (_, trainers, watching, shown):
         for _ in range(kills):
             time.sleep(rng.uniform(0.05, 1.0))
+            if sent.begins:
+                wait_until(lambda: sent.begins_period(trainers.reported() + 2))
+                time.sleep(rng.uniform(0.0, 2.0 * PACE_SECONDS))
             reported = trainers.end(signal.SIGKILL)
             began, edge = time.monotonic(), edge_of(stream)
             row.reported_frames_lost += max(reported - edge, 0)
+            row.borders += sent.begins_period(edge + 1)
             trainers.start()
             wait_for_viewers(row, began, edge, watching, shown)
         row.frames = trainers.end(signal.SIGTERM) + 1

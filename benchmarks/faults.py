@@ -9,8 +9,9 @@ Eleven cameras and a held-out one send coded pictures from this machine, and eac
 with a seed (``fault_film``); what the trainer gets is compared with what was filmed (``fault_cameras``). Then servers
 and trainers are killed by SIGKILL while players without a picture check every byte, and a page in Chromium plays on
 (``fault_viewers``; needs pytest and Chromium, ``--no-page`` does without); the *trainer that fits* is the real one, the
-other writes prepared packets. ``kills`` has what needs no viewers: trainers killed and their streams continued, full
-disks; ``store_outages`` targets in trouble. A row that the JSON file has is not made again.
+others write prepared packets, one of them with another period every eighth frame, near whose borders it is killed.
+``kills`` has what needs no viewers: trainers killed and their streams continued, full disks; ``store_outages`` targets
+in trouble. A row that the JSON file has is not made again.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import logging
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +33,37 @@ from benchmarks.stream_writers import Sent, real_writer, repeated
 from structgstream.codec.reader import open_stream
 
 FRAMES = 4096
-KILLED = ("server", "trainer")
+PERIOD_FRAMES = 512
+PERIODS = "trainer across periods"
+KILLED = ("server", "trainer", PERIODS)
 FITS = "trainer that fits"
 
 
-def prepared() -> Sent:
-    """Packets of the bundled clip, fitted for a moment."""
-    with tempfile.TemporaryDirectory(prefix="faults-") as name:
-        real_writer(8)(Path(name) / "clip", lambda frame: None)
-        return repeated(open_stream(Path(name) / "clip"), frames=FRAMES)
+@dataclass(frozen=True)
+class Prepared:
+    """Packets of the bundled clip, fitted for a moment.
+
+    Args:
+        plain: of one period.
+        periods: every eighth frame begins another.
+    """
+
+    plain: Sent
+    periods: Sent
+
+    @classmethod
+    def made(cls) -> "Prepared":
+        """Fits."""
+        with tempfile.TemporaryDirectory(prefix="faults-") as name:
+            real_writer(8)(Path(name) / "clip", lambda frame: None)
+            reader = open_stream(Path(name) / "clip")
+            return cls(repeated(reader, frames=FRAMES), repeated(reader, frames=PERIOD_FRAMES, each_a_period=True))
 
 
-def row_of(what: str, sent: Sent, options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+def row_of(what: str, sent: Prepared, options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """A row of the result."""
     if what in FILMED:
-        return asdict(camera_faults(what, sent, moments=options.moments, seed=options.seed, folder=folder))
+        return asdict(camera_faults(what, sent.plain, moments=options.moments, seed=options.seed, folder=folder))
     common: dict[str, Any] = {
         "kills": options.kills, "seed": options.seed, "folder": folder, "players": options.players,
         "page": options.page,
@@ -54,8 +71,8 @@ def row_of(what: str, sent: Sent, options: argparse.Namespace, folder: Path) -> 
     if what == FITS:
         return asdict(killed_fits(**{**common, "kills": options.fits}))
     if what == "server":
-        return asdict(killed_servers(sent, down_seconds=options.down_seconds, **common))
-    return asdict(killed_trainers(sent, **common))
+        return asdict(killed_servers(sent.plain, down_seconds=options.down_seconds, **common))
+    return asdict(killed_trainers(sent.periods if what == PERIODS else sent.plain, **common))
 
 
 def measured(options: argparse.Namespace, done: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
@@ -65,7 +82,7 @@ def measured(options: argparse.Namespace, done: Callable[[dict[str, Any]], objec
         result |= json.loads(options.json.read_text())
     there = {(row["what"], row["seed"]) for kind in ("cameras", "viewers") for row in result[kind]}
     asked = [what for what in options.only if (what, options.seed) not in there]
-    sent = prepared() if asked else None
+    sent = Prepared.made() if asked else None
     for what in asked:
         assert sent is not None
         with tempfile.TemporaryDirectory(prefix="faults-") as name:

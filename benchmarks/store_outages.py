@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.cloud_store import CloudStore
 from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.manifest_json import manifest_from_json
 from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
@@ -40,6 +41,7 @@ from structgstream.errors import StreamError
 FRAMES = 100
 PACE_SECONDS = 0.1
 SLOW_SECONDS = 1.0
+POLL_SECONDS = 0.05
 BUCKET = "outages"
 KINDS = (
     "refuses connections", "answers 503", "answers 503 to every third", "denies access", "slow", "never answers",
@@ -169,14 +171,27 @@ def services() -> Iterator[tuple[Troubled, Service, Service]]:
         other.stop()
 
 
+@dataclass
+class Written:
+    """How far what stands for the trainer is with ``count`` frames; :attr:`last` is the one that is there."""
+
+    count: int
+    last: int = -1
+
+    @property
+    def next(self) -> int:
+        """The frame that is written next; the last one at the end."""
+        return min(self.last + 1, self.count - 1)
+
+
 class Reader(threading.Thread):
-    """Reads all the time what the manifest names, and notes what it does not find."""
+    """Reads all the time what the manifest names, and notes what it does not find; slow beside busy programs."""
 
     def __init__(self, store: CloudStore, whole: bytes) -> None:
         super().__init__(daemon=True)
         self._store, self._whole = store, whole
         self._ending = threading.Event()
-        self.edge, self.reads, self.refused = -1, 0, 0
+        self.reads = self.refused = 0
 
     def run(self) -> None:
         """Until :meth:`end`."""
@@ -191,7 +206,6 @@ class Reader(threading.Thread):
             found = StoredBytes(self._store, manifest, check=True)[:]
         except StreamError:
             return False
-        self.edge = manifest.edge.frame
         return self._whole.startswith(found[: footer_offset(found)])
 
     def end(self) -> None:
@@ -211,7 +225,8 @@ def one_event(row: Row, sent: Sent, rng: random.Random, folder: Path, *, seconds
     reader = Reader(other.store(name), sent.whole)
     reader.start()
     begin = rng.randrange(1, len(sent.packets) // 4)
-    trouble = threading.Thread(target=_trouble, args=(row, troubled, service, other.store(name), seconds, reader))
+    frames = Written(len(sent.packets))
+    trouble = threading.Thread(target=_trouble, args=(row, troubled, service, other.store(name), seconds, frames))
     sink, _ = resume_segments(mirror, options=OPTIONS)
     sink.open(sent.header)
     longest = 0.0
@@ -222,6 +237,7 @@ def one_event(row: Row, sent: Sent, rng: random.Random, folder: Path, *, seconds
         began = time.monotonic()
         sink.write(packet)
         longest = max(longest, time.monotonic() - began)
+        frames.last = packet.index
     sink.close()
     trouble.join()
     left = mirror.finish(wait_seconds=120.0)
@@ -233,8 +249,10 @@ def one_event(row: Row, sent: Sent, rng: random.Random, folder: Path, *, seconds
     row.equal += not left and (folder / "copy.sgs").read_bytes() == sent.whole == content(folder, beside=folder)
 
 
-def _trouble(row: Row, troubled: Troubled, service: Service, there: CloudStore, seconds: float, reader: Reader) -> None:
-    """Gets the store into trouble and out of it, and waits for the first frame after it."""
+def _trouble(
+    row: Row, troubled: Troubled, service: Service, there: CloudStore, seconds: float, frames: Written
+) -> None:
+    """Gets the store into trouble and out of it, and waits until it has a frame that was written after it."""
     if row.what == "refuses connections":
         service.stop()
     else:
@@ -243,14 +261,19 @@ def _trouble(row: Row, troubled: Troubled, service: Service, there: CloudStore, 
     if row.what == "loses its files":
         for name in there.names():
             there.delete(name)
-    before = reader.edge
     if row.what == "refuses connections":
         service.start()
     troubled.kind = None
-    ended = time.monotonic()
-    while reader.edge <= before and time.monotonic() - ended < 120.0:
-        time.sleep(0.02)
+    ended, wanted = time.monotonic(), frames.next
+    while _edge(there) < wanted and time.monotonic() - ended < 120.0:
+        time.sleep(POLL_SECONDS)
     row.seconds_until_normal.append(time.monotonic() - ended)
+
+
+def _edge(store: CloudStore) -> int:
+    with suppress(StreamError):
+        return manifest_from_json(store.get(MANIFEST), name=MANIFEST).edge.frame
+    return -1
 
 
 def table(rows: list[Row]) -> str:

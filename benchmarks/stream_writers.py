@@ -55,6 +55,11 @@ class Sent:
     whole: bytes
     begins: frozenset[int] = frozenset()
 
+    def begins_period(self, index: int) -> bool:
+        """Whether frame ``index`` begins another period when the stream is sent again and again."""
+        at = index % len(self.packets)
+        return bool(self.begins) and index > 0 and (not at or at in self.begins)
+
 
 def repeated(reader: StreamReader, *, frames: int, each_a_period: bool = False) -> Sent:
     """A stream of ``frames`` packets, which are those of ``reader`` again and again with other numbers and times.
@@ -105,7 +110,7 @@ def send(sink: PacketSink, sent: Sent, start: int, report: Report) -> None:
     sink.open(sent.header)
     for packet in sent.packets[start:]:
         time.sleep(PACE_SECONDS)
-        if packet.index in sent.begins:
+        if sent.begins_period(packet.index):
             sink.begin(sent.header)
         sink.write(packet)
         report(packet.index)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``tools/senders/send.py`` for tests: what cameras send, in memory or on the loopback."""
 
-import importlib.util
+import importlib
 import sys
 from functools import cache
 from pathlib import Path
@@ -14,21 +14,20 @@ from numpy.typing import NDArray
 FOLDER = Path(__file__).parents[1] / "tools" / "senders"
 
 
-@cache
 def sender() -> ModuleType:
     """The module, which lies outside of any package."""
-    _loaded("rtsp")
-    return _loaded("send")
+    return _of_the_tool("send")
 
 
-def _loaded(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+def mpeg_ts() -> ModuleType:
+    """The module beside it that makes MPEG-TS."""
+    return _of_the_tool("mpeg_ts")
+
+
+def _of_the_tool(name: str) -> ModuleType:
+    if str(FOLDER) not in sys.path:
+        sys.path.append(str(FOLDER))
+    return importlib.import_module(name)
 
 
 class Collected:

@@ -14,21 +14,9 @@ from benchmarks.fault_fits import added_up
 from benchmarks.fault_report import table
 from benchmarks.fault_viewers import ViewerRow, killed_servers, killed_trainers
 from benchmarks.faults import parsed
-from benchmarks.stream_writers import Sent, repeated
 
-from segment_streams import header, packets
-from structgstream.codec.reader import StreamReader
-from structgstream.codec.sinks import MemorySink
+from repeated_streams import small_sent
 from structgstream.frames import MultiViewFrame
-
-
-def sent() -> Sent:
-    sink = MemorySink()
-    sink.open(header())
-    for packet in packets(6):
-        sink.write(packet)
-    sink.close()
-    return repeated(StreamReader(sink.data, name="small"), frames=6)
 
 
 def test_moments_are_those_of_the_seed_and_leave_time_for_recovering() -> None:
@@ -91,10 +79,18 @@ def test_what_was_not_counted_or_did_not_come_back_or_hit_another_is_seen() -> N
 
 @pytest.mark.parametrize("killed", [partial(killed_servers, down_seconds=0.1), killed_trainers])
 def test_players_go_on_after_kills(tmp_path: Path, killed: Callable[..., ViewerRow]) -> None:
-    row = killed(sent(), kills=2, seed=0, folder=tmp_path, players=2, page=False)
+    row = killed(small_sent(6), kills=2, seed=0, folder=tmp_path, players=2, page=False)
     assert (row.kills, row.equal, row.exact, row.reported_frames_lost) == (2, True, 2, 0)
     assert len(row.seconds_until_normal) == 2
     assert "| 2 of 2 |" in table({"cameras": [], "viewers": [asdict(row)]})
+
+
+def test_players_go_on_where_the_trainer_is_killed_at_a_border_of_periods(tmp_path: Path) -> None:
+    sent = small_sent(12, each_a_period=True)
+    assert [index for index in range(1, 25) if sent.begins_period(index)] == [6, 12, 18, 24]
+    row = killed_trainers(sent, kills=2, seed=1, folder=tmp_path, players=2, page=False)
+    assert (row.what, row.kills, row.equal, row.exact) == ("trainer across periods", 2, True, 2)
+    assert 0 <= row.borders <= 2
 
 
 def test_rows_of_several_seeds_are_added_up() -> None:
@@ -102,11 +98,14 @@ def test_rows_of_several_seeds_are_added_up() -> None:
     row = asdict(camera_row(film, seen_as("." * 12 + "_" * 5 + "." * 20, counted_from=12), begun=100.0, lost=0))
     text = table({"cameras": [row, {**row, "seed": 1, "smeared": 3}], "viewers": []})
     assert "| cut | 2 | 0 | 3 | 0 | 2 | 5.0 |" in text
+    later = asdict(ViewerRow("server", kills=2, seed=1, frames=5, equal=True))
+    earlier = {name: value for name, value in {**later, "seed": 0}.items() if name != "borders"}
+    assert "| server | 4 | 10 | 0 | yes |" in table({"cameras": [], "viewers": [earlier, later]})
 
 
 def test_all_is_asked_for_by_default() -> None:
     options = parsed([])
-    assert set(options.only) == {*FILMED, "server", "trainer", "trainer that fits"}
+    assert set(options.only) == {*FILMED, "server", "trainer", "trainer across periods", "trainer that fits"}
     assert options.moments >= 200
     assert options.kills >= 200
     assert np.isfinite(options.down_seconds)

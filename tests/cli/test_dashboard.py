@@ -77,6 +77,31 @@ def test_the_dashboard_names_each_camera_with_its_faults(tmp_path: Path) -> None
     assert "fit 2.00 s" in drawn
 
 
+def test_between_iterations_the_dashboard_tells_what_is_done(tmp_path: Path) -> None:
+    def lines(shown: Dashboard) -> str:
+        out = console(terminal=True)
+        out.print(shown._drawn())
+        return text(out)
+
+    values = metrics(tmp_path).values
+    shown = live_display(values, frames=None, done=3, console=console(terminal=True))
+    assert isinstance(shown, Dashboard)
+    assert "frame 4  takes pictures" in lines(shown)
+    shown.step(Step(7, 100, 0.5, 10, 0))
+    assert "frame 4  iteration 7/100" in lines(shown)
+    shown.frame(REPORT)
+    assert "frame 6  takes pictures" in lines(shown)
+    absent = replace(STATUS, cameras={"cam00": CameraStatus(False)})
+    alone = RunMetrics(tmp_path / "y.sgs", fps=30.0, live=lambda: absent)
+    assert "waits for cameras" in lines(Dashboard(alone.values, None, console=console(terminal=True)))
+
+
+def test_the_panel_leaves_room_for_what_a_terminal_shows_of_ctrl_c(tmp_path: Path) -> None:
+    out = console(terminal=True)
+    out.print(Dashboard(metrics(tmp_path).values, None, console=out)._drawn())
+    assert max(map(len, text(out).splitlines())) == 148
+
+
 def test_on_a_narrow_terminal_no_value_is_broken(tmp_path: Path) -> None:
     out = Console(file=io.StringIO(), force_terminal=True, width=48, height=40, color_system=None)
     with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:

@@ -140,6 +140,19 @@ def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, stream: bytes, m
     assert asyncio.run(rendered_apart(Catalog(tmp_path).found["ball.sgs"])) == b""
 
 
+def test_a_picture_that_is_too_large_keeps_nobody_waiting(
+    tmp_path: Path, stream: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ball.sgs").write_bytes(stream)
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\nexec head -c 10000000 /dev/zero\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(previews.sys, "executable", str(program))
+    monkeypatch.setattr(previews, "RENDER_SECONDS", 1000.0)
+    rendering = asyncio.wait_for(rendered_apart(Catalog(tmp_path).found["ball.sgs"]), 60.0)
+    assert asyncio.run(rendering) == b""
+
+
 def test_a_large_picture_comes_whole(tmp_path: Path, stream: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "ball.sgs").write_bytes(stream)
     program = tmp_path / "program"

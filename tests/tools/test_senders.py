@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import pytest
 
-from senders import sender, sent_stream
+from senders import mpeg_ts, sender, sent_stream
 from structgstream.data.clip import bundled_clip_path
 from structgstream.data.live.rig_file import read_rig
 
@@ -22,7 +22,7 @@ def stamps(stream: bytes) -> list[int]:
 
 @pytest.mark.parametrize("ticks", [0, 1, 90_000, 2**32 + 12_345, WRAP - 1])
 def test_a_time_is_written_as_the_standard_says(ticks: int) -> None:
-    first, second, third, fourth, fifth = sender().presentation_time(ticks)
+    first, second, third, fourth, fifth = mpeg_ts().presentation_time(ticks)
     assert first & 1 == third & 1 == fifth & 1 == 1
     high, middle, low = first >> 1 & 7, second << 7 | third >> 1, fourth << 7 | fifth >> 1
     assert high << 30 | middle << 15 | low == ticks

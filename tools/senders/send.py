@@ -9,31 +9,22 @@ machine, so that ten cameras cost next to nothing. Stamps of MPEG-TS are Unix ti
 """
 
 import argparse
-import io
 import json
 import random
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_lines import Line, Served, opened_lines
+from mpeg_ts import Loop, Muxer
 from rtsp import RtspCamera
 from structgstream.data.clip import bundled_clip, bundled_clip_path
-
-TICKS = 90_000
-WRAP = 2**33
-UDP_BYTES = 1316  # seven packets of MPEG-TS
-PAUSE_SECONDS = 0.2
-HTTP_OK = b"HTTP/1.0 200 OK\r\nContent-Type: video/mp2t\r\n\r\n"
 
 
 class Fault(StrEnum):
@@ -69,178 +60,6 @@ class Trouble:
         return cls(camera, Fault(fault), *map(float, times))
 
 
-@dataclass(frozen=True)
-class Loop:
-    """A short video whose first frame is a key frame, coded once.
-
-    Args:
-        template: stream of the coded video.
-        packets: of one round, in the order of showing, which is that of coding.
-    """
-
-    template: Any
-    packets: Sequence[bytes]
-
-    @classmethod
-    def of(cls, pictures: Sequence[NDArray[np.uint8]], *, codec: str = "libx264") -> "Loop":
-        """Pictures ``[H, W, 3]`` of even sizes, without frames that refer to later ones."""
-        height, width = pictures[0].shape[:2]
-        container = av.open(io.BytesIO(), "w", format="mpegts")
-        options = {"preset": "veryfast", "tune": "zerolatency", "crf": "18"}
-        stream: Any = container.add_stream(codec, rate=30, options=options)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.codec_context.gop_size = len(pictures)
-        packets = []
-        for number, picture in enumerate([*pictures, None]):
-            frame = None if picture is None else av.VideoFrame.from_ndarray(picture, format="rgb24")
-            if frame is not None:
-                frame.pts, frame.time_base = number, Fraction(1, 30)
-            packets += [bytes(packet) for packet in stream.encode(frame) if packet.size]
-        return cls(stream, packets)
-
-
-class Line(Protocol):
-    """Where the bytes of a camera go."""
-
-    def write(self, data: bytes, /) -> int: ...
-
-    def close(self) -> None: ...
-
-
-class Udp:
-    """Datagrams to a port of this machine."""
-
-    def __init__(self, port: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._address = ("127.0.0.1", port)
-
-    def write(self, data: bytes) -> int:
-        for start in range(0, len(data), UDP_BYTES):
-            self._socket.sendto(data[start : start + UDP_BYTES], self._address)
-        return len(data)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class Served:
-    """Connections to a port of this machine, each of which gets what is written from then on.
-
-    A new connection begins with a key frame, because a muxer begins anew whenever :attr:`fresh` is set.
-    """
-
-    def __init__(self, port: int = 0, *, http: bool) -> None:
-        self._http = http
-        self._listener = socket.create_server(("127.0.0.1", port))
-        self.port: int = self._listener.getsockname()[1]
-        self._clients: list[socket.socket] = []
-        self._lock = threading.Lock()
-        self.fresh = threading.Event()
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def write(self, data: bytes) -> int:
-        with self._lock:
-            clients = [*self._clients]
-        for client in clients:
-            try:
-                client.sendall(data)
-            except OSError:
-                self._drop(client)
-        return len(data)
-
-    def hang_up(self) -> None:
-        """Closes the connections; new ones are taken."""
-        with self._lock:
-            clients, self._clients = self._clients, []
-        for client in clients:
-            client.close()
-
-    def close(self) -> None:
-        self._listener.close()
-        self.hang_up()
-
-    def _drop(self, client: socket.socket) -> None:
-        with self._lock:
-            if client in self._clients:
-                self._clients.remove(client)
-        client.close()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                client, _ = self._listener.accept()
-                client.settimeout(2.0)
-                if self._http:
-                    client.recv(4096)
-                    client.sendall(HTTP_OK)
-            except OSError:
-                if self._listener.fileno() < 0:
-                    return
-                continue
-            with self._lock:
-                self._clients.append(client)
-            self.fresh.set()
-
-
-class _Written(io.RawIOBase):
-    """A file that a muxer writes: it hands the bytes on, with the presentation time that is wanted.
-
-    A muxer refuses stamps that repeat or go back, so it gets rising ones, and the five bytes that state the time in the
-    header of a picture (ISO/IEC 13818-1, 2.4.3.6) are written again here.
-    """
-
-    def __init__(self, line: Line) -> None:
-        super().__init__()
-        self._line = line
-        self.ticks: int | None = None
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        packets = bytearray(data)
-        for start in range(0, len(packets) - 187, 188):
-            header = start + 4 + (packets[start + 4] + 1 if packets[start + 3] & 0x20 else 0)
-            begins = packets[start + 1] & 0x40 and packets[header : header + 3] == b"\0\0\1"
-            if begins and packets[header + 3] == 0xE0 and self.ticks is not None:
-                packets[header + 9 : header + 14] = presentation_time(self.ticks, mark=packets[header + 9] >> 4)
-        return self._line.write(bytes(packets))
-
-
-def presentation_time(ticks: int, *, mark: int = 2) -> bytes:
-    """The five bytes of a time in the header of a picture."""
-    ticks %= WRAP
-    return bytes(
-        [
-            mark << 4 | (ticks >> 30) << 1 | 1,
-            ticks >> 22 & 0xFF,
-            (ticks >> 15 & 0x7F) << 1 | 1,
-            ticks >> 7 & 0xFF,
-            (ticks & 0x7F) << 1 | 1,
-        ]
-    )
-
-
-class _Muxer:
-    """MPEG-TS of one loop to a line."""
-
-    def __init__(self, loop: Loop, line: Line) -> None:
-        options = {"mpegts_copyts": "1", "flush_packets": "1"}
-        self._file = _Written(line)
-        self._container: Any = av.open(self._file, "w", format="mpegts", options=options)
-        self._stream = self._container.add_stream_from_template(loop.template)
-        self._count = 0
-        self.loop = loop
-
-    def send(self, data: bytes, stamp: float, *, key: bool) -> None:
-        packet = av.Packet(data)
-        packet.stream, packet.time_base = self._stream, Fraction(1, TICKS)
-        packet.pts = packet.dts = self._count = self._count + TICKS // 100
-        packet.is_keyframe = key
-        self._file.ticks = round(stamp * TICKS)
-        self._container.mux_one(packet)
-
-
 @dataclass
 class SentCamera:
     """One camera.
@@ -261,7 +80,7 @@ class SentCamera:
     troubles: Sequence[Trouble] = ()
     seed: int = 0
     sent: int = 0
-    _muxer: _Muxer | None = field(default=None, init=False)
+    _muxer: Muxer | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
@@ -313,7 +132,7 @@ class SentCamera:
         if self._muxer is None or self._muxer.loop is not loop or self._cut or fresh:
             if at:
                 return self._muxer is not None and self._muxer.loop is loop and not self._cut
-            self._muxer = _Muxer(loop, line)
+            self._muxer = Muxer(loop, line)
             self._cut = False
             if isinstance(line, Served):
                 line.fresh.clear()
@@ -344,13 +163,6 @@ def film(cameras: Sequence[SentCamera], stop: threading.Event, *, seconds: float
             cameras[index].send(number, begun=begun_unix, now=time.time())
 
 
-def free_port() -> int:
-    """A UDP port that is free now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def rig_text(urls: Mapping[str, str], calibration: Path, **settings: object) -> str:
     """The rig file of these cameras."""
     lines = [f"calibration = {json.dumps(str(calibration))}"]
@@ -374,7 +186,7 @@ def main() -> None:
     options = parser.parse_args()
     source = bundled_clip()
     frames = [frame.images for frame in source.frames()]
-    lines, urls = _lines(options.transport, list(source.rig))
+    lines, urls = opened_lines(options.transport, list(source.rig))
     cameras = [
         SentCamera(
             name,
@@ -391,33 +203,6 @@ def main() -> None:
     file.write_text(rig_text(urls, bundled_clip_path(), clock=clock, fps=options.fps))
     print(f"{len(cameras)} cameras send; structgstream reconstruct {file} --live -o live.sgs", flush=True)
     film(cameras, threading.Event(), seconds=options.seconds)
-
-
-def _lines(transport: str, names: Sequence[str]) -> tuple[dict[str, Line | RtspCamera], dict[str, str]]:
-    made: dict[str, Callable[[], tuple[Line | RtspCamera, str]]]
-    made = {"udp": _udp, "tcp": _tcp, "http": _http, "rtsp": _rtsp}
-    pairs = {name: made[transport]() for name in names}
-    return {name: line for name, (line, _) in pairs.items()}, {name: url for name, (_, url) in pairs.items()}
-
-
-def _udp() -> tuple[Line, str]:
-    port = free_port()
-    return Udp(port), f"udp://127.0.0.1:{port}"
-
-
-def _tcp() -> tuple[Line, str]:
-    served = Served(http=False)
-    return served, f"tcp://127.0.0.1:{served.port}"
-
-
-def _http() -> tuple[Line, str]:
-    served = Served(http=True)
-    return served, f"http://127.0.0.1:{served.port}/"
-
-
-def _rtsp() -> tuple[RtspCamera, str]:
-    camera = RtspCamera()
-    return camera, camera.url
 
 
 def _numbers() -> Iterator[int]:

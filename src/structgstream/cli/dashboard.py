@@ -35,7 +35,7 @@ def live_display(values: Values, *, frames: int | None, done: int = 0, console: 
     """
     console = Console() if console is None else console
     if console.is_terminal:
-        return Dashboard(values, frames, console=console)
+        return Dashboard(values, frames, done, console=console)
     return LiveLines(values, frames, done, console=console)
 
 
@@ -55,9 +55,10 @@ class LiveLines(Lines):
 class Dashboard:
     """Cameras, queues, stages and the last frame, drawn again a few times a second."""
 
-    def __init__(self, values: Values, frames: int | None, *, console: Console) -> None:
-        self._values, self._frames = values, frames
+    def __init__(self, values: Values, frames: int | None, done: int = 0, *, console: Console) -> None:
+        self._values, self._frames, self._console = values, frames, console
         self._step = self._last = ""
+        self._next, self._ended = done + 1, False  # counted from 1, as the lines of frames are
         self._live = Live(
             console=console, refresh_per_second=REFRESH, get_renderable=self._drawn, vertical_overflow="crop"
         )
@@ -69,26 +70,39 @@ class Dashboard:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._ended = True
         self._live.stop()
 
     def step(self, step: "Step") -> None:
         """Notes the iteration."""
-        self._step = f"iteration {step.iteration}/{step.iterations}  loss {step.loss:.4f}"
+        self._step = f"frame {self._next}  iteration {step.iteration}/{step.iterations}  loss {step.loss:.4f}"
 
     def frame(self, report: "FrameReport") -> None:
         """Notes the frame."""
-        self._step, self._last = "", summary(report, self._frames)
+        self._step, self._last, self._next = "", summary(report, self._frames), report.index + 2
 
     def _drawn(self) -> Panel:
         values = self._values()
         # What is cut off on a terminal of few lines is the end: cameras, of which the first line counts those present.
-        parts: list[RenderableType] = [Flow(state_parts(values)), Flow(stage_parts(values), style="dim"), Text()]
+        parts: list[RenderableType] = [Flow(state_parts(values))]
+        parts += [Flow(stages, style="dim")] if (stages := stage_parts(values)) else []
+        parts += [Text()]
         parts += [Flow(self._last.split("  "))] if self._last else []
-        parts += [Text(self._step or "waits for the next pictures", style="dim")]
+        doing = self._step or ("" if self._ended else self._between(values))
+        parts += [Text(doing, style="dim")] if doing else []
         if values.get("live") is not None:
             parts += [Text(), cameras_table(values["live"]["cameras"])]
         title = f"{values['stream']}  {values['state']}  {_duration(values['running_seconds'])}"
-        return Panel(Group(*parts), title=title, title_align="left")
+        # A terminal shows Ctrl-C as ^C, which must not begin another line: the panel would be drawn one line too low.
+        width = max(self._console.width - len("^C"), 1)
+        return Panel(Group(*parts), title=title, title_align="left", width=width)
+
+    def _between(self, values: Mapping[str, Any]) -> str:
+        """What is done between two iterations, which may be most of a frame's time."""
+        live = values.get("live")
+        if live is not None and not any(camera["present"] for camera in live["cameras"].values()):
+            return "waits for cameras"
+        return f"frame {self._next}  takes pictures and prepares them"
 
 
 class Flow:

@@ -144,10 +144,12 @@ async def rendered_apart(stream: ServedStream) -> bytes:
         async with asyncio.timeout(RENDER_SECONDS):
             while len(content) <= MOST_PICTURE_BYTES and (piece := await process.stdout.read(2**16)):
                 content += piece
+            if len(content) > MOST_PICTURE_BYTES:
+                return b""  # It would wait for ever to be read.
             return content if await process.wait() == 0 else b""
     except TimeoutError:
         return b""
     finally:
         with suppress(ProcessLookupError):
             process.kill()
-        await process.wait()
+        await process.communicate()  # Its pipe is closed when what is left in it has been read.

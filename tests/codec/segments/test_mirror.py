@@ -3,15 +3,18 @@
 
 import threading
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from segment_streams import Hands, as_file, folder, packets, written
+from segment_streams import Hands, as_file, folder, header, packets, written
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.manifest_json import manifest_from_json
 from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
+from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError
@@ -42,6 +45,7 @@ class Remote(FolderStore):
 
     def delete(self, name: str) -> None:
         self._asked()
+        assert name != MANIFEST, "readers have it at every moment"
         super().delete(name)
 
     def names(self) -> frozenset[str]:
@@ -54,8 +58,10 @@ class Remote(FolderStore):
             raise StorageError("No route to host.")
 
 
-def content(store: FolderStore) -> dict[str, bytes]:
-    return {name: store.get(name) for name in store.names()}
+def named(store: FolderStore) -> dict[str, bytes]:
+    """What the manifest names, and itself."""
+    there = store.names()
+    return {name: store.get(name) for name in there - stale_files(read_manifest(store), there)}
 
 
 def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> None:
@@ -63,7 +69,7 @@ def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> Non
     mirror = MirroredStore(here, remote)
     written(mirror, SENT)
     assert mirror.finish(wait_seconds=60) == 0
-    assert content(remote) == content(here)
+    assert named(remote) == named(here)
     assert remote.edges == sorted(remote.edges)
     assert remote.edges[-1] == 8
     stored = StoredBytes(remote, read_manifest(remote), check=True)
@@ -82,7 +88,7 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
     assert remote.edges == []
     remote.reachable.set()
     assert mirror.finish(wait_seconds=60) == 0
-    assert content(remote) == content(here)
+    assert named(remote) == named(here)
     assert remote.edges == [8]  # Those before were replaced while they waited.
     assert len(told) == 2
     assert "cannot be reached (No route to host.); the stream goes on in" in told[0]
@@ -100,7 +106,7 @@ def test_what_was_not_copied_is_told_and_copied_by_the_next_run(tmp_path: Path) 
     again = MirroredStore(here, remote)
     again.copy_all()
     assert again.finish(wait_seconds=60) == 0
-    assert content(remote) == content(here)
+    assert named(remote) == named(here)
     assert (remote.folder / "notes.txt").read_text() == "mine"
 
 
@@ -134,7 +140,7 @@ def test_a_part_that_goes_while_it_waits_is_not_copied_and_no_manifest_names_it(
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5), hands=hands)
     remote.reachable.set()
     assert mirror.finish(wait_seconds=60) == 0
-    assert content(remote) == content(here)
+    assert named(remote) == named(here)
     assert not {int(name.split("-")[1]) for name in remote.names() if "part" in name} & {0, 1, 2}
 
 
@@ -161,7 +167,7 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
     assert remote.edges == [0, 8]  # The remote raises where a manifest names what is not there.
     assert told == []
     assert short not in here.names()
-    assert content(remote).items() >= content(here).items()
+    assert named(remote) == named(here)
 
 
 def test_a_store_that_lost_files_while_it_failed_gets_them_again(tmp_path: Path) -> None:
@@ -180,7 +186,7 @@ def test_a_store_that_lost_files_while_it_failed_gets_them_again(tmp_path: Path)
     assert remote.refused.acquire(timeout=60)
     remote.reachable.set()
     assert mirror.finish(wait_seconds=60) == 0
-    assert content(remote) == content(here)
+    assert named(remote) == named(here)
 
 
 @pytest.mark.parametrize("frame", [2, 3])
@@ -194,4 +200,102 @@ def test_a_killed_writer_is_followed_up(tmp_path: Path, frame: int) -> None:
     mirror = MirroredStore(here, remote)
     written(mirror, SENT)
     assert mirror.finish(wait_seconds=60) == 0
-    assert content(remote) == content(here)
+    assert named(remote) == named(here)
+
+
+def test_after_an_outage_only_what_is_named_is_copied(tmp_path: Path) -> None:
+    """Parts of groups that are segments by now stay in the folder for the time of grace, and nobody asks for them."""
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    copied: list[str] = []
+    remote.before = copied.append
+    remote.reachable.clear()
+    mirror = MirroredStore(here, remote)
+    written(mirror, packets(30))
+    assert sum(name.startswith("part") for name in here.names()) == 30
+    remote.reachable.set()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert not any(name.startswith("part") for name in copied)
+    assert len([name for name in copied if name.startswith("segment")]) == 10
+    assert named(remote) == named(here)
+
+
+def test_a_slow_store_is_behind_by_a_round_however_long_the_stream_is(tmp_path: Path) -> None:
+    """The store takes as long for a file as three frames take: parts that were replaced meanwhile are left out."""
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    turns, copied = threading.Semaphore(0), list[str]()
+
+    def before(name: str) -> None:
+        copied.append(name)
+        assert turns.acquire(timeout=60)
+
+    remote.before = before
+    mirror = MirroredStore(here, remote)
+    sent = packets(90)
+    written(mirror, sent, after=lambda frame: frame % 3 == 2 and turns.release())
+    for _ in range(200):
+        turns.release()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert len(copied) < 90
+    assert named(remote) == named(here)
+
+
+def test_a_store_that_is_filled_again_keeps_its_manifest(tmp_path: Path) -> None:
+    hands = Hands()
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    options = MirrorOptions(grace_seconds=5.0, elapsed=lambda: hands.elapsed)
+    mirror = MirroredStore(here, remote, options=options)
+    written(mirror, SENT, hands=hands)
+    _settle(mirror)
+    before = remote.names()
+    sink = SegmentsSink(mirror, overwrite=True, clocks=hands.clocks())
+    sink.open(header())
+    _settle(mirror)
+    assert remote.names() == before  # It has the old stream until the new one has a frame.
+    for packet in SENT:
+        sink.write(packet)
+        _settle(mirror)
+        hands.wait(1.0)
+        StoredBytes(remote, read_manifest(remote), check=True)[:]
+    sink.close()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert named(remote) == named(here)
+
+
+def test_what_comes_again_while_its_removal_waits_for_a_round_stays(tmp_path: Path) -> None:
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    written(here, SENT[:1])
+    (short,) = (name for name in here.names() if name.startswith("segment"))
+    data, inside, done = here.get(short), threading.Event(), threading.Event()
+
+    def before(name: str) -> None:
+        inside.set()
+        assert done.wait(60)
+
+    remote.before = before
+    mirror = MirroredStore(here, remote)
+    mirror.copy_all()
+    assert inside.wait(60)
+    mirror.delete(short)
+    mirror.put(short, data)
+    done.set()
+    assert mirror.finish(wait_seconds=60) == 0
+    assert short in here.names()
+    assert named(remote) == named(here)
+
+
+def test_what_an_earlier_run_has_left_is_removed_little_by_little(tmp_path: Path) -> None:
+    hands = Hands()
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    for frame in range(100):
+        FolderStore.put(remote, f"part-{frame:08d}-{frame:016x}.sgs", b"")
+    options = MirrorOptions(grace_seconds=2.0, elapsed=lambda: hands.elapsed)
+    mirror = MirroredStore(here, remote, options=options)
+    left = []
+
+    def after(frame: int) -> None:
+        _settle(mirror)
+        left.append(sum(name.endswith(".sgs") and "part-" in name for name in remote.names()))
+
+    written(mirror, SENT, hands=hands, after=after)
+    assert mirror.finish(wait_seconds=60) == 0
+    assert 0 < max(before - later for before, later in pairwise(left)) < 20

@@ -223,6 +223,13 @@ def test_an_error_of_the_network_is_told_in_words(caplog: pytest.LogCaptureFixtu
     assert "is gone (nothing came for 5 s)" in caplog.text
 
 
+def test_an_error_that_nobody_expects_is_told_and_the_camera_is_opened_again(caplog: pytest.LogCaptureFixture) -> None:
+    received, faults = read(RuntimeError("what is this?"), sent_stream(frames=24))
+    assert received.numbers == [*range(12), *range(12)]
+    assert faults["gone"] == 2
+    assert "is gone (RuntimeError: what is this?)" in caplog.text
+
+
 def test_what_is_no_video_is_gone() -> None:
     received, faults = read(np.random.default_rng(0).bytes(20_000))
     assert received.pictures == []

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
 from pathlib import Path
+from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -15,10 +17,14 @@ from rigs import arc_rig
 from senders import moving_pictures, sender, sent_loops, sent_stream
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live import recording
+from structgstream.data.live import source as source_module
+from structgstream.data.live.faults import FaultLog
+from structgstream.data.live.matching import LivePicture, PictureSet
 from structgstream.data.live.source import LiveOptions, LiveSource
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.source import frame_count, may_read_ahead
+from structgstream.data.video_pictures import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
 
 NAMES = ("a", "b", "c")
@@ -60,7 +66,7 @@ def files(folder: Path, frames: int = 30, **troubles: str) -> Path:
 def sending(transport: str, *troubles: str) -> Iterator[dict[str, str]]:
     """Three cameras that send until the end of the block, and their URLs."""
     module, stop = sender(), threading.Event()
-    lines, urls = module._lines(transport, NAMES)
+    lines, urls = module.opened_lines(transport, NAMES)
     parsed = [module.Trouble.parsed(trouble) for trouble in troubles]
     cameras = [
         module.SentCamera(name, sent_loops(), lines[name], FPS, [one for one in parsed if one.camera == name])
@@ -82,6 +88,17 @@ def shown(image: np.ndarray) -> int:
     errors = ((np.stack(moving_pictures()).astype(float) - image) ** 2).mean((1, 2, 3))
     assert errors.min() < 60
     return int(errors.argmin())
+
+
+class Recorded(recording.Recording):
+    """Where nothing is written."""
+
+    def __init__(self) -> None:
+        return None
+
+
+def decoded() -> av.VideoFrame:
+    return av.VideoFrame.from_ndarray(moving_pictures()[0], format="rgb24").reformat(format="yuv420p")
 
 
 @pytest.mark.parametrize("transport", ["udp", "tcp", "http"])
@@ -266,6 +283,37 @@ def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
         frames = list(LiveSource(files(tmp_path), tmp_path / "x.sgs", options).frames())
     assert len(frames) == 4
     assert "camera 'b' is no longer recorded (no room); the stream goes on" in caplog.text
+
+
+def test_a_recording_that_cannot_be_ended_does_not_end_the_others(caplog: pytest.LogCaptureFixture) -> None:
+    class Full:
+        def close(self) -> None:
+            raise OSError(28, "No space left on device")
+
+    recorder = recording.CameraRecorder(Recorded(), "b", FaultLog("rig", now=lambda: 0.0))
+    recorder._output = Full()
+    recorder.close()
+    recorder.close()
+    assert caplog.text.count("camera 'b' is no longer recorded (No space left on device); the stream goes on") == 1
+
+
+def test_a_camera_whose_colours_cannot_be_converted_is_absent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def converted(frame: Any, *rest: Any, width: int, height: int) -> Any:
+        if width == 64:
+            raise ValueError("no such format")
+        return srgb(frame, *rest, width=width, height=height)
+
+    monkeypatch.setattr(source_module, "srgb", converted)
+    sizes = {"a": (128, 96), "b": (64, 48), "c": (128, 96)}
+    monkeypatch.setattr(source_module, "filmed_sizes", lambda calibration: sizes)
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", frames=0))
+    convert = source._converted()
+    pictures = {name: LivePicture(0.5, 0.0, decoded()) for name in NAMES}
+    assert [*convert(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
+    assert "camera 'b' sends pictures whose colours cannot be converted (no such format)" in caplog.text
+    assert source.faults.counts["b"] == {"garbage": 1}
 
 
 def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:

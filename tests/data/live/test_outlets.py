@@ -3,6 +3,7 @@
 
 import logging
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,22 @@ def test_what_an_earlier_run_left_is_removed(tmp_path: Path) -> None:
     (tmp_path / "set-00000099").write_bytes(b"old")
     outlet = DiskQueue(tmp_path, most_bytes=10**6, convert=convert)
     assert list(tmp_path.iterdir()) == []
+    outlet.close()
+
+
+def test_a_set_that_a_power_failure_has_damaged_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    killed = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert)
+    for number in range(3):
+        killed.put(one_set(number))
+    while len(list((tmp_path / "q").glob("set-????????"))) < 3:
+        time.sleep(0.01)
+    (tmp_path / "q" / "set-00000001").write_bytes(b"")
+    outlet = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert, resume=True)
+    assert taken(outlet) == 0.0
+    assert outlet.take(WAIT) is None
+    assert taken(outlet) == 2.0
+    assert (outlet.status.skipped, outlet.status.waiting_bytes) == (1, 0)
+    assert caplog.text.count("A set of pictures is lost: The pictures") == 1
     outlet.close()
 
 

@@ -7,25 +7,33 @@ after the process was killed, and the next run copies it. Nothing is kept in mem
 
 Note [Order of copying]
 ~~~~~~~~~~~~~~~~~~~~~~~
-One round takes the folder's manifest and the names that wait together, copies the files, and then the manifest, so
-that the other store's manifest names only files that are there. Manifests that were replaced meanwhile are left out. A
-file that is to leave the folder during a round, which may take longer than the time of grace, leaves it when the round
-is over. A file is removed from the other store no sooner than the time of grace after its first manifest without it.
+One round takes the folder's manifest and those of the waiting files that it names together, copies the files, and then
+the manifest, so that the other store's manifest names only files that are there. Manifests that were replaced meanwhile
+are left out, and so is what only they named: the parts of a group that is a segment by now. So a store that is slower
+than the stream, or was out of reach, is behind by about a round, however many frames came meanwhile. A file that is to
+leave the folder during a round, which may take longer than the time of grace, leaves it when the round is over. A file
+is removed from the other store no sooner than the time of grace after its first manifest without it, and a round
+removes few more than it copies.
 
 A store that has failed is compared with the folder before the next round: it may have lost what it had.
 """
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StorageError, StreamError
 
 _FIRST_WAIT_SECONDS = 0.5
 _LONGEST_WAIT_SECONDS = 30.0
+_MORE_REMOVED = 8
+"""So many files more than it copies may a round remove: what an earlier run has left must not hold up a live one."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,7 @@ class MirroredStore:
         self._remote = remote
         self._options = options or MirrorOptions()
         self._changed = threading.Condition()
-        self._waiting: dict[str, None] = {}  # names to copy, in their order
+        self._waiting: dict[str, None] = {}  # what the remote has not got, in the order of writing
         self._manifest_waits = False
         self._round_names: frozenset[str] = frozenset()  # what the round that goes on copies
         self._held: list[str] = []  # of them, what leaves the folder when it is over
@@ -74,14 +82,17 @@ class MirroredStore:
         return self._folder.name
 
     def put(self, name: str, data: bytes) -> None:
-        """Write to the folder; the copy follows."""
+        """Write to the folder; the copy follows when a manifest names it."""
+        with self._changed:
+            if name in self._held:
+                self._held.remove(name)
         self._folder.put(name, data)
         with self._changed:
-            if name == MANIFEST:
-                self._manifest_waits = True
-            else:
+            if name != MANIFEST:
                 self._waiting[name] = None
                 self._gone.pop(name, None)
+                return
+            self._manifest_waits = True
             self._started()
             self._changed.notify_all()
 
@@ -90,17 +101,22 @@ class MirroredStore:
         return self._folder.get(name)
 
     def delete(self, name: str) -> None:
-        """Remove from the folder, when it is not being copied; the copy goes later."""
+        """Remove from the folder, when it is not being copied; the copy goes later; a manifest's stays."""
         with self._changed:
             if name in self._round_names:
                 self._held.append(name)
-                return
-        self._remove(name)
+            else:
+                self._remove(name)
 
     def _remove(self, name: str) -> None:
+        """While nothing else changes."""
         self._folder.delete(name)
-        with self._changed:
-            self._waiting.pop(name, None)
+        if name == MANIFEST:
+            self._manifest_waits = False
+            return
+        waited = name in self._waiting
+        self._waiting.pop(name, None)
+        if not (waited and self._known):  # A store that has failed may have it nevertheless.
             self._gone[name] = None
 
     def names(self) -> frozenset[str]:
@@ -127,17 +143,27 @@ class MirroredStore:
             how many files still wait; they are in the folder, and the next run with the same folder copies them.
         """
         with self._changed:
-            self._changed.wait_for(lambda: not self._pending(), timeout=wait_seconds)
+            finished = self._changed.wait_for(lambda: not self._pending(), timeout=wait_seconds)
             self._ending = True
             self._changed.notify_all()
-            left = len(self._waiting) + self._manifest_waits
+            left = 0
+            if not finished:
+                with suppress(StreamError):  # A stream that was to be replaced has no manifest yet.
+                    left = len(self._due()[0]) + 1
             thread = self._thread
-        if thread is not None and not left:
+        if thread is not None and finished:
             thread.join()
         return left
 
     def _pending(self) -> bool:
-        return self._thread is not None and (bool(self._waiting) or self._manifest_waits or self._busy)
+        return self._thread is not None and (self._manifest_waits or self._busy)
+
+    def _due(self) -> tuple[list[str], bytes]:
+        """Those of the files that wait that the folder's manifest names, and the manifest."""
+        manifest = self._folder.get(MANIFEST)
+        named = manifest_from_json(manifest, name=f"{MANIFEST} in {self._folder.name}")
+        stale = stale_files(named, frozenset(self._waiting))
+        return [name for name in self._waiting if name not in stale], manifest
 
     def _started(self) -> None:
         if self._thread is None:
@@ -147,7 +173,7 @@ class MirroredStore:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._ending or self._waiting or self._manifest_waits)
+                self._changed.wait_for(lambda: self._ending or self._manifest_waits)
                 if self._ending:
                     return
                 self._busy = True
@@ -179,63 +205,53 @@ class MirroredStore:
         return 0.0
 
     def _compare(self) -> None:
-        """Find what an earlier run has not copied, and what it has not removed."""
+        """Find what the remote has not got, and what is there and no longer here."""
         there = self._remote.names()
-        here = self._folder.names()
         with self._changed:
-            earlier = {name: None for name in sorted(here - there - self._waiting.keys()) if name != MANIFEST}
-            self._waiting = {**earlier, **self._waiting}
-            self._manifest_waits = self._manifest_waits or MANIFEST in here
-            for name in there - here - {MANIFEST}:
-                self._gone.setdefault(name)
+            here = self._folder.names()
+            earlier = {name: None for name in sorted(here - self._waiting.keys()) if name != MANIFEST}
+            self._waiting = {name: None for name in (*earlier, *self._waiting) if name not in there}
+            left = dict.fromkeys(sorted(there - here - {MANIFEST}))
+            self._gone = {name: since for name, since in {**left, **self._gone}.items() if name in there}
+            self._manifest_waits = MANIFEST in here
             self._known = True
 
     def _copy(self) -> None:
         """One round."""
         with self._changed:
-            names = [*self._waiting]
-            manifest = self._folder.get(MANIFEST) if self._manifest_waits else None
+            if not self._manifest_waits:
+                return  # The stream is being replaced.
+            names, manifest = self._due()
             self._manifest_waits = False
             self._round_names = frozenset(names)
             leaving = [name for name, since in self._gone.items() if since is None]
         try:
             for name in names:
-                self._copy_file(name)
-            if manifest is not None:
-                self._remote.put(MANIFEST, manifest)
+                self._remote.put(name, self._folder.get(name))
+                with self._changed:
+                    self._waiting.pop(name, None)
+            self._remote.put(MANIFEST, manifest)
         except BaseException:
             with self._changed:
-                self._manifest_waits = self._manifest_waits or manifest is not None
+                self._manifest_waits, self._known = True, False
             raise
         finally:
             with self._changed:
                 self._round_names = frozenset()
                 held, self._held = self._held, []
-            for name in held:
-                self._remove(name)
+                for name in held:
+                    with suppress(StorageError):  # It is found again when the stream is resumed.
+                        self._remove(name)
+        self._clean(leaving, most=len(names) + _MORE_REMOVED)
+
+    def _clean(self, leaving: Iterable[str], *, most: int) -> None:
+        """Remove from the remote what its manifests have not named for the time of grace; ``leaving`` from now on."""
         now = self._options.elapsed()
-        if manifest is not None:
-            with self._changed:
-                self._gone.update({name: now for name in leaving if name in self._gone})
+        late = now - self._options.grace_seconds
         with self._changed:
-            late = now - self._options.grace_seconds
+            self._gone.update({name: now for name in leaving if name in self._gone})
             removed = [name for name, since in self._gone.items() if since is not None and since <= late]
-        for name in removed:
+        for name in removed[:most]:
             self._remote.delete(name)
             with self._changed:
                 self._gone.pop(name, None)
-
-    def _copy_file(self, name: str) -> None:
-        with self._changed:
-            if name not in self._waiting:
-                return  # It has left the folder meanwhile; a newer manifest does not name it.
-        try:
-            data = self._folder.get(name)
-        except StreamError:
-            with self._changed:
-                if name not in self._waiting:
-                    return
-            raise
-        self._remote.put(name, data)
-        with self._changed:
-            self._waiting.pop(name, None)

@@ -5,6 +5,7 @@ A picture that cannot be trusted is not delivered: after a damage none until the
 are not the calibration's, none of a picture that stands still while others change.
 """
 
+import logging
 import threading
 import zlib
 from collections.abc import Callable, Iterable
@@ -22,6 +23,8 @@ from structgstream.data.video_index import load_av
 if TYPE_CHECKING:
     from av.packet import Packet
     from av.video.frame import VideoFrame
+
+log = logging.getLogger(__name__)
 
 FIRST_WAIT_SECONDS, MOST_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_STAMPS = 2**33
@@ -152,6 +155,9 @@ class CameraFeed:
             return f"nothing came for {self._silent:g} s"
         except (av.error.FFmpegError, OSError, ValueError) as error:
             return str(getattr(error, "strerror", None) or error)
+        except Exception as error:  # Whatever it is: a thread that ends would be a camera that never comes back.
+            log.exception("camera %r cannot be read", self.name)
+            return f"{type(error).__name__}: {error}"
         return "it ended"
 
     def _read(self, container: Any) -> None:

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from structgstream.data.live.matching import PictureSet, SetTimes
 from structgstream.data.live.picture_file import read_pictures, write_pictures
-from structgstream.errors import StorageError
+from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
 
 log = logging.getLogger(__name__)
@@ -159,7 +159,7 @@ class DiskQueue:
             self._changed.notify_all()
 
     def take(self, timeout_seconds: float) -> MultiViewFrame | None:
-        """The oldest set.
+        """The oldest set; one that a power failure has damaged, which files here are not synced against, is skipped.
 
         Raises:
             StorageError: the disk is full.
@@ -172,10 +172,15 @@ class DiskQueue:
                     raise self._failed
                 return None
             path, size, self.taken = self._files.popleft()
-        frame, _ = read_pictures(path)
+        frame = None
+        try:
+            frame, _ = read_pictures(path)
+        except CaptureError as error:
+            log.warning("A set of pictures is lost: %s", error)
         path.unlink(missing_ok=True)
         with self._changed:
             self._bytes -= size
+            self._skipped += frame is None
         return frame
 
     @property

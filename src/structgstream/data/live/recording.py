@@ -13,6 +13,7 @@ then ``part-002``, each a capture too.
 import json
 import logging
 import threading
+from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -127,11 +128,12 @@ class Recording:
             raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
 
     def close(self) -> None:
-        """Ends all files."""
+        """Ends all files; what cannot be written any more is left out."""
         for camera in self._cameras:
             camera.close()
         for text in self._texts.values():
-            text.close()
+            with suppress(OSError):
+                text.close()
 
 
 class CameraRecorder:
@@ -156,13 +158,19 @@ class CameraRecorder:
                 self._keep(packet, shift_seconds)
         except (load_av().error.FFmpegError, OSError, ValueError, StorageError) as error:
             self._failed = True
-            reason = getattr(error, "strerror", None) or error
-            self._faults.say(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
+            self._tell(error)
+
+    def _tell(self, error: Exception) -> None:
+        reason = getattr(error, "strerror", None) or error
+        self._faults.say(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
 
     def close(self) -> None:
         """Ends the file."""
         with self._lock:
-            self._finish()
+            try:
+                self._finish()
+            except (load_av().error.FFmpegError, OSError, ValueError) as error:
+                self._tell(error)
             self._failed = True
 
     def _keep(self, packet: "Packet", shift_seconds: float) -> None:

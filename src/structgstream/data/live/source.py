@@ -25,10 +25,10 @@ from structgstream.data.live.calibration import (
     filmed_sizes,
     read_calibration,
 )
-from structgstream.data.live.faults import FaultLog
+from structgstream.data.live.faults import Fault, FaultLog
 from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.data.live.matching import PictureSet, SetTimes
-from structgstream.data.live.outlets import GIGABYTE, DiskQueue, Latest, Outlet
+from structgstream.data.live.outlets import GIGABYTE, Convert, DiskQueue, Latest, Outlet
 from structgstream.data.live.recording import Recording
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
 from structgstream.data.live.status import LiveStatus, SetAges
@@ -290,21 +290,28 @@ class LiveSource:
                 recording.close()
 
     def _made_outlet(self) -> Outlet:
+        if self._options.policy == "latest":
+            return Latest(self._converted())
+        most = round(self._options.queue_gigabytes * GIGABYTE)
+        folder = self._stream.with_suffix(".queue")
+        return DiskQueue(folder, most_bytes=most, convert=self._converted(), resume=self._options.resume)
+
+    def _converted(self) -> Convert:
+        """What makes a set a frame; a camera whose colours cannot be converted is absent from it."""
         reformatter = load_av().video.reformatter.VideoReformatter()
         sizes: Mapping[str, tuple[int, int]] = filmed_sizes(self._calibration)
 
         def convert(found: PictureSet) -> MultiViewFrame:
-            images = {
-                name: srgb(picture.content, reformatter, width=sizes[name][0], height=sizes[name][1])
-                for name, picture in found.pictures.items()
-            }
+            images = {}
+            for name, picture in found.pictures.items():
+                try:
+                    images[name] = srgb(picture.content, reformatter, width=sizes[name][0], height=sizes[name][1])
+                except (load_av().error.FFmpegError, ValueError) as error:
+                    text = f"sends pictures whose colours cannot be converted ({error}); it is absent"
+                    self.faults.tell(name, Fault.GARBAGE, text)
             first = min(found.pictures.values(), key=lambda picture: picture.arrived)
             streamed = self._live.clock is TimeBase.STREAM  # a clock of its own, which tells nothing of Unix time
             captured = first.arrived + self._unix_offset if streamed else found.seconds
             return MultiViewFrame(0, found.seconds, images, captured_unix_seconds=captured)
 
-        if self._options.policy == "latest":
-            return Latest(convert)
-        most = round(self._options.queue_gigabytes * GIGABYTE)
-        folder = self._stream.with_suffix(".queue")
-        return DiskQueue(folder, most_bytes=most, convert=convert, resume=self._options.resume)
+        return convert
