@@ -19,6 +19,7 @@ import numpy as np
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
 from structgstream.data.calibration_files.reading import reason
+from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
@@ -41,7 +42,7 @@ def open_json_videos(path: Path) -> VideoSource:
     """
     file = path / FILE
     rig, fps, stated_frames = read_cameras(file)
-    videos = {video.stem: video for video in path.glob("*.mp4")}
+    videos = by_stem(files_of(path, (".mp4",)))
     check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
     source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
     if len(source) < stated_frames:

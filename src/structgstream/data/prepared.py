@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.calibration_files.reading import BROKEN, readable
+from structgstream.data.folder_files import files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.picture_size import picture_size
@@ -189,8 +190,7 @@ def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
 
 def pictures_of(folder: Path) -> tuple[Path, ...]:
     """The pictures of a camera's folder, in the order of their names."""
-    files = (file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
-    return tuple(sorted(files, key=lambda file: natural(file.stem)))
+    return tuple(sorted(files_of(folder, PICTURE_SUFFIXES), key=lambda file: natural(file.stem)))
 
 
 def _of_folders(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import NEAR_IN_RIG_RADII
+from structgstream.data.folder_files import REPORT
 from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import open_capture
@@ -39,7 +40,6 @@ from structgstream.preparation.steps import FOLDER, Stored
 from structgstream.similarity import rig_radius
 from structgstream.whole_files import whole_file
 
-REPORT = "report"
 POINTS = "points.npy"
 NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
 

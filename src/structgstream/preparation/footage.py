@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
+from structgstream.data.folder_files import REPORT, files_of, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture
 from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import pictures_of
@@ -33,7 +34,7 @@ _log = logging.getLogger(__name__)
 PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
 SUBFOLDERS = ("", "videos", "images")
-NO_CAMERAS = (*SUBFOLDERS, "masks", "board")
+NO_CAMERAS = (*SUBFOLDERS, "masks", "board", REPORT)
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
 
 
@@ -211,7 +212,7 @@ def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Foot
 
 def _found(root: Path) -> dict[str, Path]:
     """Files or folders of the cameras of ``root`` by name; nothing when there are none."""
-    entries = sorted(entry for entry in root.iterdir() if not entry.name.startswith("."))
+    entries = sorted(entry for entry in root.iterdir() if not is_hidden(entry))
     for suffixes in (VIDEO_SUFFIXES, PICTURE_SUFFIXES):
         found: dict[str, Path] = {}
         for entry in entries:
@@ -256,7 +257,7 @@ def _check_left(root: Path, entries: Sequence[Path], found: Mapping[str, Path]) 
 
 def _of_folder(folder: Path, suffixes: Collection[str]) -> Path | None:
     """The one video in a camera's folder, or the folder itself when it holds pictures."""
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+    files = files_of(folder, suffixes)
     if not files:
         return None
     if suffixes is PICTURE_SUFFIXES:
