@@ -11,7 +11,7 @@ REPORT = "report"
 
 
 def is_hidden(path: Path) -> bool:
-    """Whether a file is none that was filmed: macOS leaves a ``._NAME`` beside each NAME on the file systems of cards."""
+    """Whether a file is none that was filmed: macOS leaves a ``._NAME`` beside each NAME on file systems of cards."""
     return path.name.startswith(".")
 
 
@@ -30,8 +30,8 @@ def by_stem(files: Iterable[Path]) -> dict[str, Path]:
     for file in files:
         if file.stem in found:
             raise CaptureError(
-                f"{found[file.stem].name} and {file.name} in {file.parent} are of one name, {file.stem!r}; expected one "
-                "file of each: move the other out of the folder."
+                f"{found[file.stem].name} and {file.name} in {file.parent} are of one name, {file.stem!r}; expected "
+                "one file of each: move the other out of the folder."
             )
         found[file.stem] = file
     return found
