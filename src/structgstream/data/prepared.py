@@ -6,7 +6,6 @@ calibrated again without touching what was filmed.
 """
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import BROKEN, readable
+from structgstream.data.calibration_files.reading import BROKEN, positive, readable
 from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential, finite
@@ -128,8 +127,8 @@ def read_prepared(path: Path) -> PreparedCapture:
             raise ValueError(f"unit {content['unit']!r}")
         return PreparedCapture(
             cameras={name: _read_camera(name, entry, file) for name, entry in entries.items()},
-            fps=_positive(content, "fps"),
-            near=_positive(content, "near"),
+            fps=positive(content, "fps"),
+            near=positive(content, "near"),
             unit=cast(Unit, content["unit"]),
             held_out=frozenset(content["held_out"]),
             points=None if content["points"] is None else str(content["points"]),
@@ -254,18 +253,6 @@ def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
     }
 
 
-def _positive(content: Mapping[str, Any], key: str) -> float:
-    """The number of a key.
-
-    Raises:
-        ValueError: it is not positive, or not finite.
-    """
-    number = float(content[key])
-    if not 0 < number < math.inf:
-        raise ValueError(f"{key} {number:g}")
-    return number
-
-
 def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera:
     try:
         width, height = (int(side) for side in entry["size"])
@@ -276,7 +263,7 @@ def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera
             pinhole = camera_of(entry["viewmat"], entry["pinhole"]["K"], entry["pinhole"]["size"])
         except CalibrationError as error:
             raise CalibrationError(f"The pinhole of camera {name!r} of {file}: {error}") from None
-        clock = Clock(finite(entry["clock"]["offset_seconds"]), _positive(entry["clock"], "rate"))
+        clock = Clock(finite(entry["clock"]["offset_seconds"]), positive(entry["clock"], "rate"))
         tone = None if entry["tone"] is None else ToneCurve(entry["tone"])
         return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock, tone)
     except CalibrationError:
