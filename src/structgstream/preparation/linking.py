@@ -85,8 +85,12 @@ def _bring_file(source: Path, target: Path, link: Link) -> None:
         except OSError:  # another file system, or one without links
             pass
     part = partial_path(target)
-    shutil.copy2(source, part)
-    give_name(part, target)
+    try:
+        shutil.copy2(source, part)
+        give_name(part, target)
+    except BaseException:  # a full disk is full of it
+        part.unlink(missing_ok=True)
+        raise
 
 
 def _same(source: Path, target: Path, link: Link) -> bool:
