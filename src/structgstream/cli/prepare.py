@@ -126,7 +126,7 @@ def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
     from structgstream.preparation.checking.folder import check_folder
 
     folder = options.videos / REPORT if options.report is None else options.report
-    with step_display(console) as display:
+    with interruptible(), step_display(console) as display:
         checked = check_folder(options.videos, report=folder, listener=display)
     say(console, f"Report: {folder / 'index.html'}")
     return checked.report.findings
