@@ -2,10 +2,12 @@
 """Common parts of the package's plots: figures, axes, colours, saving."""
 
 import warnings
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from structgstream.errors import MissingExtraError, StorageError
+from structgstream.errors import MissingExtraError
+from structgstream.whole_files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,16 +43,14 @@ def without_frame(axis: "Axes") -> None:
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a picture, and creates its folder if necessary.
+    """Writes a picture, whole or not at all, and creates its folder if necessary.
 
     Raises:
         StorageError: the file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with warnings.catch_warnings():
-            # Names of cameras may have letters that the font lacks; a box stands for them then.
-            warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
-            figure.savefig(path)
-    except OSError as error:
-        raise StorageError(f"The picture {path} cannot be written ({error.strerror}).") from None
+    content = BytesIO()
+    with warnings.catch_warnings():
+        # Names of cameras may have letters that the font lacks; a box stands for them then.
+        warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
+        figure.savefig(content, format=path.suffix.removeprefix(".") or "png")
+    write_whole(path, content.getvalue(), called="The picture", new_folder=True, sync=False)

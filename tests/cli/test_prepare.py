@@ -3,6 +3,8 @@
 
 import json
 import os
+import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -44,6 +46,27 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     capsys.readouterr()
     assert main(["prepare", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
     assert "is missing; give the folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("told", "arguments"),
+    [("prepare.prepare_capture", ["-o", "out"]), ("checking.folder.check_folder", ["--check"])],
+)
+def test_ctrl_c_that_a_library_loses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str, arguments: list[str]
+) -> None:
+    """It comes while one is loaded, which makes an error of its own of it."""
+
+    def lost(*_: object, **__: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+        except KeyboardInterrupt:
+            raise ImportError("cannot be loaded") from None
+
+    monkeypatch.setattr(f"structgstream.preparation.{told}", lost)
+    monkeypatch.chdir(tmp_path)
+    assert main(["prepare", str(tmp_path), *arguments]) == 130
 
 
 def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 from structgstream.data.exif import Stated, read_exif
 from structgstream.errors import CaptureError, MissingExtraError
 
-FOCAL, FILM, RESOLUTION, UNIT, ACROSS = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002
+FOCAL, FILM, RESOLUTION, UNIT, ACROSS, DOWN = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002, 0xA003
 
 
 def written(path: Path, tags: dict[int, Any], *, size: tuple[int, int] = (400, 300), orientation: int = 1) -> Path:
@@ -44,6 +44,13 @@ def test_a_focal_length_and_the_pitch_of_the_sensor(tmp_path: Path, unit: int | 
 def test_pictures_that_were_reduced(tmp_path: Path) -> None:
     tags = {FOCAL: IFDRational(5), RESOLUTION: IFDRational(320), UNIT: 4, ACROSS: 1600}
     assert read_exif(written(tmp_path / "a.jpg", tags)).focal_pixels == pytest.approx(400)
+
+
+def test_pictures_that_were_turned_without_their_tags(tmp_path: Path) -> None:
+    """As ``jpegtran -rotate 90`` does, here of a picture that was reduced before."""
+    tags = {FOCAL: IFDRational(5), RESOLUTION: IFDRational(320), UNIT: 4, ACROSS: 1600, DOWN: 1200}
+    assert read_exif(written(tmp_path / "a.jpg", tags, size=(300, 400))).focal_pixels == pytest.approx(400)
+    assert read_exif(written(tmp_path / "b.jpg", tags)).focal_pixels == pytest.approx(400)
 
 
 def test_of_two_that_contradict_each_other_the_one_of_film_counts(tmp_path: Path) -> None:

@@ -69,6 +69,14 @@ def test_another_rate_than_stated(tmp_path: Path) -> None:
         open_json_videos(tmp_path)
 
 
+@pytest.mark.parametrize("change", [{"fps": 0}, {"fps": float("nan")}, {"near": -1}])
+def test_numbers_that_cannot_be(tmp_path: Path, change: dict[str, float]) -> None:
+    write_clip(tmp_path)
+    edit(tmp_path, lambda content: content.update(change))
+    with pytest.raises(CaptureError, match=rf"cameras\.json cannot be read \(ValueError: {next(iter(change))} "):
+        open_json_videos(tmp_path)
+
+
 def test_nan_names_the_camera(tmp_path: Path) -> None:
     write_clip(tmp_path)
     edit(tmp_path, lambda content: content["cameras"]["cam03"]["viewmat"][1].__setitem__(3, float("nan")))

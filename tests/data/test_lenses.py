@@ -138,3 +138,9 @@ def test_any_coefficients_are_inverted_up_to_where_they_fold() -> None:
         back = lens.undistort(to_pixels)[inside]
         assert (np.abs(back - points[inside]) < 1e-4).all(1).mean() > 0.97, lens
         lens.undistort(points)
+
+
+def test_a_coefficient_that_is_no_number_is_refused() -> None:
+    for read in (opencv_lens, fisheye_lens):
+        with pytest.raises(ValueError, match=r"not finite \(nan\)"):
+            read([0.1, math.nan, 0.0, 0.0])

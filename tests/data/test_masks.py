@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from captures import HEIGHT, WIDTH, small_rig, write_clip, write_panoptic, write_picture
+from captures import HEIGHT, WIDTH, picture, small_rig, write_clip, write_panoptic, write_picture
 from structgstream.data.images import reduced_mask
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.masks import with_masks
 from structgstream.data.open import open_capture
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear
+from structgstream.data.timeline import Clock
+from structgstream.data.tone import ToneCurve
 from structgstream.data.undistortion import Undistortion, undistort
 from structgstream.data.wrappers import every_nth_frame
 from structgstream.errors import CaptureError
@@ -61,6 +64,35 @@ def test_masks_of_videos_are_numbered_and_follow_sections_and_sizes(tmp_path: Pa
     expected[5, 5] = False  # one of its four pixels is left out
     np.testing.assert_array_equal(frame.masks["cam01"], expected)
     assert [list(frame.masks) for frame in every_nth_frame(whole, 3).frames()] == [[], ["cam01"]]
+
+
+def test_a_mask_with_another_spelling_of_png_counts(tmp_path: Path) -> None:
+    write_clip(tmp_path, frames=2)
+    write_mask(tmp_path / "masks/cam01.png", left_half())
+    (tmp_path / "masks/cam01.png").rename(tmp_path / "masks/cam01.PNG")
+    (tmp_path / "masks/._cam01.PNG").write_bytes(b"")
+    (tmp_path / "masks/.thumbs").mkdir()
+    np.testing.assert_array_equal(next(open_capture(tmp_path).frames()).masks["cam01"], left_half())
+
+
+def test_masks_of_a_prepared_capture_are_named_as_the_cameras_pictures(tmp_path: Path) -> None:
+    """Whose instants have no common name: clocks shift them."""
+    cameras = {}
+    for number, (name, camera) in enumerate(small_rig().cameras.items()):
+        filmed = LensCamera(camera, RadialTangential(k1=-0.05))
+        clock = Clock(1 / 30 if number == 1 else 0.0)
+        curve = ToneCurve((tuple(np.linspace(0.05, 1, 8)),) * 3)
+        cameras[name] = PreparedCamera(f"pictures/{name}", filmed, rectilinear(filmed), clock, curve)
+        for frame in range(1, 5):
+            write_picture(tmp_path / "pictures" / name / f"{frame:03d}.png", picture(number, frame))
+    write_prepared(tmp_path, PreparedCapture(cameras, 30.0, 0.25))
+    write_mask(tmp_path / "masks/cam00/003.png", np.zeros((HEIGHT, WIDTH), bool))
+    write_mask(tmp_path / "masks/cam01/003.png", np.zeros((HEIGHT, WIDTH), bool))
+    frames = list(open_capture(tmp_path).frames())
+    assert {(name, frame.index) for frame in frames for name in frame.masks} == {
+        ("cam00", 1),
+        ("cam01", 2),
+    }  # Frame 0 has the pictures 002, and 001 of the late one.
 
 
 @pytest.mark.parametrize("size", [(32, 24), (21, 17), (64, 48)])

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -146,6 +147,19 @@ def test_a_later_version_is_refused(tmp_path: Path) -> None:
         (lambda values: values["cameras"]["cam02"].update(size=[9, 9]), r"Camera 'cam02' .*principal point"),
         (lambda values: values.update(unit="yards"), r"capture\.json cannot be read .*yards"),
         (lambda values: values.pop("fps"), r"capture\.json cannot be read \(.*fps"),
+        (lambda values: values.update(fps=0), r"capture\.json cannot be read \(.*fps 0\)"),
+        (lambda values: values.update(fps=math.nan), r"capture\.json cannot be read \(.*fps nan\)"),
+        (lambda values: values.update(near=-1), r"capture\.json cannot be read \(.*near -1\)"),
+        (lambda values: values["cameras"]["cam02"]["clock"].update(rate=0), r"Camera 'cam02' .*rate 0"),
+        (lambda values: values["cameras"]["cam02"]["clock"].update(offset_seconds=math.nan), r"Camera 'cam02' .*nan"),
+        (
+            lambda values: values["cameras"]["cam02"].update(lens={"model": "opencv", "k1": math.nan}),
+            r"Camera 'cam02' .*not finite \(nan\)",
+        ),
+        (
+            lambda values: values["cameras"]["cam02"]["pinhole"].update(size=[0, 9]),
+            r"pinhole of camera 'cam02' of .*capture\.json: .*must be positive",
+        ),
     ],
 )
 def test_broken_content_names_its_camera(tmp_path: Path, change: Callable[[dict[str, Any]], object], told: str) -> None:

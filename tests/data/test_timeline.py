@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import logging
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from properties import examples
-from structgstream.data.timeline import Clock, common_slots, natural
+from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
 from structgstream.errors import CaptureError
 
 
@@ -100,3 +101,18 @@ def test_the_range_is_the_longest_that_all_have_begun_and_half_reach(found: list
 def test_a_clock_gives_common_time() -> None:
     times = Clock(offset_seconds=-2.0, rate=1.001).common_seconds(np.array([0.0, 10.0]))
     np.testing.assert_allclose(times, [-2.0, 8.01])
+
+
+def slots(**names: str) -> dict[str, list[int]]:
+    pictures = {camera: [Path(camera, f"{stem}.png") for stem in own.split()] for camera, own in names.items()}
+    return {camera: own.tolist() for camera, own in picture_slots(pictures).items()}
+
+
+def test_pictures_are_of_one_instant_by_their_names() -> None:
+    """One lacks a picture, one begins late, and what no camera has is no instant."""
+    assert slots(a="8 9 10 12", b="8 10 12", c="10 12 13") == {"a": [0, 1, 2, 3], "b": [0, 2, 3], "c": [2, 3, 4]}
+
+
+def test_pictures_are_counted_where_a_camera_names_them_its_own_way() -> None:
+    assert slots(a="8 9 10", b="8 10", c="IMG1 IMG2") == {"a": [0, 1, 2], "b": [0, 1], "c": [0, 1]}
+    assert slots(a="a", b="b") == {"a": [0], "b": [0]}

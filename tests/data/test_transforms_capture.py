@@ -56,6 +56,13 @@ def test_pictures_with_times(tmp_path: Path, pattern: str) -> None:
     assert all_numbers(source.frames()) == [[(camera, frame) for camera in range(3)] for frame in range(FRAMES)]
 
 
+@pytest.mark.parametrize("fps", [0, -30, float("nan"), "fast"])
+def test_a_rate_that_is_none(tmp_path: Path, fps: object) -> None:
+    write(tmp_path, "rgb/CAM/FRAME.png", fps=fps)
+    with pytest.raises(CalibrationError, match=r"transforms\.json cannot be read \(.*; expected fps as a number"):
+        open_capture(tmp_path)
+
+
 def test_times_order_the_pictures_not_their_names(tmp_path: Path) -> None:
     write(tmp_path, "rgb/CAM/FRAME.png")
 

@@ -18,6 +18,7 @@ from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,
     check_tone,
+    check_used,
     chosen_method,
     from_other_tool,
     packed,
@@ -26,7 +27,7 @@ from structgstream.preparation.calibrating import (
     unpacked,
 )
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.footage import Footage
+from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.steps import Stored
 
@@ -80,6 +81,25 @@ def test_tone_curves_need_points(tmp_path: Path) -> None:
     check_tone("sfm", toned)
 
 
+def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:
+    write_room(tmp_path, cameras=3)
+    there = find_footage(tmp_path)
+    given = chosen_method(there, PrepareOptions())
+    stills = Footage(tmp_path, {}, {}, {})
+    for method, options, told in (
+        ("sfm", PrepareOptions(fps=25), "leave out --fps"),
+        ("sfm", PrepareOptions(board_videos=tmp_path), "--calibration board alone"),
+        ("board", PrepareOptions(intrinsics="shared"), "by structure from motion alone"),
+        (given, PrepareOptions(lens="fisheye"), r"cameras\.json states the lenses, so --lens fisheye has no effect"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            check_used(method, there, options)
+    check_used("sfm", stills, PrepareOptions(fps=25))
+    check_used("board", there, PrepareOptions(board_videos=tmp_path, lens="brown"))
+    check_used("sfm", there, PrepareOptions(intrinsics="shared", lens="brown"))
+    check_used(given, there, PrepareOptions(lens="fisheye", refine=True))
+
+
 def test_three_cameras_are_enough(tmp_path: Path) -> None:
     check_enough(footage(tmp_path, "a", "b", "c"))
     for names in (("a", "b"), ("a",)):
@@ -90,8 +110,8 @@ def test_three_cameras_are_enough(tmp_path: Path) -> None:
 def test_every_camera_is_placed_or_named(tmp_path: Path) -> None:
     found = solved(ring(3, radius=2.6, arc_degrees=40))
     assert check_complete(found, footage(tmp_path, "cam00", "cam02")) is found
-    with pytest.raises(CalibrationError, match="'x', 'y'.* among the other 3: .* --without x y"):
-        check_complete(found, footage(tmp_path, "cam00", "x", "cam01", "y"))
+    with pytest.raises(CalibrationError, match="'x', 'y z'.* among the other 3: .* --without x 'y z'"):
+        check_complete(found, footage(tmp_path, "cam00", "x", "cam01", "y z"))
 
 
 def test_the_calibration_of_another_tool_is_for_these_pictures(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps up to a calibration: what each depends on, and what is done again."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +73,14 @@ def test_cameras_that_are_not_there_cost_no_time(
     with pytest.raises(ConfigError, match=f"has no camera .* to {purpose}; its cameras are cam0"):
         CameraSteps(job(room, tmp_path / "out", options)).find()
     assert not (tmp_path / "out").exists()
+
+
+def test_too_many_held_out_cost_no_time(room: Path, tmp_path: Path) -> None:
+    options = replace(NONE, held_out=("cam00", "cam01", "cam02"))
+    with pytest.raises(ConfigError, match="4 cameras, 3 of them held out; a reconstruction needs 2 or more"):
+        CameraSteps(job(room, tmp_path / "out", options)).find()
+    assert not (tmp_path / "out").exists()
+    CameraSteps(job(room, tmp_path / "out", replace(NONE, held_out=("cam00", "cam01")))).find()
 
 
 def test_too_few_cameras_claim_nothing(room: Path, tmp_path: Path) -> None:
@@ -153,3 +162,35 @@ def test_focal_lengths_that_pictures_state_are_told(tmp_path: Path) -> None:
     again = job(tmp_path, tmp_path / "out")
     run(again)
     assert again.told["calibrate"] == one.told["calibrate"]
+
+
+def test_a_calibration_of_two_files_is_read_again_when_the_second_changes(room: Path, tmp_path: Path) -> None:
+    """``extri.yml`` alone, as somebody corrects a pose there."""
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    for video in room.glob("*.mp4"):
+        (videos / video.name).hardlink_to(video)
+    names = sorted(video.stem for video in videos.glob("*.mp4"))
+    intri, extri = (["%YAML:1.0", "---", "names:", *(f'  - "{name}"' for name in names)] for _ in range(2))
+    for number, name in enumerate(names):
+        intri += matrix(f"K_{name}", 3, (150, 0, 80, 0, 150, 60, 0, 0, 1)) + matrix(f"D_{name}", 5, (0.0,) * 5)
+        extri += matrix(f"R_{name}", 1, (0.0,) * 3) + matrix(f"T_{name}", 1, (0.5 * number, 0.0, 0.0))
+    (videos / "intri.yml").write_text("\n".join(intri) + "\n")
+    (videos / "extri.yml").write_text("\n".join(extri) + "\n")
+    _, before = run(job(videos, tmp_path / "out"))
+    again = job(videos, tmp_path / "out")
+    run(again)
+    assert "calibrate" in again.steps.skipped
+    (videos / "extri.yml").write_text("\n".join(extri).replace("1.5, 0.0, 0.0", "2.5, 0.0, 0.0") + "\n")
+    _, after = run(job(videos, tmp_path / "out"))
+    assert float(before.cameras["cam03"].camera.viewmat[0, 3]) == 1.5
+    assert float(after.cameras["cam03"].camera.viewmat[0, 3]) == 2.5
+
+
+def matrix(key: str, columns: int, values: Sequence[float]) -> list[str]:
+    """A matrix as OpenCV's storage writes it; one column for vectors."""
+    rows, columns = (len(values) // columns, columns) if columns > 1 else (len(values), 1)
+    data = ", ".join(str(float(value)) for value in values)
+    return [
+        f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]",
+    ]  # fmt: skip

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -87,6 +88,40 @@ def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "masks" / "cam00" / "0.png").read_bytes() == b"mask"
     assert read_prepared(tmp_path / "out").near == 0.25
     assert one.told["bring"] == "4 cameras by hard link or copy"
+
+
+def test_masks_of_cameras_that_are_left_out_stay_behind(tmp_path: Path) -> None:
+    """In the first run, and where an earlier one with these cameras has brought them; what is another's stays."""
+    footage, _, content = made(tmp_path / "videos")
+    masks, brought = tmp_path / "videos" / "masks", tmp_path / "out" / "masks"
+    (masks / "cam01").mkdir(parents=True)
+    for name in ("cam00.png", "cam01.png", "cam01/0.png", "cam02.png"):
+        (masks / name).write_bytes(name.encode())
+    (tmp_path / "out").mkdir()
+    CaptureSteps(job(tmp_path / "videos", tmp_path / "out")).bring(footage, content)
+    assert (brought / "cam01" / "0.png").is_file()
+    (brought / "cam02.png").unlink()
+    (brought / "cam02.png").write_bytes(b"drawn by hand")
+    less = replace(NONE, without=("cam01", "cam02"))
+    for _ in range(2):
+        CaptureSteps(job(tmp_path / "videos", tmp_path / "out", less)).bring(footage, content)
+        assert sorted(entry.name for entry in brought.iterdir()) == ["cam00.png", "cam02.png"]
+    assert sorted(entry.name for entry in masks.iterdir()) == ["cam00.png", "cam01", "cam01.png", "cam02.png"]
+
+
+def test_another_mask_does_again_what_depends_on_it(tmp_path: Path) -> None:
+    _, steps, content = brought(tmp_path)
+    steps.points(content)
+    again, steps, content = brought(tmp_path)
+    steps.points(content)
+    assert again.steps.skipped == ["points"]
+    (tmp_path / "out" / "masks").mkdir()
+    mask = np.full((120, 160), 255, np.uint8)
+    mask[:60] = 0
+    assert cv2.imwrite(str(tmp_path / "out" / "masks" / "cam00.png"), mask)
+    again, steps, content = brought(tmp_path)
+    steps.points(content)
+    assert again.steps.skipped == []
 
 
 def test_a_near_plane_that_is_given_is_not_looked_for(tmp_path: Path) -> None:

@@ -135,3 +135,27 @@ def test_a_damaged_video_names_its_camera(tmp_path: Path) -> None:
     file.write_bytes(bytes(data))
     with pytest.raises(CaptureError, match=r"a\.mp4 of camera 'a' cannot be decoded .*--without a"):
         list(footage.pictures("a", range(40)))
+
+
+def test_what_a_mac_and_a_check_leave_is_no_footage(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_picture(tmp_path / "pictures" / name / "0.png", picture(0, 0))
+        (tmp_path / "pictures" / name / "._0.png").write_bytes(b"")
+        write_videos(tmp_path / "cards" / name, ["GX01"], frames=2)
+        (tmp_path / "cards" / name / "._GX01.mp4").write_bytes(b"")
+    write_picture(tmp_path / "pictures" / "report" / "camera_a.png", picture(0, 0))
+    pictures = find_footage(tmp_path / "pictures")
+    assert pictures.cameras == ("a", "b")
+    assert len(pictures.stamps("a")) == 1
+    assert find_footage(tmp_path / "cards").path("a").name == "GX01.mp4"
+
+
+def test_a_file_of_another_kind_is_not_lost_unnoticed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_videos(tmp_path, ["a", "b"], frames=2)
+    for name in ("c.AVI", "d.jpg", "notes.txt", "cameras.json"):
+        (tmp_path / name).write_bytes(b"")
+    with caplog.at_level(logging.WARNING):
+        assert find_footage(tmp_path).cameras == ("a", "b")
+    left = [record.getMessage().split(" is left out")[0].split("/")[-1] for record in caplog.records]
+    assert left == ["c.AVI", "d.jpg"]
+    assert "c.AVI is left out: it is not of the kind of" in caplog.text

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.preparation.linking import bring
+from structgstream.preparation.linking import Link, bring, drop_others, unbring
 
 
 def test_each_kind_of_link(tmp_path: Path) -> None:
@@ -57,3 +58,39 @@ def test_no_room_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match=r"cannot be brought to .*--link symlink"):
         bring(tmp_path / "a", tmp_path / "file" / "a", link="hard")
+
+
+@pytest.mark.parametrize("kind", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_copy_that_is_broken_off_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: BaseException
+) -> None:
+    def cut(source: Path, target: Path) -> None:
+        target.write_bytes(source.read_bytes()[:2])
+        raise kind
+
+    monkeypatch.setattr(shutil, "copy2", cut)
+    (tmp_path / "a").write_text("film")
+    with pytest.raises((StorageError, KeyboardInterrupt)):
+        bring(tmp_path / "a", tmp_path / "b" / "a", link="copy")
+    assert not list((tmp_path / "b").iterdir())
+
+
+def test_what_was_brought_and_is_no_more_goes(tmp_path: Path) -> None:
+    for name in ("0.png", "1.png"):
+        (tmp_path / name).write_text("film")
+    drop_others(tmp_path, ["1.png"])
+    assert [file.name for file in tmp_path.iterdir()] == ["1.png"]
+
+
+@pytest.mark.parametrize("link", ["hard", "symlink", "copy"])
+def test_what_was_brought_can_be_taken_back(tmp_path: Path, link: Link) -> None:
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / "0.png").write_text("mask")
+    bring(tmp_path / "cam", tmp_path / "out" / "cam", link=link)
+    (tmp_path / "out" / "cam" / "1.png").write_text("by hand")
+    unbring(tmp_path / "cam", tmp_path / "out" / "cam")
+    assert [file.name for file in (tmp_path / "out" / "cam").iterdir()] == ["1.png"]
+    (tmp_path / "out" / "cam" / "1.png").unlink()
+    unbring(tmp_path / "cam", tmp_path / "out" / "cam")
+    assert not (tmp_path / "out" / "cam").exists()
+    assert (tmp_path / "cam" / "0.png").is_file()

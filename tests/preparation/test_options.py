@@ -53,3 +53,9 @@ def test_numbers_that_cannot_be(value: float) -> None:
         PrepareOptions(fps=value)
     with pytest.raises(ConfigError, match="at least one instant"):
         PrepareOptions(instants=0)
+
+
+@pytest.mark.parametrize("degrees", [0.0, -5.0, 175.0, math.nan])
+def test_a_field_of_view_that_no_plane_has(degrees: float) -> None:
+    with pytest.raises(ConfigError, match="field of view of less than 175"):
+        PrepareOptions(field_of_view=degrees)

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from captures import write_videos
+from captures import write_picture, write_videos
+from planes import room_frame
 from rooms import write_room
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
 from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.preparation.capture_steps import CaptureSteps
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
 
@@ -41,6 +43,42 @@ def test_a_capture_is_made_once_and_only_what_changed_again(tmp_path: Path) -> N
     assert found.unit == "metres"
     one, other = (found.cameras[name].pinhole.center for name in ("cam00", "cam04"))
     assert float((one - other).norm()) == pytest.approx(2.0)
+
+
+def write_pictures(folder: Path, frames: int) -> None:
+    """The room as folders of pictures, a corner of which holds the frame's number."""
+    rig = write_room(folder, cameras=4)
+    for name, image in room_frame(rig).images.items():
+        (folder / f"{name}.mp4").unlink()
+        for frame in range(frames):
+            numbered = image.copy()
+            numbered[:10, :10] = 40 * frame
+            write_picture(folder / name / f"{frame:04d}.png", numbered)
+
+
+def carried(capture: Path) -> list[dict[str, int]]:
+    return [
+        {name: int(image[3, 3, 0]) // 40 for name, image in frame.images.items()}
+        for frame in open_capture(capture).frames()
+    ]
+
+
+def test_a_picture_that_lacks_is_no_other_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the first time, or deleted between two runs: its camera is absent there, and in step after it."""
+    monkeypatch.setattr(CaptureSteps, "points", lambda self, content: content)
+    monkeypatch.setattr(CaptureSteps, "check", lambda self, content: ())
+    options = replace(OPTIONS, near=0.3)
+    write_pictures(tmp_path / "videos", 5)
+    names = ("cam00", "cam01", "cam02", "cam03")
+    prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
+    assert carried(tmp_path / "out") == [dict.fromkeys(names, frame) for frame in range(5)]
+    (tmp_path / "videos" / "cam02" / "0003.png").unlink()
+    for out in ("out", "new"):
+        prepare_capture(tmp_path / "videos", tmp_path / out, options=options)
+        wanted = [dict.fromkeys(names, frame) for frame in range(5)]
+        del wanted[3]["cam02"]
+        assert carried(tmp_path / out) == wanted
+    assert (tmp_path / "videos" / "cam02" / "0004.png").is_file()
 
 
 def test_an_interrupted_preparation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

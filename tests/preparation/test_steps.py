@@ -111,3 +111,8 @@ def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:
     assert fingerprint(files) == before
     (tmp_path / "b" / "c").write_text("three")
     assert fingerprint(files) != before
+    (tmp_path / "b" / "d").mkdir()
+    (tmp_path / "b" / "d" / "e").write_text("four")
+    before = fingerprint(files)
+    (tmp_path / "b" / "d" / "e").write_text("deeper")
+    assert fingerprint(files) != before

@@ -41,17 +41,12 @@ class BoardCommand:
 def main(arguments: list[str]) -> None:
     """Writes the board and says how to name it to prepare."""
     options = parse_options(BoardCommand, "board", arguments=arguments)
-    from structgstream.errors import StorageError
     from structgstream.preparation.calibration.board_page import write_board_pdf
     from structgstream.preparation.options import board_text, parse_board
 
     with usage_errors():
         board = parse_board(f"{options.squares}:{options.square}:{options.dictionary}")
-        try:
-            options.output.parent.mkdir(parents=True, exist_ok=True)
-            write_board_pdf(options.output, board, options.paper)
-        except OSError as error:
-            raise StorageError(f"The board {options.output} cannot be written ({error.strerror}).") from None
+        write_board_pdf(options.output, board, options.paper)
     console = Console()
     told = (
         f"Wrote {options.output}: {board.text}, on {options.paper}. Print it at 100 %, and check its bar with a ruler."

@@ -122,10 +122,11 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
 
 
 def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
+    from structgstream.data.folder_files import REPORT
     from structgstream.preparation.checking.folder import check_folder
 
-    folder = options.videos / "report" if options.report is None else options.report
-    with step_display(console) as display:
+    folder = options.videos / REPORT if options.report is None else options.report
+    with interruptible(), step_display(console) as display:
         checked = check_folder(options.videos, report=folder, listener=display)
     say(console, f"Report: {folder / 'index.html'}")
     return checked.report.findings

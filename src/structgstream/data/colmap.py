@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential, finite
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
 from structgstream.errors import CalibrationError
 
@@ -74,6 +74,7 @@ def read_model(folder: Path) -> Calibration:
 
 
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:
+    params = tuple(map(finite, params))
     if len(params) != _parameters(model, where):
         raise ValueError(f"{len(params)} parameters of a {model}")
     fx, fy, cx, cy, *coefficients = (params[0], *params) if model in ONE_FOCAL_LENGTH else params

@@ -11,7 +11,7 @@ from structgstream.errors import CaptureError, MissingExtraError
 
 ORIENTATION, EXIF_IFD = 0x0112, 0x8769
 FOCAL_LENGTH, FOCAL_35MM = 0x920A, 0xA405
-PLANE_RESOLUTION, PLANE_UNIT, PIXELS_ACROSS = 0xA20E, 0xA210, 0xA002
+PLANE_RESOLUTION, PLANE_UNIT, PIXELS_ACROSS, PIXELS_DOWN = 0xA20E, 0xA210, 0xA002, 0xA003
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 """In the unit of the resolution of the focal plane: inch, and by common extension of TIFF centimetre, mm and µm."""
 DIAGONAL_35MM = math.hypot(36.0, 24.0)
@@ -83,8 +83,10 @@ def _by_plane(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     unit = MILLIMETRES.get(tags.get(PLANE_UNIT, 2))
     if length is None or resolution is None or unit is None:
         return None
-    taken = _number(tags.get(PIXELS_ACROSS)) or size[0]
-    return length * resolution / unit * size[0] / taken
+    across, down = _number(tags.get(PIXELS_ACROSS)), _number(tags.get(PIXELS_DOWN))
+    if across is not None and down is not None:  # The longer sides: what turns a picture seldom turns its tags.
+        return length * resolution / unit * max(size) / max(across, down)
+    return length * resolution / unit * size[0] / (across or size[0])
 
 
 def _number(value: object) -> float | None:

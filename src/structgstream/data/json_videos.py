@@ -18,7 +18,8 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
-from structgstream.data.calibration_files.reading import reason
+from structgstream.data.calibration_files.reading import positive, reason
+from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
@@ -41,7 +42,7 @@ def open_json_videos(path: Path) -> VideoSource:
     """
     file = path / FILE
     rig, fps, stated_frames = read_cameras(file)
-    videos = {video.stem: video for video in path.glob("*.mp4")}
+    videos = by_stem(files_of(path, (".mp4",)))
     check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
     source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
     if len(source) < stated_frames:
@@ -62,7 +63,7 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
     try:
         content: dict[str, Any] = json.loads(file.read_text())
         rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
-        return rig, float(content["fps"]) if "fps" in content else None, int(content.get("frames", 1))
+        return rig, positive(content, "fps") if "fps" in content else None, int(content.get("frames", 1))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise CaptureError(
             f"{file} cannot be read ({reason(error)}); expected width, height and cameras "
@@ -76,7 +77,7 @@ def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
         name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
         for name, entry in content["cameras"].items()
     }
-    near = float(content["near"]) if "near" in content else None
+    near = positive(content, "near") if "near" in content else None
     return calibrated_rig(cameras, content.get("held_out", ()), where=file, near=near)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import listed
+from structgstream.data.folder_files import by_stem, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
@@ -124,7 +125,7 @@ def with_masks(source: FrameSource, folder: Path) -> FrameSource:
         CaptureError: a mask of an unknown camera, of no frame, of another size, or in a lossy format.
     """
     found = sorted(folder.iterdir(), key=lambda entry: natural(entry.name)) if folder.is_dir() else []
-    entries = [entry for entry in found if entry.is_dir() or _is_mask(entry)]
+    entries = [entry for entry in found if not is_hidden(entry) and (entry.is_dir() or _is_mask(entry))]
     if not entries:
         return source
     names = {entry.name if entry.is_dir() else entry.stem: entry for entry in entries}
@@ -132,7 +133,7 @@ def with_masks(source: FrameSource, folder: Path) -> FrameSource:
         if name not in source.rig.cameras:
             raise CaptureError(
                 f"{entry} is a mask of camera {name!r}, which the capture {source.name} does not have; its cameras are "
-                f"{', '.join(source.rig)}."
+                f"{', '.join(source.rig)}. Rename or remove it."
             )
 
     def masked(stored: FrameSource) -> FrameSource:
@@ -155,6 +156,19 @@ def _has_lenses(source: FrameSource) -> bool:
     return isinstance(source, UndistortedSource) or (isinstance(source, SourceWrapper) and _has_lenses(source.source))
 
 
+def _masks(folder: Path) -> list[Path]:
+    return [file for file in sorted(folder.iterdir()) if file.is_file() and not is_hidden(file) and _is_mask(file)]
+
+
+def _instants(name: str, source: FrameSource) -> tuple[str, ...]:
+    """What the frames of a camera are called in its files; nothing for videos."""
+    while isinstance(source, SourceWrapper):
+        source = source.source
+    if not isinstance(source, ImageSource):
+        return ()
+    return source.instants or tuple("" if file is None else file.stem for file in source.files[name])
+
+
 def _is_mask(file: Path) -> bool:
     suffix = file.suffix.lower()
     if suffix in PICTURE_SUFFIXES - {".png"}:
@@ -164,22 +178,21 @@ def _is_mask(file: Path) -> bool:
 
 def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
     """The mask files of a camera, the first of which is checked."""
-    always = folder / f"{name}.png"
-    own = folder / name
-    files = {file.stem: file for file in own.iterdir() if _is_mask(file)} if own.is_dir() else {}
-    instants = source.instants if isinstance(source, ImageSource) else ()
+    always, own = by_stem(_masks(folder)).get(name), folder / name
+    files = by_stem(_masks(own)) if own.is_dir() else {}
+    instants = _instants(name, source)
     numbers = {instant: index for index, instant in enumerate(instants or map(str, range(len(source))))}
     if not instants:
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}
     frames = {numbers[stem]: file for stem, file in files.items() if stem in numbers}
     if files and not frames:
-        expected = f"{instants[0]}.png" if instants else "000000.png, the frame's number from 0"
+        expected = f"{next(filter(None, instants))}.png" if instants else "000000.png, the frame's number from 0"
         raise CaptureError(
             f"None of the masks in {own} is of a frame of the capture, such as {next(iter(files.values())).name}; "
             f"expected names such as {expected}."
         )
     size = (source.rig[name].width, source.rig[name].height)
-    masks = CameraMasks(size, always if always.is_file() else None, frames)
+    masks = CameraMasks(size, always, frames)
     for file in filter(None, (masks.always, next(iter(frames.values()), None))):
         read_mask(file, size=size, camera=name)
     return masks

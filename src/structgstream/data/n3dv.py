@@ -19,6 +19,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.aligned_points import aligned_points
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.colmap import find_model, read_model
+from structgstream.data.folder_files import files_of
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import VideoTrack, scan_videos
@@ -42,7 +43,7 @@ def open_n3dv(path: Path) -> VideoSource:
         CalibrationError: broken poses, not one pose per video, or a video of other proportions than its pose.
     """
     poses = _read_poses(path / POSES)
-    videos = sorted(path.glob("*.mp4"), key=lambda video: natural(video.stem))
+    videos = sorted(files_of(path, (".mp4",)), key=lambda video: natural(video.stem))
     if len(videos) != len(poses):
         raise CalibrationError(
             f"{path / POSES} has {len(poses)} poses, {path} has {len(videos)} mp4 files; expected one pose "

@@ -23,6 +23,7 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
+from structgstream.data.folder_files import REPORT, by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera
 from structgstream.data.picture_size import picture_size
@@ -42,7 +43,7 @@ STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estima
 REDUCED = ("images_2", "images_4", "images_8")
 # In the order in which they are looked through; the last but one are those of the CMU Panoptic toolbox.
 ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "", *REDUCED)
-MASKS = "masks"  # of ``masks.py``: no camera and no frame
+NO_CAMERAS = (*ROOTS, "masks", REPORT)  # of ``masks.py`` and of the check: no camera and no frame
 
 Of = TypeVar("Of")
 Pictures = Mapping[str, Mapping[str, Path]]  # camera, then instant
@@ -130,10 +131,14 @@ def of_pictures(
 
 
 def _files(root: Path, suffixes: Collection[str]) -> dict[str, Path]:
-    """Files of these kinds in a folder, by stem."""
+    """Files of these kinds in a folder, by stem.
+
+    Raises:
+        CaptureError: two have one.
+    """
     if not root.is_dir():
         return {}
-    return {file.stem: file for file in root.iterdir() if file.suffix.lower() in suffixes}
+    return by_stem(files_of(root, suffixes))
 
 
 def _videos(root: Path) -> dict[str, Path]:
@@ -144,7 +149,7 @@ def _folders(root: Path) -> dict[str, dict[str, Path]]:
     """Folders below ``root`` that hold pictures: folder name, then file stem."""
     if not root.is_dir():
         return {}
-    folders = (folder for folder in root.iterdir() if folder.is_dir() and folder.name not in (*ROOTS, MASKS))
+    folders = (folder for folder in root.iterdir() if folder.is_dir() and folder.name not in NO_CAMERAS)
     return {folder.name: pictures for folder in folders if (pictures := _files(folder, PICTURE_SUFFIXES))}
 
 

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import BROKEN, readable
+from structgstream.data.calibration_files.reading import BROKEN, positive, readable
+from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
-from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential, finite
 from structgstream.data.picture_size import picture_size
 from structgstream.data.source import FrameSource
-from structgstream.data.timeline import Clock, natural
+from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
 from structgstream.data.tone import ToneCurve, toned
 from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.video import synchronised
@@ -126,11 +127,11 @@ def read_prepared(path: Path) -> PreparedCapture:
             raise ValueError(f"unit {content['unit']!r}")
         return PreparedCapture(
             cameras={name: _read_camera(name, entry, file) for name, entry in entries.items()},
-            fps=float(content["fps"]),
-            near=float(content["near"]),
+            fps=positive(content, "fps"),
+            near=positive(content, "near"),
             unit=cast(Unit, content["unit"]),
             held_out=frozenset(content["held_out"]),
-            points=content["points"],
+            points=None if content["points"] is None else str(content["points"]),
         )
 
 
@@ -188,37 +189,38 @@ def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
 
 
 def pictures_of(folder: Path) -> tuple[Path, ...]:
-    """The pictures of a camera's folder, in the order of their names."""
-    files = (file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
-    return tuple(sorted(files, key=lambda file: natural(file.stem)))
+    """The pictures of a camera's folder, in the order of their names.
+
+    Raises:
+        CaptureError: two have one name.
+    """
+    return tuple(sorted(by_stem(files_of(folder, PICTURE_SUFFIXES)).values(), key=lambda file: natural(file.stem)))
 
 
 def _of_folders(
     path: Path, files: Mapping[str, Path], rig: CameraRig, capture: PreparedCapture, points: NDArray[np.float64] | None
 ) -> ImageSource:
-    """Folders of pictures at the capture's rate; clocks shift them by whole frames."""
+    """Folders of pictures at the capture's rate; clocks shift them by whole frames, and what lacks is absent."""
     found = {name: pictures_of(folder) for name, folder in files.items()}
     if empty := [name for name, pictures in found.items() if not pictures]:
         raise CaptureError(f"The folder {files[empty[0]]} of camera {empty[0]!r} has no pictures; restore them.")
     shifts = {name: round(capture.cameras[name].clock.offset_seconds * capture.fps) for name in rig}
-    first = max(shifts.values())
-    last = min(shifts[name] + len(pictures) for name, pictures in found.items())
-    if first >= last:
-        raise CaptureError(
-            f"The pictures of {path} have no instant in common by their clocks; prepare the capture again."
-        )
-    cut = {name: pictures[first - shifts[name] : last - shifts[name]] for name, pictures in found.items()}
-    for name, pictures in cut.items():
+    slots = {name: (own + shifts[name]).tolist() for name, own in picture_slots(found).items()}
+    common = common_slots(slots, where=str(path), label=lambda slot: f"instant {slot}", training=rig.training)
+    cut: dict[str, tuple[Path | None, ...]] = {}
+    for name, pictures in found.items():
+        picture_of = dict(zip(slots[name], pictures, strict=True))
+        cut[name] = tuple(picture_of.get(slot) for slot in common)
         size, own = picture_size(pictures[0]), (rig[name].width, rig[name].height)
         if size != own:
             raise CalibrationError(
                 f"The pictures of camera {name!r} in {files[name]} have {size[0]}x{size[1]} pixels, {path / FILE} is "
                 f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
             )
-    apart = {
-        name: np.full(last - first, capture.cameras[name].clock.offset_seconds - shift / capture.fps)
-        for name, shift in shifts.items()
-    }
+    apart = {}
+    for name, shift in shifts.items():
+        late = capture.cameras[name].clock.offset_seconds - shift / capture.fps
+        apart[name] = np.array([np.nan if file is None else late for file in cut[name]])
     return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=apart)
 
 
@@ -255,11 +257,13 @@ def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera
     try:
         width, height = (int(side) for side in entry["size"])
         filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
-        parameters = {key: float(value) for key, value in entry["lens"].items() if key != "model"}
+        parameters = {key: finite(value) for key, value in entry["lens"].items() if key != "model"}
         lens = LENSES[entry["lens"]["model"]](**parameters)
-        # Its principal point may lie anywhere.
-        pinhole = camera_of(entry["viewmat"], entry["pinhole"]["K"], entry["pinhole"]["size"])
-        clock = Clock(**{key: float(value) for key, value in entry["clock"].items()})
+        try:  # Its principal point may lie anywhere.
+            pinhole = camera_of(entry["viewmat"], entry["pinhole"]["K"], entry["pinhole"]["size"])
+        except CalibrationError as error:
+            raise CalibrationError(f"The pinhole of camera {name!r} of {file}: {error}") from None
+        clock = Clock(finite(entry["clock"]["offset_seconds"]), positive(entry["clock"], "rate"))
         tone = None if entry["tone"] is None else ToneCurve(entry["tone"])
         return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock, tone)
     except CalibrationError:

@@ -42,8 +42,7 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
     if degrees is None and isinstance(filmed.lens, Pinhole):
         return filmed.camera.resized(width, height)
     if degrees is not None:
-        if not 0 < degrees < 175:
-            raise ConfigError(f"A plane cannot show {degrees:g} degrees; give a field of view of less than 175.")
+        check_field_of_view(degrees)
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
         middle = np.zeros(2)
     else:
@@ -55,6 +54,15 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
     cx, cy = width / 2 - focal * middle[0], height / 2 - focal * middle[1]
     K = torch.tensor([[focal, 0, cx], [0, focal, cy], [0, 0, 1]], dtype=torch.float64)
     return replace(filmed.camera, K=K, width=width, height=height)
+
+
+def check_field_of_view(degrees: float) -> None:
+    """
+    Raises:
+        ConfigError: no angle across a plane.
+    """
+    if not 0 < degrees < 175:
+        raise ConfigError(f"A plane cannot show {degrees:g} degrees; give a field of view of less than 175.")
 
 
 def shows(filmed: LensCamera, normalised: Floats) -> NDArray[np.bool_]:

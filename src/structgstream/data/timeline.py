@@ -3,9 +3,11 @@
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,23 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts ``cam2`` before ``cam10``."""
     parts = [part for part in re.split(r"(\d+)", text) if part]
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts)
+
+
+def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, NDArray[np.intp]]:
+    """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending.
+
+    Cameras that share names of files number their pictures alike, so one that lacks a name lacks that instant. Where a
+    camera shares none with any other, each numbers as it likes, and pictures are counted.
+
+    Args:
+        pictures: camera name to its pictures, in :func:`natural` order of their stems, which differ.
+    """
+    stems = {name: [file.stem for file in files] for name, files in pictures.items()}
+    taken = Counter(stem for own in stems.values() for stem in own)
+    if not all(any(taken[stem] > 1 for stem in own) for own in stems.values()):
+        return {name: np.arange(len(own)) for name, own in stems.items()}
+    slot_of = {stem: slot for slot, stem in enumerate(sorted(taken, key=natural))}
+    return {name: np.array([slot_of[stem] for stem in own]) for name, own in stems.items()}
 
 
 def common_slots(

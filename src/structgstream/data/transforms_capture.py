@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from structgstream.data.calibration_files.reading import positive, readable
 from structgstream.data.calibration_files.transforms import WHOLE, Shot, find, read, read_shots
 from structgstream.data.posed import Calibration
 from structgstream.data.posed_capture import of_pictures, open_posed
@@ -44,8 +45,10 @@ def open_transforms(path: Path) -> FrameSource:
     held_out = [name for name, own in cameras.items() if own[0].held_out]
     calibration = Calibration(files[0], tuple(poses.values()), held_out=held_out)
     source, filmed = of_pictures(path, pictures, poses, root=path, calibration=calibration)
-    if (fps := json.loads(files[0].read_text()).get("fps")) is not None:
-        source = replace(source, fps=float(fps))
+    with readable(files[0], "fps as a number of frames a second"):
+        content = json.loads(files[0].read_text())
+        if content.get("fps") is not None:
+            source = replace(source, fps=positive(content, "fps"))
     return undistort(source, filmed)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The step that finds the cameras: structure from motion, a board, or the calibration of another tool."""
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,32 @@ def check_tone(method: str | Calibration, options: PrepareOptions) -> None:
         )
 
 
+def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
+    """
+    Raises:
+        ConfigError: something is asked for that has no effect, so that its user expects another capture.
+    """
+    if options.fps is not None and footage.tracks:
+        raise ConfigError(
+            f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
+            "pictures; leave out --fps."
+        )
+    if options.board_videos is not None and method != "board":
+        raise ConfigError(
+            "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
+        )
+    if options.intrinsics != "own" and method != "sfm":
+        raise ConfigError(
+            "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
+            "or leave them out."
+        )
+    if options.lens is not None and isinstance(method, Calibration) and not options.refine:
+        raise ConfigError(
+            f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
+            "the pictures, choose --calibration sfm, or leave out --lens."
+        )
+
+
 def check_board(method: str | Calibration, options: PrepareOptions) -> None:
     """
     Raises:
@@ -86,6 +113,15 @@ def from_other_tool(calibration: Calibration, footage: Footage) -> SolvedCalibra
     return SolvedCalibration(filmed, points, Observations(none, none, np.empty((0, 2)), none))
 
 
+def described(calibration: Calibration) -> list[object]:
+    """All that a result depends on of a calibration, whose files may be several: as JSON can hold it."""
+    cameras = [
+        (camera.name, camera.viewmat.tolist(), camera.K.tolist(), camera.size, repr(camera.lens))
+        for camera in calibration.cameras
+    ]
+    return [str(calibration.where), cameras, None if calibration.points is None else calibration.points.tolist()]
+
+
 def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibration:
     """The calibration itself.
 
@@ -97,7 +133,7 @@ def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibra
         raise CalibrationError(
             f"{listed(missing)} of {footage.where} could not be placed among the other {len(solved.cameras)}: their "
             "pictures have too little in common; move them closer to the others or show a board to all (structgstream "
-            f"board), or go on without: --without {' '.join(missing)}."
+            f"board), or go on without: --without {shlex.join(missing)}."
         )
     return solved
 

@@ -6,12 +6,13 @@ from dataclasses import asdict
 
 from structgstream.data.calibration import listed
 from structgstream.data.posed import Calibration
-from structgstream.data.timeline import Clock
+from structgstream.data.timeline import LEAST_CAMERAS, Clock
 from structgstream.data.tone import ToneCurve
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,
+    described,
     from_other_tool,
     packed,
     scaled,
@@ -59,6 +60,7 @@ class CameraSteps:
             () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
         )
         check_enough(footage)
+        self._check_trained(footage)
         claim(self.capture, self.videos)
         turns = turns_told(footage)
         self.listener.end("find", _described(footage) + (f"; {turns}" if turns else ""))
@@ -69,6 +71,15 @@ class CameraSteps:
         if unknown := [name for name in names if name not in footage.cameras]:
             raise ConfigError(
                 f"{self.videos} has no {listed(unknown)} to {purpose}; its cameras are {', '.join(footage.cameras)}."
+            )
+
+    def _check_trained(self, footage: Footage) -> None:
+        """Refuses to hold out more cameras than can be spared, before anything takes time."""
+        held_out = set(self.options.held_out) - {"auto"}
+        if len(footage.cameras) - len(held_out) < LEAST_CAMERAS:
+            raise ConfigError(
+                f"{self.videos} has {len(footage.cameras)} cameras, {len(held_out)} of them held out; a reconstruction "
+                f"needs {LEAST_CAMERAS} or more to train on: hold out fewer."
             )
 
     def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
@@ -86,7 +97,7 @@ class CameraSteps:
             "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
             "fps": footage.fps,
             "how": self.options.synchronize,
-            "calibration": method if isinstance(method, str) else fingerprint({"calibration": method.where}),
+            "calibration": method if isinstance(method, str) else described(method),
             "board": self.options.board_videos is not None,
         }
         return self._clocks("synchronize", inputs, find)
@@ -120,7 +131,7 @@ class CameraSteps:
         options = self.options
         name = method if isinstance(method, str) else method.where.name
         inputs = {
-            "method": method if isinstance(method, str) else fingerprint({"calibration": method.where}),
+            "method": method if isinstance(method, str) else described(method),
             "board": asdict(options.board),
             "lens": options.lens,
             "intrinsics": options.intrinsics,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import NEAR_IN_RIG_RADII
+from structgstream.data.folder_files import REPORT
 from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import open_capture
@@ -33,13 +34,12 @@ from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.job import Job
-from structgstream.preparation.linking import bring
+from structgstream.preparation.linking import bring, drop_others, unbring
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Stored
+from structgstream.preparation.steps import FOLDER, Stored, fingerprint
 from structgstream.similarity import rig_radius
 from structgstream.whole_files import whole_file
 
-REPORT = "report"
 POINTS = "points.npy"
 NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
 
@@ -65,12 +65,22 @@ class CaptureSteps:
             source = footage.path(name)
             bring(source, target / source.name if not footage.tracks and source.is_file() else target,
                   link=self.options.link)  # fmt: skip
-        if (self.videos / MASKS).is_dir():
-            for entry in sorted((self.videos / MASKS).iterdir()):
-                bring(entry, self.capture / MASKS / entry.name, link=self.options.link)
+            if not footage.tracks:
+                drop_others(target, [file.name for file in footage.stills[name]])
+        self._bring_masks()
         write_prepared(self.capture, content)
         how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
         self.listener.end("bring", f"{len(content.cameras)} cameras by {how}")
+
+    def _bring_masks(self) -> None:
+        """All but those of cameras that are left out, which go where an earlier run has brought them."""
+        folder = self.videos / MASKS
+        for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
+            target = self.capture / MASKS / entry.name
+            if (entry.name if entry.is_dir() else entry.stem) in self.options.without:
+                unbring(entry, target)
+            else:
+                bring(entry, target, link=self.options.link)
 
     def near(self, content: PreparedCapture) -> PreparedCapture:
         """With the near plane from the points that pictures confirm."""
@@ -83,7 +93,7 @@ class CaptureSteps:
 
         nearest = self.steps.run(
             "near",
-            {"content": _described(content)},
+            self._inputs(content),
             measure,
             pack=lambda found: Stored({"nearest": found}),
             unpack=lambda stored: stored.values["nearest"],
@@ -102,7 +112,7 @@ class CaptureSteps:
 
         found = self.steps.run(
             "points",
-            {"content": _described(content)},
+            self._inputs(content),
             estimate,
             pack=lambda points: Stored({}, {"points": points}),
             unpack=lambda stored: stored.arrays["points"],
@@ -129,7 +139,7 @@ class CaptureSteps:
             (self.capture / FOLDER / "check.json").unlink(missing_ok=True)
         return self.steps.run(
             "check",
-            {"content": _described(content)},
+            self._inputs(content),
             look,
             pack=lambda findings: Stored({"findings": [asdict(finding) for finding in findings]}),
             unpack=lambda stored: tuple(
@@ -139,6 +149,13 @@ class CaptureSteps:
             summary=lambda findings: f"{len(findings)} findings; {REPORT}/index.html",
             after=("points",),
         )
+
+    def _inputs(self, content: PreparedCapture) -> dict[str, object]:
+        """All that frames depend on, but for what was filmed."""
+        inputs: dict[str, object] = {"content": json.dumps(prepared_entries(content))}
+        if (masks := self.capture / MASKS).is_dir():
+            inputs["masks"] = fingerprint({"masks": masks})
+        return inputs
 
     def _source(self, content: PreparedCapture) -> FrameSource:
         """The capture, opened once: indexing videos takes time, and what is to be said of them is said once."""
@@ -195,8 +212,3 @@ def with_tones(content: PreparedCapture, curves: Mapping[str, ToneCurve]) -> Pre
     """The content with a curve for each camera that has one."""
     cameras = {name: replace(camera, tone=curves.get(name)) for name, camera in content.cameras.items()}
     return replace(content, cameras=cameras)
-
-
-def _described(content: PreparedCapture) -> str:
-    """All that frames depend on, but for the files themselves."""
-    return json.dumps(prepared_entries(content))

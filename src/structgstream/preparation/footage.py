@@ -13,16 +13,18 @@ import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
+from structgstream.data.folder_files import REPORT, files_of, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture
 from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import pictures_of
-from structgstream.data.timeline import natural
+from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos
 from structgstream.data.video_pictures import pictures_at
@@ -33,7 +35,11 @@ _log = logging.getLogger(__name__)
 PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
 SUBFOLDERS = ("", "videos", "images")
-NO_CAMERAS = (*SUBFOLDERS, "masks", "board")
+NO_CAMERAS = (*SUBFOLDERS, "masks", "board", REPORT)
+FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | {
+    ".360", ".3gp", ".avi", ".dng", ".heic", ".insv", ".m2ts", ".mpeg", ".mpg", ".mts", ".mxf", ".wmv",
+}  # fmt: skip
+"""What a camera may have written, also in ways that are not read here."""
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
 
 
@@ -83,7 +89,12 @@ class Footage:
         """Time ``[N]`` of every frame by the camera's own clock, seconds, ascending."""
         if (track := self.tracks.get(name)) is not None:
             return track.seconds
-        return np.arange(len(self.stills[name])) / self.picture_fps
+        return self._slots[name] / self.picture_fps
+
+    @cached_property
+    def _slots(self) -> Mapping[str, NDArray[np.intp]]:
+        """Which instant each picture is of, from 0 on."""
+        return picture_slots(self.stills)
 
     def pictures(self, name: str, indices: Sequence[int] | NDArray[np.intp]) -> Iterator[NDArray[np.uint8]]:
         """Pictures ``[H, W, 3]`` sRGB of frames of one camera, whose numbers ascend, at their stored size.
@@ -211,7 +222,7 @@ def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Foot
 
 def _found(root: Path) -> dict[str, Path]:
     """Files or folders of the cameras of ``root`` by name; nothing when there are none."""
-    entries = sorted(entry for entry in root.iterdir() if not entry.name.startswith("."))
+    entries = sorted(entry for entry in root.iterdir() if not is_hidden(entry))
     for suffixes in (VIDEO_SUFFIXES, PICTURE_SUFFIXES):
         found: dict[str, Path] = {}
         for entry in entries:
@@ -239,7 +250,14 @@ def _check_left(root: Path, entries: Sequence[Path], found: Mapping[str, Path]) 
     Raises:
         CaptureError: an empty folder beside those of cameras.
     """
+    taken = next(iter(found.values()))
     for entry in entries:
+        if entry.is_file() and entry.suffix.lower() in FILMED and entry not in found.values():
+            _log.warning(
+                "The file %s is left out: it is not of the kind of %s. If it is a camera's, convert it, keeping the "
+                "time of each frame.",
+                entry, taken,
+            )  # fmt: skip
         if not entry.is_dir() or entry.name in NO_CAMERAS or found.get(entry.name, root).is_relative_to(entry):
             continue
         if not any(entry.iterdir()):
@@ -249,14 +267,13 @@ def _check_left(root: Path, entries: Sequence[Path], found: Mapping[str, Path]) 
             )
         _log.warning(
             "The folder %s is left out: it holds no %s, as %s does. If it is a camera, give all of one kind.",
-            entry, "video" if next(iter(found.values())).suffix.lower() in VIDEO_SUFFIXES else "picture",
-            next(iter(found.values())),
+            entry, "video" if taken.suffix.lower() in VIDEO_SUFFIXES else "picture", taken,
         )  # fmt: skip
 
 
 def _of_folder(folder: Path, suffixes: Collection[str]) -> Path | None:
     """The one video in a camera's folder, or the folder itself when it holds pictures."""
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
+    files = files_of(folder, suffixes)
     if not files:
         return None
     if suffixes is PICTURE_SUFFIXES:

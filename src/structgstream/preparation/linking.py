@@ -3,6 +3,7 @@
 
 import os
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
@@ -37,6 +38,38 @@ def bring(source: Path, target: Path, *, link: Link) -> None:
         ) from None
 
 
+def drop_others(folder: Path, kept: Collection[str]) -> None:
+    """Removes what an earlier run has brought to ``folder`` and is no more among the files of the names ``kept``.
+
+    Raises:
+        StorageError: it cannot be removed.
+    """
+    for file in sorted(entry for entry in folder.iterdir() if entry.name not in kept and not entry.is_dir()):
+        _remove(file)
+
+
+def unbring(source: Path, target: Path) -> None:
+    """Removes what :func:`bring` has made of ``source``, a file or a folder of files; what is another's stays.
+
+    Raises:
+        StorageError: it cannot be removed.
+    """
+    if source.is_dir():
+        for file in sorted(entry for entry in source.iterdir() if entry.is_file()):
+            unbring(file, target / file.name)
+        if target.is_dir() and not any(target.iterdir()):
+            target.rmdir()
+    elif target.is_file() and any(_same(source, target, link) for link in ("hard", "symlink", "copy")):
+        _remove(target)
+
+
+def _remove(file: Path) -> None:
+    try:
+        file.unlink()
+    except OSError as error:
+        raise StorageError(f"{file} is of no camera now and cannot be removed ({error.strerror}); remove it.") from None
+
+
 def _bring_file(source: Path, target: Path, link: Link) -> None:
     if _same(source, target, link):
         return
@@ -52,8 +85,12 @@ def _bring_file(source: Path, target: Path, link: Link) -> None:
         except OSError:  # another file system, or one without links
             pass
     part = partial_path(target)
-    shutil.copy2(source, part)
-    give_name(part, target)
+    try:
+        shutil.copy2(source, part)
+        give_name(part, target)
+    except BaseException:  # a full disk is full of it
+        part.unlink(missing_ok=True)
+        raise
 
 
 def _same(source: Path, target: Path, link: Link) -> bool:

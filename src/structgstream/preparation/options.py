@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from structgstream.data.rectilinear import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.colmap import LensModel
@@ -75,6 +76,8 @@ class PrepareOptions:
             raise ConfigError(f"The near plane must be positive, got {self.near:g}.")
         if self.fps is not None and not 0 < self.fps < math.inf:
             raise ConfigError(f"Frames a second must be positive, got {self.fps:g}.")
+        if self.field_of_view is not None:
+            check_field_of_view(self.field_of_view)
         if self.instants < 1:
             raise ConfigError(f"Structure from motion needs at least one instant, got {self.instants}.")
 

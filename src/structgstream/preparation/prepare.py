@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from structgstream.data.folder_files import REPORT
 from structgstream.data.posed import Calibration
-from structgstream.preparation.calibrating import check_board, check_tone, chosen_method
+from structgstream.preparation.calibrating import check_board, check_tone, check_used, chosen_method
 from structgstream.preparation.camera_steps import CameraSteps
-from structgstream.preparation.capture_steps import REPORT, CaptureSteps, assembled, with_tones
+from structgstream.preparation.capture_steps import CaptureSteps, assembled, with_tones
 from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.claiming import alone
 from structgstream.preparation.footage import Footage
@@ -58,6 +59,7 @@ def prepare_capture(
     find = CameraSteps(job)
     footage = find.find()
     method = chosen_method(footage, options)
+    check_used(method, footage, options)
     check_tone(method, options)
     check_board(method, options)
     with alone(capture):

@@ -149,11 +149,13 @@ class Steps:
 
 
 def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
-    """What tells that files are the same without reading them: name, file, size and time of change of each."""
+    """What tells that files, and those of folders, are the same without reading them: name, file, size and time of
+    change of each."""
     found = []
     for name, path in files.items():
-        inside = sorted(path.iterdir()) if path.is_dir() else [path]
+        inside = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
         for file in inside:
             status = file.stat()
-            found.append((name, file.name, status.st_size, status.st_mtime_ns))
+            inner = file.relative_to(path).as_posix() if path.is_dir() else file.name
+            found.append((name, inner, status.st_size, status.st_mtime_ns))
     return found

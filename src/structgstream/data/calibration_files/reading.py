@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Broken files become one sentence that names file, camera and remedy."""
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from structgstream.data.posed import PosedCamera
 from structgstream.errors import CalibrationError
@@ -57,6 +58,18 @@ def each_camera(
     if not cameras:
         raise CalibrationError(f"{file} holds no cameras; expected {expected}.")
     return tuple(cameras)
+
+
+def positive(content: Mapping[str, Any], key: str) -> float:
+    """The number of a key.
+
+    Raises:
+        ValueError: it is not positive, or not finite.
+    """
+    number = float(content[key])
+    if not 0 < number < math.inf:
+        raise ValueError(f"{key} {number:g}")
+    return number
 
 
 def reason(error: Exception) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from structgstream.data.calibration_files.reading import each_camera, readable
 from structgstream.data.images import PICTURE_SUFFIXES
-from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential, finite
 from structgstream.data.picture_size import picture_size
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
 from structgstream.errors import CalibrationError
@@ -104,7 +104,7 @@ def _camera(name: str, frame: dict[str, Any], picture: Path, where: Path) -> Pos
 
 def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else str(frame.get("camera_model", "OPENCV"))
-    k1, k2, k3, k4, p1, p2 = (float(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, k3, k4, p1, p2 = (finite(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if model == "OPENCV_FISHEYE":
         return Fisheye(k1, k2, k3, k4)
     if model in PINHOLES or (model == "OPENCV" and not any((k1, k2, k3, k4, p1, p2))):

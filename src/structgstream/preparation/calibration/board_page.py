@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 from structgstream.data.images import opencv
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.preparation.calibration.board import Board
+from structgstream.whole_files import write_whole
 
 Paper = Literal["A4", "A3", "A2", "A1", "A0", "letter", "tabloid"]
 
@@ -48,6 +50,7 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
     Raises:
         ConfigError: the board does not fit the paper.
         MissingExtraError: matplotlib or cv2 is not installed.
+        StorageError: the file cannot be written.
     """
     width, height = board_page(board, paper)
     figure, canvas = _figure(width, height)
@@ -61,7 +64,9 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
         fontsize=6.5,
         va="bottom",
     )
-    canvas.print_pdf(path, metadata={"CreationDate": None, "Title": f"ChArUco board, {board.text}"})
+    content = BytesIO()
+    canvas.print_pdf(content, metadata={"CreationDate": None, "Title": f"ChArUco board, {board.text}"})
+    write_whole(path, content.getvalue(), called="The board", new_folder=True)
 
 
 def board_page(board: Board, paper: Paper) -> tuple[float, float]:

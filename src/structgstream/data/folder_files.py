@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a folder by kind, as all readers of folders look for them."""
+
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from structgstream.errors import CaptureError
+
+REPORT = "report"
+"""The folder that the check of a capture leaves in it, whose pictures are no camera's."""
+
+
+def is_hidden(path: Path) -> bool:
+    """Whether a file is none that was filmed: macOS leaves a ``._NAME`` beside each NAME on file systems of cards."""
+    return path.name.startswith(".")
+
+
+def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """The files of these kinds (lower-case suffixes, with the dot) in a folder, sorted by name, without hidden ones."""
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
+
+
+def by_stem(files: Iterable[Path]) -> dict[str, Path]:
+    """Files by their names without suffix.
+
+    Raises:
+        CaptureError: two have one name.
+    """
+    found: dict[str, Path] = {}
+    for file in files:
+        if file.stem in found:
+            raise CaptureError(
+                f"{found[file.stem].name} and {file.name} in {file.parent} are of one name, {file.stem!r}; expected "
+                "one file of each: move the other out of the folder."
+            )
+        found[file.stem] = file
+    return found
