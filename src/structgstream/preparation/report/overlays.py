@@ -104,6 +104,8 @@ def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
         for axis, pixels in ((left, pixels1), (right, pixels2)):
             axis.plot(*pixels[row], "o", color=color, markeredgecolor="white", markeredgewidth=0.8, markersize=6)
     text = f"{error.matches} matches, median distance to their lines {error.pixels:.2f} pixels"
+    if pair in examined.suspects.stray:
+        text += ": both cameras fit others, so most likely these matches are wrong"
     figure.suptitle("\n".join(textwrap.wrap(text, 110)), fontsize=10, color=INK)
     save_figure(figure, path)
 
