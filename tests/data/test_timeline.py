@@ -55,6 +55,11 @@ def test_a_hole_is_told_once_and_the_range_stays(caplog: pytest.LogCaptureFixtur
     assert messages(caplog) == ["take: camera 'b' lacks 2 of 5 frames, the first of them frame 2; it is absent there"]
 
 
+def test_of_many_cameras_with_holes_one_line_tells(caplog: pytest.LogCaptureFixture) -> None:
+    assert common(a=[0, 2, 3, 4], b=[0, 1, 4], c=[0, 1, 3, 4], d=[0, 1, 2, 3, 4]) == range(5)
+    assert messages(caplog) == ["take: 3 cameras lack some of 5 frames and are absent there: 'a' 1, 'b' 2, 'c' 1"]
+
+
 def test_the_range_ends_where_most_cameras_have_ended(caplog: pytest.LogCaptureFixture) -> None:
     whole = list(range(10))
     assert common(a=whole, b=whole, c=whole[:4], d=whole[:4]) == range(10)  # half of them still run

@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 
 LEAST_CAMERAS = 2
 """Training cameras that a frame needs: one picture does not say where things are."""
+MOST_SINGLE = 2
+"""Cameras that lack frames and get a line each; of more one line tells."""
 
 
 @dataclass(frozen=True)
@@ -139,9 +141,14 @@ def _tell_absences(
 ) -> None:
     """Warnings of absent cameras; ``slots`` are those of the range."""
     count = last - first + 1
+    gaps = {camera: sorted({*range(first, own[-1] + 1)}.difference(own)) for camera, own in slots.items()}
+    gaps = {camera: lacking for camera, lacking in gaps.items() if lacking}
+    if len(gaps) > MOST_SINGLE:
+        listed = ", ".join(f"{camera!r} {len(lacking)}" for camera, lacking in gaps.items())
+        log.warning("%s: %d cameras lack some of %d frames and are absent there: %s", where, len(gaps), count, listed)
+        gaps = {}
     for camera, own in slots.items():
-        lacking = sorted({*range(first, own[-1] + 1)}.difference(own))
-        if lacking:
+        if lacking := gaps.get(camera):
             log.warning(
                 "%s: camera %r lacks %d of %d frames, the first of them %s; it is absent there",
                 where, camera, len(lacking), count, label(lacking[0]),

@@ -65,6 +65,20 @@ def test_perturbed_poses_come_back_where_they_were() -> None:
     assert np.median(found.solved.errors()) < 0.3
 
 
+def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in five is held back until the refinement is accepted; what is returned is made from all."""
+    from structgstream.preparation.calibration import refinement
+
+    rig, pictures = filmed()
+    given = perturbed(rig, degrees=0.2, percent=0.5)
+    found = refine(pictures, given)
+    monkeypatch.setattr(refinement, "_completed", lambda graph, refined, terms, **options: refined)
+    judged = refine(pictures, given)
+    assert found.changed
+    assert (found.after_pixels, found.held_back) == (judged.after_pixels, judged.held_back)
+    assert len(found.solved.observations) > 1.15 * len(judged.solved.observations)
+
+
 def test_a_lens_that_was_not_known_is_found() -> None:
     rig, pictures = filmed()
     given = {name: replace(one, lens=RadialTangential(k1=-0.06)) for name, one in rig.items()}

@@ -222,9 +222,11 @@ def test_the_frame_that_is_looked_at_is_one_that_all_cameras_have() -> None:
     report = check_capture(MemoryCapture(rig, frames_without({"cam07": {0, 1}}, 4))).report
     assert report.frame > 1
     assert report.cameras["cam07"].points > 20
-    (found,) = [finding for finding in report.findings if finding.cameras == ("cam07",)]
-    assert found.severity == "warning"
-    assert "has no picture of frame 0" in found.sentence
+    dropped, start = [finding for finding in report.findings if finding.cameras == ("cam07",)]
+    assert (dropped.severity, start.severity) == ("warning", "warning")
+    assert "lacks 2 of 4 frames" in dropped.sentence
+    assert "has no picture of frame 0" in start.sentence
+    assert "begin with frame 2 (--start)" in start.sentence
 
 
 def test_cameras_without_a_frame_in_common_are_all_looked_at() -> None:
@@ -234,7 +236,9 @@ def test_cameras_without_a_frame_in_common_are_all_looked_at() -> None:
     assert all(camera.points > 20 for camera in report.cameras.values())
     told = [finding.sentence for finding in report.findings]
     assert any("Camera 'cam01' ends with frame" in sentence for sentence in told)
-    assert any("Camera 'cam00'" in sentence and "no picture of frame 0" in sentence for sentence in told)
+    assert any(
+        "Camera 'cam00' has no picture of frame 0" in sentence and "no frame has more" in sentence for sentence in told
+    )
 
 
 def test_a_few_wrong_matches_are_a_note() -> None:

@@ -59,3 +59,22 @@ def test_what_is_dropped_is_told_of_a_camera_that_ends_a_little_early() -> None:
     assert note.severity == "note"
     assert "lacks 3 of 295 frames" in warning.sentence
     assert "ends with" not in warning.sentence
+
+
+def test_of_many_cameras_that_drop_frames_one_warning_tells_and_says_with_which_frame_to_begin() -> None:
+    presence = {name: np.ones(20, bool) for name in "abcd"}
+    presence["a"][[0, 7]] = presence["b"][1] = presence["c"][[2, 9, 12]] = False
+    dropped, start = presence_findings(presence, 30.0)
+    assert (dropped.severity, dropped.cameras) == ("warning", ("c", "a", "b"))
+    assert "3 cameras lack some of 20 frames ('c' 3, 'a' 2, 'b' 1)" in dropped.sentence
+    assert (start.severity, start.cameras) == ("warning", ("a",))
+    assert "Camera 'a' has no picture of frame 0" in start.sentence
+    assert "begin with frame 3 (--start), which 4 of 4 cameras have" in start.sentence
+
+
+def test_where_no_frame_has_all_cameras_one_with_most_is_advised() -> None:
+    presence = {"a": np.array([False, False, False, True]), "b": np.array([True, True, True, False])}
+    presence |= {"c": np.array([False, True, True, True])}
+    *_, start = presence_findings(presence, 30.0)
+    assert start.cameras == ("a", "c")
+    assert "begin with frame 1 (--start), which 2 of 3 cameras have" in start.sentence

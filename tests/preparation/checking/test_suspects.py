@@ -37,6 +37,14 @@ def test_the_camera_that_disagrees_with_all_is_off_and_nobody_else() -> None:
     assert not found.everything
 
 
+def test_a_bad_pair_of_cameras_that_fit_others_is_stray() -> None:
+    errors = errors_of(6, ["cam4"]) | {("cam0", "cam1"): PairError(200.0, 0.9, 21)}
+    found = verdict(errors, 6)
+    assert found.off == ("cam4",)
+    assert found.stray == (("cam0", "cam1"),)
+    assert verdict(errors_of(6), 6).stray == ()
+
+
 def test_two_that_agree_with_each_other_only_are_both_off() -> None:
     errors = errors_of(7, ["cam1", "cam5"])
     errors["cam1", "cam5"] = GOOD

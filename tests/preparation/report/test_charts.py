@@ -46,6 +46,20 @@ def test_the_matrix_has_every_pair_on_both_sides_of_its_diagonal(drawn: Callable
     assert shown.get_clim() == (0, 4)
     texts = {(int(text.get_position()[0]), int(text.get_position()[1])): text.get_text() for text in axis.texts}
     assert texts == {(0, 1): "0.5", (1, 0): "0.5", (1, 2): "7.2", (2, 1): "7.2"}
+    assert "x:" not in axis.get_title(loc="left")
+
+
+@pytest.mark.parametrize("count", [3, 20])
+def test_pairs_of_wrong_matches_have_a_cross(drawn: Callable[..., Any], count: int) -> None:
+    names = [f"cam{number:02d}" for number in range(count)]
+    report = report_of(
+        dict.fromkeys(names, CameraCheck(None, None, 0, 0)),
+        (PairCheck(names[0], names[1], 40, 0.5, 0.0), PairCheck(names[1], names[2], 21, 90.0, 0.9)),
+    )
+    axis = drawn(charts.draw_matrix, report, limit_pixels=2.0, stray=[(names[1], names[2])]).axes[0]
+    crossed = {text.get_position() for text in axis.texts if "x" in text.get_text()}
+    assert crossed == {(1, 2), (2, 1)}
+    assert "wrong matches" in axis.get_title(loc="left")
 
 
 def test_colours_are_bars_of_the_cameras_that_were_compared(drawn: Callable[..., Any]) -> None:
@@ -63,18 +77,18 @@ def test_colours_are_bars_of_the_cameras_that_were_compared(drawn: Callable[...,
     assert high == -low
 
 
-def test_late_cameras_are_red_and_all_bars_fit(drawn: Callable[..., Any]) -> None:
-    late = {"a": 0.5, "b": -6.0, "c": 4.9, "d": 30.0}
+def test_surely_late_cameras_are_red_and_all_bars_fit(drawn: Callable[..., Any]) -> None:
+    late = {"a": 0.5, "b": -6.0, "c": 4.9, "d": 30.0, "e": 5.5}
     cameras = {
-        name: CameraCheck(None, None, 0, 0, offset_ms=offset, offset_uncertainty_ms=2.0)
+        name: CameraCheck(None, None, 0, 0, offset_ms=offset, offset_uncertainty_ms=4.0 if name == "e" else 2.0)
         for name, offset in late.items()
-    } | {"e": CameraCheck(None, None, 0, 0)}
+    } | {"f": CameraCheck(None, None, 0, 0)}
     axis = drawn(charts.draw_times, report_of(cameras)).axes[0]
     points = {
         to_hex(container.lines[0].get_color()): dict(zip(*map(list, container.lines[0].get_data()), strict=True))
         for container in axis.containers
     }
-    assert points == {to_hex(COLORS[0]): {0: 0.5, 2: 4.9}, to_hex(COLORS[3]): {1: -6.0, 3: 30.0}}
+    assert points == {to_hex(COLORS[0]): {0: 0.5, 2: 4.9, 4: 5.5}, to_hex(COLORS[3]): {1: -6.0, 3: 30.0}}
     low, high = axis.get_ylim()
     assert high > 34
     assert low == -high

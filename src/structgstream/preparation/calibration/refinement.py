@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError, ConfigError
+from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.calibration.coordinates import normalized
+from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
 from structgstream.preparation.calibration.posed_matches import epipolar_pixels
 from structgstream.preparation.calibration.solved import SolvedCalibration
@@ -56,7 +59,7 @@ class Refinement:
     Args:
         solved: refined cameras, in the coordinates of the given ones; these themselves if refining did not help.
         before_pixels: median distance of matches that were held back to the epipolar lines of the given cameras.
-        after_pixels: the same of the refined cameras.
+        after_pixels: the same of the refined cameras, before they are adjusted to these matches, too.
         held_back: number of these matches.
         changed: whether ``solved`` has refined cameras.
     """
@@ -82,7 +85,8 @@ def refine(
     """Adjust ``cameras`` to pictures of the same instants.
 
     One track in five is held back. Only if the refined cameras fit these better than the given ones do, they are
-    returned; they are moved, turned and scaled to lie as close to the given ones as they can.
+    returned, after a last adjustment to all tracks (adjustment.py); they are moved, turned and scaled to lie as close
+    to the given ones as they can.
 
     Args:
         free: what moves beside poses.
@@ -126,6 +130,12 @@ def refine(
     before, after = (_judged(graph, judges, which) for which in (cameras, result.cameras))
     count = sum(map(len, judges.values()))
     if after < before:
+        terms = _free_terms(free, lens)
+        if terms is not None:
+            everything = _completed(graph, result, terms, limits=Limits(limit, config.points.degrees), config=config)
+            everything = everything.aligned(rig_alignment(everything.cameras, cameras), metres=metres)
+            if _judged(graph, judges, everything.cameras) <= after:
+                result = everything
         return Refinement(result, before, after, count, True)
     _log.warning(
         "Refining does not help: matches that were held back are %.2f pixels off with the given cameras and %.2f with "
@@ -135,6 +145,39 @@ def refine(
     points, observations = observed(model, graph.keypoints, {name: index for index, name in enumerate(cameras)})
     return Refinement(
         SolvedCalibration(dict(cameras), points, observations, metres=metres), before, after, count, False
+    )
+
+
+def _free_terms(free: Free, lens: LensModel | None) -> tuple[int, ...] | None:
+    """The terms of ``lens_terms.py`` that move; None where it depends on the lens that each camera has."""
+    if free == "poses":
+        return ()
+    if free == "focal":
+        return (FOCAL, ASPECT)
+    if lens is None:
+        return None
+    return (FOCAL, ASPECT, *((ACROSS, DOWN) if free == "all" else ()), *DISTORTION[lens])
+
+
+def _completed(
+    graph: PosedGraph,
+    refined: SolvedCalibration,
+    terms: tuple[int, ...],
+    *,
+    limits: Limits,
+    config: RefinementConfig,
+) -> SolvedCalibration:
+    """``refined`` adjusted to all tracks, those that judged it included, with what alike lenses share."""
+    model = posed_model(graph, refined.cameras, pixels=limits.pixels, slack_degrees=config.points.slack_degrees)
+    filtered(model, pixels=limits.pixels, degrees=limits.degrees)
+    order = {name: index for index, name in enumerate(refined.cameras)}
+    points, observations = observed(model, graph.keypoints, order)
+    return adjust_together(
+        normalized(SolvedCalibration(refined.cameras, points, observations)),
+        lens=range(len(order)),
+        free=terms,
+        held=np.zeros(len(order), np.bool_),
+        limits=limits,
     )
 
 

@@ -16,6 +16,7 @@ from structgstream.preparation.checking.findings import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
 MOST_TRIED = 4  # frames, where pictures that should be there cannot be decoded
+MOST_SINGLE = 2  # cameras that drop frames and get a sentence each
 LOST_SECONDS, LOST_SHARE, MOST_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of the take
 
 
@@ -67,23 +68,33 @@ def note(frame: MultiViewFrame, presence: Presence) -> None:
 
 
 def presence_findings(presence: Presence, fps: float) -> list[Finding]:
-    """A warning for each camera that ends early, lacks frames, or has no picture of frame 0.
+    """A warning for each camera that ends early or has nothing, and for those that drop frames or lack frame 0.
 
-    Cameras are never stopped in the same instant: those that end within :func:`_slack` of the last one are told of in
-    one note, which says what all have.
+    Where many drop frames, as phones do, one warning has them all. Cameras are never stopped in the same instant: those
+    that end within :func:`_slack` of the last one are told of in one note, which says what all have.
     """
     ends = {name: int(np.flatnonzero(own)[-1]) + 1 for name, own in presence.items() if own.any()}
     slack = _slack(max(map(len, presence.values()), default=0), fps)
     early = {name: end for name, end in ends.items() if 0 < len(presence[name]) - end <= slack}
     findings = [_stopped(early, max(ends.values()), fps)] if early else []
     presence = {name: own[: early.get(name, len(own))] for name, own in presence.items()}
+    dropping = {name: gaps for name, own in presence.items() if len(gaps := np.flatnonzero(~own[: ends.get(name, 0)]))}
     for name, present in presence.items():
-        if present.all():
-            continue
-        told = f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
-        if present.any():
-            told = " ".join(_told(name, present, fps))
-        findings.append(Finding("warning", told, (name,)))
+        told = []
+        if not present.any():
+            told.append(
+                f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
+            )
+        if name in dropping and len(dropping) <= MOST_SINGLE:
+            told.append(_dropped(name, dropping[name], len(present), fps))
+        if 0 < ends.get(name, 0) < len(present):
+            told.append(_ended(name, ends[name], len(present), fps))
+        if told:
+            findings.append(Finding("warning", " ".join(told), (name,)))
+    if len(dropping) > MOST_SINGLE:
+        findings.append(_all_dropped(dropping, max(map(len, presence.values()))))
+    if late := tuple(name for name, own in presence.items() if own.any() and not own[0]):
+        findings.append(_without_start(late, presence))
     return findings
 
 
@@ -107,27 +118,50 @@ def _stopped(ends: Mapping[str, int], last: int, fps: float) -> Finding:
     )
 
 
-def _told(name: str, present: NDArray[np.bool_], fps: float) -> list[str]:
-    total, end = len(present), int(np.flatnonzero(present)[-1]) + 1
-    inside = np.flatnonzero(~present[:end])
-    told = []
-    if len(inside):
-        told.append(
-            f"Camera {name!r} lacks {len(inside)} of {total} frames, the first of them frame {inside[0]} "
-            f"({inside[0] / fps:.2f} s): it dropped or damaged them, and the others alone see what happens there; "
-            "film with a faster card or a lower data rate."
-        )
-    if end < total:
-        told.append(
-            f"Camera {name!r} ends with frame {end - 1} ({(end - 1) / fps:.2f} s) and is absent from the {total - end} "
-            "frames after that; use the frames before, or leave it out."
-        )
-    if not present[0]:
-        told.append(
-            f"Camera {name!r} has no picture of frame 0, from which a stream learns the scene; begin with frame "
-            f"{int(np.flatnonzero(present)[0])} (--start)."
-        )
-    return told
+def _dropped(name: str, gaps: NDArray[np.intp], total: int, fps: float) -> str:
+    return (
+        f"Camera {name!r} lacks {len(gaps)} of {total} frames, the first of them frame {gaps[0]} "
+        f"({gaps[0] / fps:.2f} s): it dropped or damaged them, and the others alone see what happens there; "
+        "film with a faster card or a lower data rate."
+    )
+
+
+def _all_dropped(dropping: Mapping[str, NDArray[np.intp]], total: int) -> Finding:
+    """What many cameras lack, those that lack most first."""
+    names = sorted(dropping, key=lambda name: -len(dropping[name]))
+    listed = ", ".join(f"{name!r} {len(dropping[name])}" for name in names)
+    return Finding(
+        "warning",
+        f"{len(names)} cameras lack some of {total} frames ({listed}): they dropped or damaged them, and the others "
+        "alone see what happens there; film with faster cards or a lower data rate.",
+        tuple(names),
+    )
+
+
+def _ended(name: str, end: int, total: int, fps: float) -> str:
+    return (
+        f"Camera {name!r} ends with frame {end - 1} ({(end - 1) / fps:.2f} s) and is absent from the {total - end} "
+        "frames after that; use the frames before, or leave it out."
+    )
+
+
+def _without_start(late: tuple[str, ...], presence: Presence) -> Finding:
+    """Which cameras lack frame 0, and with which frame to begin: the first that most cameras have."""
+    frames = min(map(len, presence.values()))
+    counts = np.sum([own[:frames] for own in presence.values()], axis=0)
+    first = int(counts.argmax())
+    names = f"Camera{'s' * (len(late) > 1)} {', '.join(map(repr, late))}"
+    advice = (
+        f"begin with frame {first} (--start), which {counts[first]} of {len(presence)} cameras have"
+        if first
+        else "no frame has more cameras"
+    )
+    return Finding(
+        "warning",
+        f"{names} {'have' if len(late) > 1 else 'has'} no picture of frame 0, from which a stream learns the scene; "
+        f"{advice}.",
+        late,
+    )
 
 
 def _read(source: FrameSource, index: int, presence: Presence) -> MultiViewFrame:

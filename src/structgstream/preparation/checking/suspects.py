@@ -35,6 +35,13 @@ class Suspects:
     limit_pixels: float
     everything: bool
 
+    @property
+    def stray(self) -> tuple[Pair, ...]:
+        """Bad pairs of cameras that fit others: most likely what is wrong there are the matches."""
+        if self.everything:
+            return ()
+        return tuple(pair for pair in self.bad if not set(pair) & set(self.off))
+
 
 def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> Suspects:
     """Names the cameras without which the poses explain the matches.

@@ -1,30 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Charts of a check: errors of pairs, coverage from above and from the side, colours, times."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import level_normal
+from structgstream.data.matching import Pair, level_normal
 from structgstream.figure import COLORS, FAINT, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.preparation.checking.check import Examination
 from structgstream.preparation.checking.findings import CheckReport
 from structgstream.preparation.checking.overlap import cameras_per_point
+from structgstream.preparation.checking.times import SIGMAS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LIMIT_MS = 5.0
+MOST_NUMBERED = 16  # cameras
 FAR_PERCENTILE = 97.0
 MOST_LABELS = 60
 LABEL_REACH = 0.06  # of the rig's radius: closer cameras share a label
 
 
-def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float) -> None:
-    """Median epipolar error of every pair; pairs without matches stay white.
+def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: Collection[Pair] = ()) -> None:
+    """Median epipolar error of every pair; pairs without matches stay white, pairs ``stray`` have a cross.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -47,17 +49,17 @@ def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float) -> None
     axis.grid(which="minor", color=FAINT, linewidth=0.6)
     axis.tick_params(which="both", length=0)
     axis.spines[:].set_visible(False)
-    if len(names) <= 16:
-        for row, column in zip(*np.nonzero(np.isfinite(values))):
+    crossed = {(names.index(one), names.index(other)) for pair in stray for one, other in (pair, pair[::-1])}
+    for row, column in zip(*np.nonzero(np.isfinite(values))):
+        told = [f"{values[row, column]:.1f}"] * (len(names) <= MOST_NUMBERED) + ["x"] * ((row, column) in crossed)
+        if told:
             dark = values[row, column] < 1.3 * limit_pixels
-            axis.text(
-                column, row, f"{values[row, column]:.1f}", ha="center", va="center", fontsize=7,
-                color="white" if dark else INK,
-            )  # fmt: skip
+            axis.text(column, row, " ".join(told), ha="center", va="center", fontsize=7, color="white" if dark else INK)
     bar = figure.colorbar(shown, ax=axis, shrink=0.7, pad=0.02, extend="max")
     bar.set_label("median distance to epipolar lines, pixels", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    axis.set_title("Error of each pair; white: no matches", fontsize=10, loc="left", color=INK)
+    crosses = "\nx: both cameras fit others, so most likely these are wrong matches" if crossed else ""
+    axis.set_title(f"Error of each pair; white: no matches{crosses}", fontsize=10, loc="left", color=INK)
     save_figure(figure, path)
 
 
@@ -77,7 +79,7 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
     points, counts = _within(points, counts, centers)
     radius = max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-9)
     figure = figure_of(11.0, 5.4)
-    label = f"{unit}" if unit == "metres" else "capture's units"
+    label = unit if unit == "metres" else "units of the capture"
     shown = None
     for axis, (across, up), title in zip(
         figure.subplots(1, 2), ((0, 1), (1, 2)), ("from above", "from the side"), strict=True
@@ -151,7 +153,7 @@ def draw_times(path: Path, report: CheckReport) -> None:
     names = list(known)
     values = np.array([camera.offset_ms for camera in known.values()], float)
     spread = np.array([camera.offset_uncertainty_ms or 0.0 for camera in known.values()], float)
-    late = np.abs(values) > LIMIT_MS
+    late = (np.abs(values) > LIMIT_MS) & (np.abs(values) >= SIGMAS * spread)  # as what is told of times
     figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
     axis = figure.subplots()
     axis.axhspan(-LIMIT_MS, LIMIT_MS, color="#e8f4ec", zorder=0)

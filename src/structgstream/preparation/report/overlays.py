@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from structgstream.data.matching import Pair, fundamental_matrix
+from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix
 from structgstream.figure import COLORS, INK, figure_of, save_figure
 from structgstream.preparation.checking.check import Examination
 from structgstream.preparation.checking.evidence import pair_errors
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 WIDTH_INCHES = 7.0
 MOST_POINTS = 400
 LINES = 7
+USUAL_PERCENTILE = 75  # of the matches of a pair, by their distance to their lines
 MOST_PAIRS = 6
 
 
@@ -86,11 +87,15 @@ def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
     first, second = (examined.cameras[name] for name in pair)
     pixels1, pixels2 = examined.evidence.pixels(pair)
     error = pair_errors(examined.evidence, examined.cameras)[pair]
-    chosen = _spread(pixels1, LINES)
+    fundamental = fundamental_matrix(first, second)
+    off = epipolar_errors(fundamental, pixels1, pixels2)
+    # Wrong matches lie at the rims, where they would be drawn before all others.
+    usual = np.flatnonzero(off <= np.percentile(off, USUAL_PERCENTILE))
+    chosen = usual[_spread(pixels1[usual], LINES)]
     share = first.height / first.width
     figure = figure_of(2 * WIDTH_INCHES * 0.8, 0.8 * WIDTH_INCHES * share + 0.6)
     left, right = figure.subplots(1, 2)
-    lines = np.column_stack([pixels1, np.ones(len(pixels1))]) @ fundamental_matrix(first, second).T
+    lines = np.column_stack([pixels1, np.ones(len(pixels1))]) @ fundamental.T
     for axis, name in ((left, pair[0]), (right, pair[1])):
         _picture(axis, examined, name)
         axis.set_title(name, fontsize=10, color=INK, loc="left")
@@ -104,6 +109,8 @@ def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
         for axis, pixels in ((left, pixels1), (right, pixels2)):
             axis.plot(*pixels[row], "o", color=color, markeredgecolor="white", markeredgewidth=0.8, markersize=6)
     text = f"{error.matches} matches, median distance to their lines {error.pixels:.2f} pixels"
+    if pair in examined.suspects.stray:
+        text += ": both cameras fit others, so most likely these matches are wrong"
     figure.suptitle("\n".join(textwrap.wrap(text, 110)), fontsize=10, color=INK)
     save_figure(figure, path)
 

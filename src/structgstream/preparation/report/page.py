@@ -58,14 +58,16 @@ def page(report: CheckReport, *, off: Sequence[str], sections: Mapping[str, Sequ
 
 
 def _facts(report: CheckReport) -> str:
-    unit = f" {report.unit}" if report.unit == "metres" else " units of the capture"
+    radius = f"{report.rig_radius:.3g}"
+    unit = ("metre" if report.unit == "metres" else "unit") + "s" * (radius != "1")
+    unit += "" if report.unit == "metres" else " of the capture"
     nearest = "" if report.nearest is None else f", nearest points at {report.nearest:.3g}"
     coverage = report.coverage
     matched = sum(pair.matches > 0 for pair in report.pairs)
     median = report.median_epipolar_pixels
     error = "no pair has matches" if median is None else f"median error of {matched} pairs {median:.2f} pixels"
     return (
-        f"{len(report.cameras)} cameras within {report.rig_radius:.3g}{unit} of their middle; {error}; near plane at "
+        f"{len(report.cameras)} cameras within {radius} {unit} of their middle; {error}; near plane at "
         f"{report.near:.3g}{nearest}; {coverage.points} points, {coverage.seen_by_three:.0%} of them seen by three "
         "cameras or more."
     )

@@ -37,7 +37,8 @@ def write_report(folder: Path, checked: Checked, *, listener: Listener | None = 
         listener.progress(len(examined.cameras) + number, total, "epipolar lines")
         lines.append(f"lines_{number}.png")
         draw_epipolar(folder / lines[-1], examined, pair)
-    draw_matrix(folder / "pairs.png", report, limit_pixels=examined.suspects.limit_pixels)
+    suspects = examined.suspects
+    draw_matrix(folder / "pairs.png", report, limit_pixels=suspects.limit_pixels, stray=suspects.stray)
     draw_coverage(folder / "coverage.png", examined, near=report.near, unit=report.unit or "")
     charts = []
     if any(camera.offset_ms is not None for camera in report.cameras.values()):
