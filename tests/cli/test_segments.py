@@ -17,6 +17,7 @@ from structgstream.cli import main, segment_options
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.cloud_store import CloudStore
+from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 
@@ -132,7 +133,9 @@ def test_publishing_to_s3(
         monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
         assert main([*command, "--resume"]) == 0
         remote = CloudStore(url, **options)
-        assert remote.names() == FolderStore(out).names()
+        here = FolderStore(out)
+        replaced = stale_files(read_manifest(here), here.names())
+        assert here.names() - replaced <= remote.names() <= here.names()
         write_archive(remote, tmp_path / "a.sgs")
     assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
     assert main(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs"), "--publish", url]) == 2

@@ -12,6 +12,7 @@ from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.cloud_store import CloudStore
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
+from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.errors import MissingExtraError, StorageError, StreamError
 
@@ -79,7 +80,8 @@ def test_an_outage_of_s3_costs_nothing(server: Emulator, tmp_path: Path) -> None
     again.copy_all()
     assert again.finish(wait_seconds=60) == 0
     store = s3(server, "outage")
-    assert store.names() == here.names()
+    replaced = stale_files(read_manifest(here), here.names())
+    assert here.names() - replaced <= store.names() <= here.names()
     write_archive(store, tmp_path / "a.sgs")
     assert (tmp_path / "a.sgs").read_bytes() == as_file(SENT)
 
