@@ -66,7 +66,11 @@ def test_ctrl_c_that_a_library_loses(
 
     monkeypatch.setattr(f"structgstream.preparation.{told}", lost)
     monkeypatch.chdir(tmp_path)
-    assert main(["prepare", str(tmp_path), *arguments]) == 130
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # Runs in the background may ignore it.
+    try:
+        assert main(["prepare", str(tmp_path), *arguments]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
