@@ -33,8 +33,9 @@ COARSEST = 8.0
 class ThinBirthConfig:
     """A second sweep, for thin and faint content such as a stream of water, in frames in which the first bears nothing.
 
-    Its fields replace those of :class:`BirthConfig`: finer pictures, every ray, lower thresholds. By these rules,
-    something large would be born of many small Gaussians, which follow it worse than few large ones and cost more.
+    Its fields replace those of the same names of :class:`BirthConfig`: finer pictures, every ray, lower thresholds. By
+    these rules something large would be born of many small Gaussians, which follow it worse than few large ones do and
+    cost more.
     """
 
     enabled: bool = False
@@ -86,17 +87,7 @@ class BirthConfig:
     @property
     def for_thin(self) -> "BirthConfig":
         """The rules of the second sweep."""
-        thin = self.thin
-        return replace(
-            self,
-            picture_width=thin.picture_width,
-            missing_threshold=thin.missing_threshold,
-            pixel_step=thin.pixel_step,
-            most_contradictions=thin.most_contradictions,
-            most_cost=thin.most_cost,
-            least_hits=thin.least_hits,
-            most_missing_share=thin.most_missing_share,
-        )
+        return replace(self, **vars(self.thin))
 
 
 @dataclass(frozen=True)
