@@ -146,7 +146,7 @@ class CaptureSteps:
                 Finding(found["severity"], found["sentence"], tuple(found["cameras"]))
                 for found in stored.values["findings"]
             ),
-            summary=lambda findings: f"{len(findings)} findings; {REPORT}/index.html",
+            summary=lambda findings: f"{len(findings)} finding{'s' * (len(findings) != 1)}; {REPORT}/index.html",
             after=("points",),
         )
 

@@ -162,6 +162,15 @@ def test_points_of_another_unit_are_told() -> None:
     assert "1000 times too large (millimetres among metres)" in sentence
 
 
+def test_points_that_were_estimated_with_a_camera_of_another_unit_are_not_told_beside_it() -> None:
+    def mistake(cameras: Cameras) -> None:
+        cameras["cam03"] = moved(cameras["cam03"], 1000.0)
+
+    points = 1000 * np.random.default_rng(0).uniform([-0.5, -0.4, 0.3], [0.5, 0.6, 1.5], (200, 3))
+    (found,) = checked(mistake, points=points).report.errors
+    assert found.cameras == ("cam03",)
+
+
 def test_exposure_is_measured() -> None:
     """Cameras of ``planes`` have gains of sRGB values; halving one in linear light is a stop."""
     rig, frame = room()

@@ -38,6 +38,7 @@ from structgstream.preparation.steps import Listener, Silent
 from structgstream.preparation.synchronization import SynchronizationCheck
 
 LEAST_TIMED = 3  # cameras, for times that can be compared
+FAR_AWAY = 30.0  # radii of the rig: a camera that stands further away is in another unit
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,8 @@ def check_capture(
     radius = _radius(first.cameras, first.suspects)
     if not first.suspects.everything:
         seen = {name: cameras[name] for name in first.cameras}  # with the near plane of now
-        findings += scale_findings(depths, source.points, seen, radius=radius, unit=unit)
+        points = None if _any_far_away(first.cameras, first.suspects, radius) else source.points
+        findings += scale_findings(depths, points, seen, radius=radius, unit=unit)
     findings += color_findings(first.colors)
     listener.progress(1, 3, "last frame")
     if (end := len(source) - 1) > first.frame.index:
@@ -168,9 +170,21 @@ def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationC
 
 def _radius(cameras: Mapping[str, Camera], suspects: Suspects) -> float:
     """Largest distance of a camera that is not off to the middle of these."""
-    off = () if suspects.everything else suspects.off
-    centers = np.stack([camera.center.numpy() for name, camera in cameras.items() if name not in off])
+    centers = _sound_centers(cameras, suspects)
     return float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+
+
+def _any_far_away(cameras: Mapping[str, Camera], suspects: Suspects, radius: float) -> bool:
+    """Whether a camera that is off stands as in another unit: points that were estimated with it are as wrong."""
+    middle = _sound_centers(cameras, suspects).mean(0)
+    far = [float(np.linalg.norm(cameras[name].center.numpy() - middle)) for name in suspects.off]
+    return max(far, default=0.0) > FAR_AWAY * radius
+
+
+def _sound_centers(cameras: Mapping[str, Camera], suspects: Suspects) -> np.ndarray:
+    """Of the cameras that are not off, ``[C, 3]``; of all where all look off."""
+    off = () if suspects.everything else suspects.off
+    return np.stack([camera.center.numpy() for name, camera in cameras.items() if name not in off])
 
 
 def _solid_points(tracks: Tracks) -> np.ndarray:
