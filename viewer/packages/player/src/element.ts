@@ -301,7 +301,7 @@ export class StructgstreamPlayer extends HTMLElement {
   private described(source: string): SourceDescription {
     if (source.startsWith("#")) {
       const text = document.getElementById(source.slice(1))?.textContent;
-      return { kind: "base64", text: text ?? "", name: `The page's ${source}` };
+      return { kind: "base64", text: text ?? "", name: "The page's stream" };
     }
     return this.sourceAt(new URL(source, document.baseURI), false);
   }

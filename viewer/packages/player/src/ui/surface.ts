@@ -108,7 +108,7 @@ export class Surface {
     this.closePanel();
     this.playButton = undefined;
     this.notes.say("", 0);
-    this.notes.loading(0, undefined, `Opening ${name}`);
+    this.notes.loading(0, undefined, `Opening ${name.replace(/^The /, "the ")}`);
     if (this.options.player.engine) this.bar.timeline.attach(this.options.player.engine);
   }
 

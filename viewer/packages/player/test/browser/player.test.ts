@@ -503,6 +503,17 @@ describe.skipIf(!executable)("the player in a browser", () => {
     await ask(page, (player) => player.seek(0.3));
     await shows(page, 9);
     expect(stage.server.rangesOf("/clip.sgs")).toEqual([]);
+    const said = await page.evaluate(async () => {
+      const other = document.createElement("structgstream-player");
+      other.setAttribute("src", "#stream");
+      document.body.append(other);
+      const text = () => other.shadowRoot!.querySelector("progress + p")?.textContent;
+      while (!text()) await Promise.resolve();
+      const first = text();
+      other.remove();
+      return first;
+    });
+    expect(said).toBe("Opening the page's stream");
     await page.evaluate(async (text) => {
       const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
       const transfer = new DataTransfer();
