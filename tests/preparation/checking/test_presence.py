@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras that drop frames, die, or begin late, as files state it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from captures import picture, small_rig, write_video
+from structgstream.data.timeline import Clock
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.data.wrappers import WithoutPoints
-from structgstream.preparation.checking.presence import presence_findings, stated_presence, whole_frame
+from structgstream.preparation.checking.presence import (
+    passed_frames,
+    presence_findings,
+    stated_presence,
+    whole_frame,
+)
 
 
 def test_what_files_state_without_decoding(tmp_path: Path) -> None:
@@ -25,10 +32,34 @@ def test_what_files_state_without_decoding(tmp_path: Path) -> None:
     for name in rig:
         np.testing.assert_array_equal(np.flatnonzero(presence[name]), list(taken[name]))
     assert whole_frame(source, presence).index == 0
+    assert passed_frames(source) == {}
     first, second = presence_findings(presence, source.fps)
     assert (first.severity, first.cameras) == ("warning", (list(rig)[1],))
     assert "lacks 2 of 8 frames, the first of them frame 2 (0.07 s)" in first.sentence
     assert "ends with frame 4 (0.13 s) and is absent from the 3 frames after that" in second.sentence
+
+
+def test_a_slow_clock_drops_nothing(tmp_path: Path) -> None:
+    """Pictures of two cameras come later and later: some frame has none that is nearest. ``lossy`` lacks one more."""
+    rig = small_rig(6)
+    slow, lossy = list(rig)[4:]
+    taken: dict[str, Sequence[int]] = dict.fromkeys(rig, range(110))
+    taken[lossy] = [frame for frame in range(110) if frame != 8]
+    for number, name in enumerate(rig):
+        pictures = [picture(number, frame) for frame in taken[name]]
+        write_video(tmp_path / f"{name}.mp4", pictures, instants=list(taken[name]))
+    tracks = scan_videos({name: tmp_path / f"{name}.mp4" for name in rig})
+    clocks = {name: Clock(rate=1.01) if name in (slow, lossy) else Clock() for name in rig}
+    source = synchronised(tracks, rig, where=tmp_path, clocks=clocks)
+    presence, passed = stated_presence(source), passed_frames(source)
+    (at,) = passed[slow]
+    assert 20 < at < 90
+    assert {name: list(frames) for name, frames in passed.items()} == {slow: [at], lossy: [at]}
+    told, dropped = presence_findings(presence, source.fps, passed=passed)
+    assert (told.severity, told.cameras) == ("note", (slow, lossy))
+    assert f"{slow!r} 1, the first at {at / source.fps:.2f} s" in told.sentence
+    assert (dropped.severity, dropped.cameras) == ("warning", (lossy,))
+    assert "lacks 1 of" in dropped.sentence
 
 
 @pytest.mark.parametrize("present", [[True] * 3, [False] * 3])

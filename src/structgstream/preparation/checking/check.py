@@ -25,6 +25,7 @@ from structgstream.preparation.checking.overlap import coverage, overlap_finding
 from structgstream.preparation.checking.presence import (
     Presence,
     note,
+    passed_frames,
     presence_findings,
     stated_presence,
     whole_frame,
@@ -135,7 +136,7 @@ def check_capture(
         last = next(source.frames(end))
         note(last, presence)
         findings += bump_findings(first.frame, last, first.evidence, first.cameras)
-    findings += presence_findings(presence, source.fps)
+    findings += presence_findings(presence, source.fps, passed=passed_frames(source))
     listener.progress(2, 3, "times")
     times = _measured_times(source, first.suspects)
     findings += time_findings(times)

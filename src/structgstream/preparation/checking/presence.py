@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cameras have a picture of which frame, and a frame in which all have one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +36,19 @@ def stated_presence(source: FrameSource) -> Presence:
     }
 
 
+def passed_frames(source: FrameSource) -> dict[str, NDArray[np.intp]]:
+    """By camera of videos, the frames that it lacks although it dropped no picture.
+
+    A clock that runs slow makes pictures later and later beside the frames, so that now and then none is nearest to a
+    frame: the pictures before and after it follow each other in the file at the usual interval.
+    """
+    inner = unwrapped(source)
+    if not isinstance(inner, VideoSource):
+        return {}
+    found = {name: _passed(own[: len(source)], inner.tracks[name].stamps) for name, own in inner.stamps.items()}
+    return {name: frames for name, frames in found.items() if len(frames)}
+
+
 def whole_frame(source: FrameSource, presence: Presence) -> MultiViewFrame:
     """The first frame of which all cameras have a picture.
 
@@ -67,18 +80,31 @@ def note(frame: MultiViewFrame, presence: Presence) -> None:
         present[frame.index] = name in frame.images
 
 
-def presence_findings(presence: Presence, fps: float) -> list[Finding]:
+def presence_findings(
+    presence: Presence, fps: float, *, passed: Mapping[str, NDArray[np.intp]] | None = None
+) -> list[Finding]:
     """A warning for each camera that ends early or has nothing, and for those that drop frames or lack frame 0.
 
     Where many drop frames, as phones do, one warning has them all. Cameras are never stopped in the same instant: those
-    that end within :func:`_slack` of the last one are told of in one note, which says what all have.
+    that end within :func:`_slack` of the last one are told of in one note, which says what all have. Another one has
+    those whose clocks run slow.
+
+    Args:
+        presence: by camera, whether it has a picture of each frame.
+        fps: frames a second.
+        passed: what cameras lack without having dropped it, see :func:`passed_frames`.
     """
+    passed = passed or {}
     ends = {name: int(np.flatnonzero(own)[-1]) + 1 for name, own in presence.items() if own.any()}
     slack = _slack(max(map(len, presence.values()), default=0), fps)
     early = {name: end for name, end in ends.items() if 0 < len(presence[name]) - end <= slack}
     findings = [_stopped(early, max(ends.values()), fps)] if early else []
     presence = {name: own[: early.get(name, len(own))] for name, own in presence.items()}
-    dropping = {name: gaps for name, own in presence.items() if len(gaps := np.flatnonzero(~own[: ends.get(name, 0)]))}
+    if passed:
+        findings.append(_slow(passed, fps))
+    lacking = {name: np.flatnonzero(~own[: ends.get(name, 0)]) for name, own in presence.items()}
+    lacking = {name: np.setdiff1d(gaps, passed.get(name, [])) for name, gaps in lacking.items()}
+    dropping = {name: gaps for name, gaps in lacking.items() if len(gaps)}
     for name, present in presence.items():
         told = []
         if not present.any():
@@ -96,6 +122,29 @@ def presence_findings(presence: Presence, fps: float) -> list[Finding]:
     if late := tuple(name for name, own in presence.items() if own.any() and not own[0]):
         findings.append(_without_start(late, presence))
     return findings
+
+
+def _passed(own: Sequence[int | None], stamps: Sequence[int]) -> NDArray[np.intp]:
+    """Of the ``own`` stamps of frames the gaps in which the file, with all ``stamps``, lacks no picture."""
+    frames = np.flatnonzero([stamp is not None for stamp in own])
+    if len(frames) < 2:
+        return np.empty(0, np.intp)
+    taken = np.array([stamp for stamp in own if stamp is not None])
+    lost = np.round(np.diff(taken) / np.median(np.diff(stamps))) - 1
+    whole = np.flatnonzero((np.diff(frames) > 1) & (lost <= 0))
+    return np.concatenate([np.arange(frames[at] + 1, frames[at + 1]) for at in whole] or [np.empty(0, np.intp)])
+
+
+def _slow(passed: Mapping[str, NDArray[np.intp]], fps: float) -> Finding:
+    listed = ", ".join(
+        f"{name!r} {len(frames)}, the first at {frames[0] / fps:.2f} s" for name, frames in passed.items()
+    )
+    return Finding(
+        "note",
+        f"Frames without a picture of cameras that dropped none: {listed}. Their clocks run slower than those of the "
+        "others, so that their pictures pass from one frame to the next.",
+        tuple(passed),
+    )
 
 
 def _slack(frames: int, fps: float) -> int:
