@@ -38,10 +38,10 @@ def change_of(scene: Scene, before: Scene) -> torch.Tensor:
     return change[0]
 
 
-def on_grid(scene: Scene) -> Scene:
+def on_grid(scene: Scene, step: float = 1 / 1024) -> Scene:
     """``scene`` with the biases of a stream's, multiples of a step."""
     head = scene.mlps.color
-    biases = (head.b2 * 1024).round() / 1024
+    biases = (head.b2 / step).round() * step
     return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
 
 
@@ -63,6 +63,31 @@ def test_the_same_light_keeps_every_bit() -> None:
     assert followed(WORLD.scene, views_of(WORLD, np.zeros(3))) is WORLD.scene
     faint = LightConfig(enabled=True, picture_scale=1.0, least_change=0.05)
     assert followed(WORLD.scene, views_of(WORLD, np.full(3, 0.03)), config=faint) is WORLD.scene
+
+
+def test_light_that_has_changed_is_followed_in_small_steps() -> None:
+    """What is too little to begin with is followed afterwards."""
+    first = on_grid(WORLD.scene)
+    config = replace(CONFIG, least_change=0.04, least_further_change=0.015)
+    reference = light_reference(first, views_of(WORLD, np.zeros(3)), config=config)
+
+    def light(scene: Scene, change: float, step: float = 1 / 1024) -> Scene:
+        return with_light_of(scene, views_of(WORLD, np.full(3, change)), reference, config=config, step=step)
+
+    assert light(first, -0.03) is first
+    dark = light(first, -0.06)
+    assert light(dark, -0.066) is dark
+    darker = light(dark, -0.09)
+    assert float((change_of(dark, first) - change_of(darker, first)).min()) > 0.015
+    assert light(darker, -0.09) is darker
+
+
+def test_a_change_of_less_than_half_a_step_changes_nothing() -> None:
+    first, config = on_grid(WORLD.scene, step=1 / 16), replace(CONFIG, least_change=0.005)
+    reference = light_reference(first, views_of(WORLD, np.zeros(3)), config=config)
+    faint = views_of(WORLD, np.full(3, -0.02))
+    assert with_light_of(first, faint, reference, config=config, step=1 / 1024) is not first
+    assert with_light_of(first, faint, reference, config=config, step=1 / 16) is first
 
 
 def test_light_that_returns_to_frame_0s_returns_its_bits() -> None:

@@ -12,6 +12,10 @@ F_c's colours are c = sigmoid(x), so a change d of the biases changes a picture 
 (1 - c). In each view d is fitted by least squares to the difference of the two pictures; the median over the views
 leaves out cameras that correct their own exposure. The fit is against the pictures of frame 0, not against renderings
 or the last frame, so errors do not accumulate and renderings' own errors do not enter.
+
+Where the light is steady, the estimate still wavers by up to half of ``least_change``, and what would follow that
+flickers. Where it fades, coarse steps show and lag behind. So the first step takes a large change, and later ones small
+changes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +50,10 @@ class LightConfig:
     least_share: float = 0.2
     """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
     least_change: float = 1 / 256
-    """Smallest change of a bias that is made, at most a quarter of an 8-bit level: flicker below it costs no bits."""
+    """Smallest change of a bias that is followed at first, at most a quarter of an 8-bit level: flicker below it costs
+    no bits."""
+    least_further_change: float = 1 / 1024
+    """Smallest change of a bias that is made once the light differs from that of frame 0."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +90,13 @@ def with_light_of(
     head = scene.mlps.color
     so_far = (head.b2 - reference.biases).reshape(-1, 3)[0]
     found = _light_change(scene, views, reference, so_far, config)
-    wanted = torch.where((found - so_far).abs() < config.least_change, so_far, found)
-    if torch.equal(wanted, so_far):
-        return scene
+    least = config.least_further_change if bool(so_far.any()) else config.least_change
+    wanted = torch.where((found - so_far).abs() < least, so_far, found)
     biases = reference.biases + wanted.repeat(len(head.b2) // 3)
     if step is not None:
         biases = round_straight_through(biases, step)
+    if torch.equal(wanted, so_far) or torch.equal(biases, head.b2):
+        return scene
     return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
 
 
