@@ -87,7 +87,7 @@ def measured(options: argparse.Namespace, done: Callable[[dict[str, Any]], objec
         assert sent is not None
         with tempfile.TemporaryDirectory(prefix="faults-") as name:
             row = row_of(what, sent, options, Path(name))
-        row["load_average"] = load_average()
+        row |= {"load_average": load_average(), "commit": machine()["commit"]}
         result["cameras" if what in FILMED else "viewers"].append(row)
         done(result)
     return result

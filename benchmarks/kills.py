@@ -42,6 +42,7 @@ from structgstream.codec.reader import open_stream
 
 FRAMES = 60
 SINKS = ("segments", "file", "segments of 8 periods", "file of 8 periods")
+DISKS = ("seen", "not seen")
 
 
 def started(writer: Writer, path: Path) -> tuple[int, int]:
@@ -136,7 +137,8 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--of", nargs="+", choices=SINKS, default=SINKS, metavar="SINK", help=", ".join(SINKS))
     parser.add_argument("--real", type=int, default=20, help="kills of trainers")
     parser.add_argument("--real-frames", type=int, default=8)
-    parser.add_argument("--full", type=int, default=50, help="disks that fill up, with and without the margin")
+    parser.add_argument("--full", type=int, default=50, help="disks that fill up, for each kind of disk")
+    parser.add_argument("--disks", nargs="+", choices=DISKS, default=DISKS, metavar="DISK", help=", ".join(DISKS))
     parser.add_argument("--outages", type=int, default=5)
     parser.add_argument("--outage-seconds", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -179,9 +181,9 @@ def measured(options: argparse.Namespace, folder: Path) -> list[Row]:
         limit = real_seconds
         add(killed_streams(row, trainer, kills=options.real, whole=whole, folder=folder, seed=seed, limit=limit))
     try:
-        for margin in (True, False):
-            row = Row(f"disk full, {'seen' if margin else 'not seen'} before")
-            add(full_disks(row, sent, count=options.full, folder=folder, seed=seed, margin=margin))
+        for disk in options.disks:
+            row = Row(f"disk full, {disk} before")
+            add(full_disks(row, sent, count=options.full, folder=folder, seed=seed, margin=disk == "seen"))
     except PermissionError as error:
         print(f"No small disk can be mounted here ({error}).")
     if options.outages:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files in ``deploy/``: the server behind nginx and Caddy, what describes containers, and the unit."""
+"""The files in ``deploy/``: the server behind nginx and Caddy, what describes containers, and the units."""
 
 import getpass
 import os
@@ -20,6 +20,9 @@ import yaml
 from segment_folders import GrowingFolder
 from serving import Served, hosted
 from streams import small_stream
+from structgstream.cli.app import TERMINATED
+from structgstream.cli.options import parse_known_options
+from structgstream.cli.reconstruct import Reconstruct
 from structgstream.server.settings import LOOPBACK_NAMES, Limits, ServerSettings
 from structgstream.server.tokens import TokenKeys
 
@@ -215,13 +218,23 @@ def test_the_image_is_built() -> None:
     assert subprocess.run(build, capture_output=True, check=False).returncode == 0
 
 
-def test_the_unit_is_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("service", ["serve", "live"])
+def test_the_units_are_such(tmp_path: Path, service: str) -> None:
     program = shutil.which("systemd-analyze")
     if program is None:
         pytest.skip("there is no systemd on this machine")
-    unit = tmp_path / "structgstream-serve.service"
+    unit = tmp_path / f"structgstream-{service}.service"
     text = (DEPLOY / unit.name).read_text()
     assert "/opt/structgstream/bin/structgstream" in text
     unit.write_text(text.replace("/opt/structgstream/bin/structgstream", "/bin/true"))
     found = subprocess.run([program, "verify", unit], capture_output=True, text=True, check=False)
     assert unit.name not in found.stderr
+
+
+def test_the_unit_of_a_live_run_says_what_the_command_takes_and_how_it_ends() -> None:
+    text = (DEPLOY / "structgstream-live.service").read_text().replace("\\\n", " ")
+    (line,) = re.findall(r"^ExecStart=\S+ reconstruct (.*)$", text, re.MULTILINE)
+    options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=line.split())
+    assert not rest
+    assert (options.live.live, options.resume, options.segments.sink) == (True, True, "segments")
+    assert f"SuccessExitStatus={TERMINATED}\n" in text

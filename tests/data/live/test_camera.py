@@ -4,7 +4,11 @@
 import io
 import itertools
 import logging
+import socket
+import threading
+import time
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,6 +26,7 @@ from structgstream.data.live.stamps import StampReader
 
 WAIT = 20.0
 PERIOD = 1 / 30
+NOWHERE = LiveCamera("udp://nowhere")
 
 
 class Received:
@@ -61,12 +66,14 @@ class Received:
         return [round((b - a) / PERIOD) for a, b in itertools.pairwise(times)]
 
 
-def camera_feed(received: Received, *, base: TimeBase, **opening: Any) -> tuple[CameraFeed, FaultLog]:
+def camera_feed(
+    received: Received, *, base: TimeBase, camera: LiveCamera = NOWHERE, **opening: Any
+) -> tuple[CameraFeed, FaultLog]:
     """A camera of 128x96 pixels in a time of its own, and its faults."""
     ticks, faults = itertools.count(), FaultLog("rig", now=lambda: 0.0)
     feed = CameraFeed(
         "a",
-        LiveCamera("udp://nowhere"),
+        camera,
         size=(128, 96),
         receiver=received,
         stamps=StampReader(base),
@@ -253,3 +260,49 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
         assert 'take clock = "arrival"' in caplog.text
     stamped = SimpleNamespace(pts=90, time_base=1)
     assert feed._placed(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
+
+
+def sent_by_rtp(port: int, form: str, ended: threading.Event) -> None:
+    """The film over and over, until the end."""
+    with av.open(f"rtp://127.0.0.1:{port}", "w", format=form) as output:
+        stream = output.add_stream("libx264", rate=30, options={"tune": "zerolatency", "g": "6"})
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        stream.options["x264-params"] = "repeat-headers=1"
+        for number, picture in enumerate(itertools.cycle(moving_pictures())):
+            if ended.wait(PERIOD):
+                return
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts = number
+            output.mux(stream.encode(frame))
+
+
+@pytest.mark.parametrize("form", ["rtp_mpegts", "rtp"])
+def test_a_camera_that_sends_rtp(tmp_path: Path, form: str) -> None:
+    """MPEG-TS needs its address alone; what else there is, a description of the session."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1] & ~1  # the next one is for reports
+    (tmp_path / "a.sdp").write_text(
+        f"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=a\nc=IN IP4 127.0.0.1\nt=0 0\nm=video {port} RTP/AVP 96\n"
+        "a=rtpmap:96 H264/90000\na=fmtp:96 packetization-mode=1\n"
+    )
+    url = str(tmp_path / "a.sdp") if form == "rtp" else f"rtp://127.0.0.1:{port}"
+    received, ended = Received(), threading.Event()
+    feed, faults = camera_feed(received, base=TimeBase.ARRIVAL, camera=LiveCamera(url))
+    sender = threading.Thread(target=sent_by_rtp, args=(port, form, ended))
+    sender.start()
+    feed.start()
+    try:
+        last = time.monotonic() + WAIT
+        while len(received.pictures) < 8 and time.monotonic() < last:
+            time.sleep(0.05)
+    finally:
+        ended.set()
+        feed.stop()
+        sender.join()
+        feed.join(WAIT)
+    numbers = received.numbers[:8]
+    assert numbers == [(numbers[0] + n) % 12 for n in range(8)]
+    assert not feed.ended
+    assert "gone" not in faults.counts.get("a", {})

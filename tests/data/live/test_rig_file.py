@@ -43,6 +43,14 @@ def test_everything_that_a_file_can_say(tmp_path: Path) -> None:
     assert (b.url, b.follow, b.is_file) == (str(tmp_path / "take/b.ts"), True, False)
 
 
+def test_a_description_of_a_session_is_beside_the_rig_file_and_no_recording(tmp_path: Path) -> None:
+    rig = read_rig(written(tmp_path, WHOLE.replace("take/b.ts", "b.sdp").replace("follow = true", 'format = "sdp"')))
+    camera = rig.cameras["b"]
+    assert (camera.url, camera.is_session, camera.is_file) == (str(tmp_path / "b.sdp"), True, False)
+    assert not LiveCamera("b.sdp").is_file
+    assert not LiveCamera("http://studio/a.sdp").is_session
+
+
 def test_a_password_is_in_no_message() -> None:
     assert LiveCamera("rtsp://user:secret@10.0.0.11/stream").shown_url == "rtsp://10.0.0.11/stream"
 

@@ -321,6 +321,9 @@ def open_camera(camera: LiveCamera, timeout_seconds: float) -> AbstractContextMa
     options = {**PROBE_OPTIONS, **camera.options}
     if camera.follow:
         options["follow"] = "1"
+    if camera.is_session:
+        # Without this FFmpeg opens nothing but files from a file.
+        options.setdefault("protocol_whitelist", "file,udp,rtp")
     # A timeout is refused by FFmpeg where it listens for a sender, which has listen_timeout instead.
     timeout = None if options.get("rtsp_flags") == "listen" else timeout_seconds
     return closing(load_av().open(camera.url, format=camera.format, options=options, timeout=timeout))

@@ -51,7 +51,12 @@ class LiveCamera:
     @property
     def is_file(self) -> bool:
         """Whether it is a file, which ends for good, and not a stream, which may come back."""
-        return self.format is None and not self.follow and not SCHEME.match(self.url)
+        return self.format is None and not self.follow and not self.is_session and not SCHEME.match(self.url)
+
+    @property
+    def is_session(self) -> bool:
+        """Whether the file describes a stream that comes by RTP (SDP)."""
+        return self.url.endswith(".sdp") and not SCHEME.match(self.url)
 
 
 @dataclass(frozen=True)
@@ -133,10 +138,14 @@ def _resolved(rig: LiveRig, path: Path) -> LiveRig:
     """Files and folders are relative to the rig file; names of devices stay."""
     folder = path.parent
     cameras = {
-        name: camera if camera.format is not None or SCHEME.match(camera.url) else _in_folder(camera, folder)
+        name: _in_folder(camera, folder) if camera.is_session or _is_path(camera) else camera
         for name, camera in rig.cameras.items()
     }
     return replace(rig, calibration=folder / rig.calibration, cameras=cameras)
+
+
+def _is_path(camera: LiveCamera) -> bool:
+    return camera.format is None and not SCHEME.match(camera.url)
 
 
 def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:

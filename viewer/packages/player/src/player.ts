@@ -98,6 +98,18 @@ export class Player extends Emitter<PlayerEvents> {
     return this.rate;
   }
 
+  /** Plays what is paused, pauses what plays. */
+  toggle(): void {
+    if (this.engine?.paused) this.engine.play();
+    else this.engine?.pause();
+  }
+
+  /** Goes to the newest frame; the edge of a live stream is played from now on. */
+  goToNewest(): void {
+    if (this.engine?.edge.live) this.engine.goLive();
+    else this.engine?.seekFrame(Number.MAX_SAFE_INTEGER);
+  }
+
   setLoop(loop: boolean): void {
     this.loop = loop;
     if (this.engine) this.engine.loop = loop;

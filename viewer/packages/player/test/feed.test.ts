@@ -126,6 +126,20 @@ test("after its end a run is asked for now and then for half an hour, as it may 
   expect(recording.asked.length).toBe(1);
 });
 
+test("a host that does not answer for hours is asked every 10 s, and gone on with", async () => {
+  const live = new LiveRun(CLIP).write(3);
+  const { asked, told } = await followed(2 * 3600 + 60, true, ({ at, after }) => {
+    if (after !== null && at < 2 * 3600) return new Response("", { status: 503 });
+    if (after !== null) live.write(1);
+    return new Response(bodyOf(live));
+  });
+  expect(told.slice(-3)[0]).toMatch(/^manifest/);
+  expect(told.filter((text) => text.startsWith("failed"))).toEqual([]);
+  expect(told).toContain("recovered");
+  const gaps = asked.slice(1, 700).map(({ at }, i) => at - asked[i]!.at);
+  expect(Math.max(...gaps)).toBeCloseTo(10);
+});
+
 test("a host that never answers is given up for this time", async () => {
   const live = new LiveRun(CLIP).write(3);
   const { told } = await followed(50, true, ({ after }, signal) => {

@@ -43,6 +43,12 @@ function goingOn(play: Playing, live?: LiveRun): () => boolean {
   };
 }
 
+/** So many ticks, in each of which workers may work. */
+function ticks(play: Playing, count: number, on: () => boolean = () => true): Promise<void> {
+  let left = count;
+  return play.until(() => on() && left-- <= 0);
+}
+
 test("begins with the last key frame that is far enough behind the edge", async () => {
   const host = new Host({ "": run(40, { targetSeconds: 0.5 }) });
   const play = opened(host);
@@ -290,7 +296,7 @@ describe("a host in trouble", () => {
     host.trouble = trouble;
     live.write(9);
     await play.until(() => on() && play.notices.length > 0, "notice");
-    for (let i = 0; i < 50; i++) await play.until(on);
+    await ticks(play, 50, on);
     expect(play.notices.length).toBe(1);
     expect(play.notices[0]).toContain("The next attempt is in");
     host.trouble = undefined;
@@ -511,6 +517,99 @@ describe("qualities", () => {
     expect(play.notices).toEqual(["high/manifest.json was not found on the server (404). Check the address."]);
     expect(play.engine.qualities.at).toBe(0);
     expect(play.shown.at(-1)).toBe(29);
+  });
+
+  /** Both qualities of a stream that plays, of which the higher one was chosen and is shown. */
+  async function high(runs: Record<"high" | "low", LiveRun>, bits_per_second = 4e6) {
+    const host = new Host(runs);
+    host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second }, ENTRIES[1]]));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.chooseQuality(1);
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
+    return { host, play, on };
+  }
+
+  test("an outage is told once, and the quality that could not be had in it is taken later", async () => {
+    const runs = { high: run(12, { frameSeconds: 1 }), low: run(12, { frameSeconds: 1 }) };
+    const { host, play, on } = await high(runs, 1e12);
+    await play.until(() => on() && play.shown.at(-1) === 11 && play.engine.stalled, "edge");
+    host.trouble = "offline";
+    play.engine.chooseQuality(undefined); // no connection bears the higher one
+    await ticks(play, 3000, on);
+    host.trouble = undefined;
+    let count = 0;
+    await play.until(() => {
+      // Each frame is an occasion to change.
+      if (++count % 100 === 0) for (const one of [runs.high, runs.low]) one.write(1);
+      return on() && play.engine.qualities.at === 0;
+    }, "lower quality");
+    expect(play.notices.filter((text) => text.includes("cannot be fetched")).length).toBeLessThanOrEqual(1);
+    expect(play.errors).toEqual([]);
+  });
+
+  test("a file that another quality lacks is asked for as often as any other", async () => {
+    const runs = { high: run(30).finish(), low: run(30).finish() };
+    const gone = [...runs.high.files.keys()].find((name) => name.startsWith("segment-00000002"))!;
+    runs.high.files.delete(gone);
+    const host = new Host(runs);
+    host.instead.set("/qualities.json", listed(ENTRIES));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.seekFrame(3);
+    await play.until(() => !play.engine.seeking, "frame 3");
+    for (let i = 0; i < 40; i++) {
+      play.engine.chooseQuality(1); // an occasion to change
+      await ticks(play, 50);
+    }
+    expect(host.asked(gone)).toBe(3);
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
+    expect(play.errors).toEqual([]);
+  });
+
+  test("what is lost in one quality is not in another", async () => {
+    const runs = { high: run(30).finish(), low: run(30).finish() };
+    runs.low.files.delete([...runs.low.files.keys()].find((name) => name.startsWith("segment-00000001"))!);
+    const host = new Host(runs);
+    host.instead.set("/qualities.json", listed(ENTRIES));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.engine.frames.lost.length > 0, "lost frames");
+    play.engine.chooseQuality(1);
+    await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
+    await ticks(play, 200);
+    expect(play.engine.frames.lost).toEqual([]);
+  });
+
+  test("news of the quality that was changed to are no reason to begin anew", async () => {
+    const runs = { high: run(13, { frameSeconds: 1 }), low: run(13, { frameSeconds: 1 }) };
+    const { host, play, on } = await high(runs);
+    await play.until(() => on() && play.shown.at(-1) === 12 && play.engine.stalled, "edge");
+    const decoded: number[] = [];
+    const { packets } = play.engine;
+    const take = packets.take.bind(packets);
+    packets.take = (facts, milliseconds) => {
+      decoded.push(...facts.map(({ index }) => index));
+      take(facts, milliseconds);
+    };
+    for (const frame of [13, 14, 15]) {
+      runs.high.write(1);
+      await play.until(() => on() && play.shown.at(-1) === frame, `frame ${frame}`);
+    }
+    expect(decoded).toEqual([13, 14, 15]);
+    const fatal: boolean[] = [];
+    play.engine.on("error", (event) => fatal.push(event.fatal));
+    const text = new TextDecoder().decode(runs.high.write(1).files.get("manifest.json")!);
+    const sha256 = /"sha256":"([\da-f]{64})","period":0/.exec(text)![1]!;
+    host.instead.set("/high/manifest.json", new TextEncoder().encode(text.replaceAll(sha256, "0".repeat(64))));
+    await play.until(() => fatal.length > 0, "error");
+    expect(fatal).toEqual([false]); // what is there can still be seen
   });
 
   test("are changed by what the connection bears, and not to and fro", () => {

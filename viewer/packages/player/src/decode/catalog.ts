@@ -30,8 +30,8 @@ export abstract class Catalog {
   abstract groupEnd(index: number): number;
   abstract facts(): CatalogFacts;
 
-  markDamaged(index: number): void {
-    this.damaged.add(index);
+  markDamaged(first: number, end = first + 1): void {
+    for (let i = first; i < end; i++) this.damaged.add(i);
   }
 
   isDamaged(index: number): boolean {

@@ -121,7 +121,11 @@ export class Decoding {
     }
     if (!this.seeking && demand.at > this.next) this.next = demand.at;
     const changed = this.segmented?.changed(this.next, demand, this.seeking);
-    if (changed) this.begin(changed);
+    if (changed) {
+      this.begin(changed);
+      this.catalogChanged();
+      this.storeChanged();
+    }
     const { stream } = this;
     const target = this.seeking ? stream.catalog.shownFor(this.next) : this.next;
     if (target === undefined) return this.passLost(stream, demand);
@@ -206,7 +210,7 @@ export class Decoding {
   /** Frames from `first` on cannot be shown: up to before `end`, or all that need the first. */
   private lose(first: number, end: number | undefined, reason: string): void {
     const { catalog } = this.stream!;
-    for (let i = first; i < (end ?? first + 1); i++) catalog.markDamaged(i);
+    catalog.markDamaged(first, end);
     const last = (end ?? catalog.groupEnd(first)) - 1;
     const frames = last === first ? `Frame ${first} is` : `Frames ${first} to ${last} are`;
     this.tell({ type: "damage", message: `${frames} lost: ${reason}.`, lost: [first, last + 1] });

@@ -10,6 +10,8 @@ const STAY = 1.15;
 const UP_SECONDS = 4;
 const AGAIN_SECONDS = 20;
 const DOWN_SECONDS = 2;
+/** One that could not be had for a reason that may go away is tried again. */
+const RETRY_SECONDS = 2;
 
 export class Ladder {
   /** By rising bit rate. */
@@ -19,7 +21,8 @@ export class Ladder {
   at = 0;
   private changed: number;
   private fell = false;
-  private readonly refused = new Set<number>();
+  /** Until when, by step. */
+  private readonly refused = new Map<number, number>();
 
   /** @param now seconds of any clock */
   constructor(
@@ -33,18 +36,18 @@ export class Ladder {
   /** The step to be on; `bitsPerSecond` is undefined while nothing is known. */
   wanted(bitsPerSecond: number | undefined): number {
     const { at, steps, choice } = this;
-    if (choice !== undefined) return this.refused.has(choice) ? at : choice;
+    if (choice !== undefined) return this.granted(choice);
     if (bitsPerSecond === undefined) return at;
     const since = this.now() - this.changed;
     const bears = (step: number, factor: number) => bitsPerSecond >= factor * steps[step]!.bits_per_second;
     if (at > 0 && !bears(at, STAY)) {
       let lower = at - 1;
       while (lower > 0 && !bears(lower, STAY)) lower--;
-      return since >= DOWN_SECONDS ? lower : at;
+      return since >= DOWN_SECONDS ? this.granted(lower) : at;
     }
     const higher = at + 1;
     const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
-    return higher < steps.length && enough && !this.refused.has(higher) && bears(higher, UP) ? higher : at;
+    return higher < steps.length && enough && bears(higher, UP) ? this.granted(higher) : at;
   }
 
   /** Another step is used from now on. */
@@ -54,8 +57,12 @@ export class Ladder {
     this.changed = this.now();
   }
 
-  /** A step cannot be had. */
-  refuse(step: number): void {
-    this.refused.add(step);
+  /** A step cannot be had, for now or ever. */
+  refuse(step: number, temporary: boolean): void {
+    this.refused.set(step, temporary ? this.now() + RETRY_SECONDS : Number.POSITIVE_INFINITY);
+  }
+
+  private granted(step: number): number {
+    return this.now() < (this.refused.get(step) ?? 0) ? this.at : step;
   }
 }

@@ -25,7 +25,8 @@ export interface SegmentEvents {
   lost(first: number, end: number | undefined, reason: string): void;
   notice(message: string): void;
   waiting(seconds: number, problem: string | undefined): void;
-  failed(message: string): void;
+  /** A `temporary` failure may go away by itself. */
+  failed(message: string, temporary?: boolean): void;
 }
 
 export class SegmentStream implements Stream {
@@ -72,7 +73,7 @@ export class SegmentStream implements Stream {
       manifest: (manifest) => this.take(manifest),
       qualities: (qualities) => this.events.qualities(qualities),
       end: () => {},
-      failed: (message) => this.events.failed(message),
+      failed: (message, temporary) => this.events.failed(message, temporary),
       waiting: (seconds, problem) => {
         // Once is enough to know.
         if (!this.troubled) this.events.waiting(seconds, problem);

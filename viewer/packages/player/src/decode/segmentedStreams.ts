@@ -77,8 +77,6 @@ export class SegmentedStreams {
     this.pending = undefined;
     this.ladder!.change(step);
     this.tellQualities();
-    this.events.changed();
-    this.events.stored();
     return stream;
   }
 
@@ -96,9 +94,9 @@ export class SegmentedStreams {
         if (!isActive()) events.stored();
         else {
           if (!begun) events.begun(stream);
-          begun = true;
           events.changed();
         }
+        begun = true; // one that is changed to later goes on there
       },
       stored: () => events.stored(),
       qualities: (qualities) => {
@@ -107,6 +105,7 @@ export class SegmentedStreams {
       },
       lost: (first, end, reason) => {
         if (isActive()) events.lost(first, end, reason);
+        else stream.catalog.markDamaged(first, end);
       },
       notice: (message) => {
         if (isActive()) events.notice(message);
@@ -114,9 +113,9 @@ export class SegmentedStreams {
       waiting: (seconds, problem) => {
         if (isActive()) events.waiting(seconds, problem);
       },
-      failed: (message) => {
+      failed: (message, temporary) => {
         if (isActive()) events.failed(message, !begun);
-        else if (stream === this.pending?.stream) this.refuse(message);
+        else if (stream === this.pending?.stream) this.refuse(message, temporary);
       },
     };
     const stream: SegmentStream = new SegmentStream(this.client, url, name, this.budgetBytes, told);
@@ -131,10 +130,11 @@ export class SegmentedStreams {
     this.tellQualities();
   }
 
-  private refuse(message: string): void {
-    this.ladder!.refuse(this.pending!.step);
+  private refuse(message: string, temporary = false): void {
+    this.ladder!.refuse(this.pending!.step, temporary);
     this.drop();
-    this.events.notice(message);
+    // An outage is told by the stream that is played.
+    if (!temporary) this.events.notice(message);
   }
 
   private qualityOf({ manifest }: Quality): SegmentStream {

@@ -12,6 +12,8 @@ const QUICK_AGAIN = 1.1;
 /** Frames come in steps: so many of the longest step of late, and so much more, should lie between clock and edge. */
 const STEPS = 1.5;
 const SPARE_SECONDS = 0.25;
+/** A longer one was an outage. */
+const MOST_STEP_SECONDS = 10;
 /** Each stall lets the clock fall back so much farther. */
 const STALL_SECONDS = 0.5;
 const MOST_STALL_SECONDS = 4;
@@ -90,7 +92,8 @@ export class Edge {
   get distance(): number {
     if (!this.flows) return 0;
     const step = this.arrivals.reduce((most, at, i) => Math.max(most, i ? at - this.arrivals[i - 1]! : 0), 0);
-    return Math.max(this.timeline.live!.targetSeconds, STEPS * step + SPARE_SECONDS) + this.stalls;
+    const needed = STEPS * Math.min(step, MOST_STEP_SECONDS) + SPARE_SECONDS;
+    return Math.max(this.timeline.live!.targetSeconds, needed) + this.stalls;
   }
 
   /** The frame to begin with: the last key frame that is far enough behind the newest. */

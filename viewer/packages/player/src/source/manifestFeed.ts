@@ -48,13 +48,13 @@ export class ManifestFeed {
 
   /**
    * Gives manifests until one is of a finished stream, or the address leads to a list of qualities. A run that ends
-   * meanwhile may be resumed, so its host is asked a while longer.
+   * meanwhile may be resumed, so its host is asked a while longer; that of a live one for as long as it takes.
    *
-   * @throws SourceError the first one cannot be had, or the host has not answered for long
+   * @throws SourceError the first one cannot be had, or the stream was replaced
    */
   async follow(events: FeedEvents, signal: AbortSignal): Promise<void> {
     const { firstPoll, longestPoll, backOff, stillAfter } = this.patience;
-    let [wait, troubled, fresh] = [firstPoll, 0, performance.now()];
+    let [wait, troubled, fresh] = [firstPoll, false, performance.now()];
     while (!signal.aborted) {
       if (this.isOver && performance.now() - fresh > stillAfter * 1000) return;
       const began = performance.now();
@@ -63,7 +63,7 @@ export class ManifestFeed {
         const found = await this.ask(signal);
         if (signal.aborted) return;
         if (troubled) events.recovered();
-        troubled = 0;
+        troubled = false;
         if (found && !("sequence" in found)) return events.qualities(found);
         if (found) events.manifest(found);
         if (found && !found.live && !asked?.live) return;
@@ -78,9 +78,9 @@ export class ManifestFeed {
           await pause(longestPoll, signal); // what there is plays without the host
           continue;
         }
-        if (!this.last || (error instanceof SourceError && error.final) || troubled > stillAfter) throw error;
+        if (!this.last || (error instanceof SourceError && error.final)) throw error;
         wait = troubled ? Math.min(wait * 2, longestPoll) : firstPoll;
-        troubled += wait;
+        troubled = true;
         events.waiting(wait, (error as Error).message);
         await pause(wait, signal);
       }

@@ -4,10 +4,9 @@
 import type { Player } from "../player.js";
 import { made, setText } from "./dom.js";
 import { timeText } from "./format.js";
-import { type IconName, icon } from "./icons.js";
+import { button, type IconName, icon } from "./icons.js";
+import { RATES } from "./keyboard.js";
 import { TimelineBar } from "./timelineBar.js";
-
-const RATES = [0.1, 0.25, 0.5, 1, 1.5, 2, 4];
 
 /** What a button does that concerns more than the player. */
 export interface BarActions {
@@ -35,7 +34,7 @@ export class Bar {
   ) {
     const engine = () => player.engine;
     this.timeline = new TimelineBar((seconds) => engine()?.seek(seconds));
-    this.play = button("play", "Play", () => this.toggle());
+    this.play = button("play", "Play", () => player.toggle());
     this.loop = button("loop", "Loop", () => player.setLoop(!player.loop), "medium");
     this.compare = button("compare", "Compare with the camera's picture", () => actions.compare());
     this.compare.hidden = true;
@@ -45,10 +44,7 @@ export class Bar {
       player.playbackRate = Number(this.rate.value);
     });
     this.edge = made("button", { type: "button", class: "edge", hidden: true });
-    this.edge.addEventListener("click", () => {
-      if (engine()?.edge.live) engine()?.goLive();
-      else engine()?.seekFrame(Number.MAX_SAFE_INTEGER);
-    });
+    this.edge.addEventListener("click", () => player.goToNewest());
     const panel = (name: Parameters<BarActions["toggle"]>[0], face: IconName, label: string, extra: string) => {
       const made_ = button(face, label, () => actions.toggle(name, made_), extra);
       made_.setAttribute("aria-expanded", "false");
@@ -80,12 +76,6 @@ export class Bar {
       ),
     );
     this.update();
-  }
-
-  toggle(): void {
-    const { engine } = this.player;
-    if (engine?.paused) engine.play();
-    else engine?.pause();
   }
 
   /** To be called with every picture: sets what is different. */
@@ -137,10 +127,4 @@ export class Bar {
     if (this.time.textContent === text + frame) return;
     this.time.replaceChildren(text, made("span", { class: "soft" }, frame));
   }
-}
-
-export function button(face: IconName, label: string, action: () => void, extra = ""): HTMLButtonElement {
-  const element = made("button", { type: "button", "aria-label": label, title: label, class: extra }, icon(face));
-  element.addEventListener("click", action);
-  return element;
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Pictures on buttons, 24 by 24, drawn in lines of the text's colour. */
 
-import { madeSvg } from "./dom.js";
+import { made, madeSvg } from "./dom.js";
 
 const PATHS = {
   play: "M8 5.5v13l10.5-6.5z",
@@ -14,11 +14,11 @@ const PATHS = {
   compare: "M12 3v18M4 6h16v12H4z",
   chart: "M5 19V11M10 19V5M15 19v-6M20 19V8",
   settings: "M4 7h9M17 7h3M4 17h3M11 17h9M15 4.8v4.4M9 14.8v4.4",
-  link: "M10 14a4 4 0 0 0 5.7 0l3-3A4 4 0 0 0 13 5.300l-1 1M14 10a4 4 0 0 0-5.700 0l-3 3A4 4 0 0 0 11 18.700l1-1",
-  photo: "M4 8h3.500l1.500-2.500h6L16.500 8H20v11H4zM12 16.500a3.250 3.250 0 1 0 0-6.500 3.250 3.250 0 0 0 0 6.500z",
+  link: "M10 14a4 4 0 0 0 5.7 0l3-3A4 4 0 0 0 13 5.3l-1 1M14 10a4 4 0 0 0-5.7 0l-3 3A4 4 0 0 0 11 18.7l1-1",
+  photo: "M4 8h3.5l1.5-2.5h6L16.5 8H20v11H4zM12 16.5a3.25 3.25 0 1 0 0-6.5 3.25 3.25 0 0 0 0 6.5z",
   full: "M4 9V4h5M15 4h5v5M20 15v5h-5M9 20H4v-5",
   close: "M6 6l12 12M18 6L6 18",
-  help: "M9.200 9a2.900 2.900 0 1 1 4.300 2.500c-1 .6-1.500 1.200-1.500 2.500M12 17.500v.5",
+  help: "M9.2 9a2.9 2.9 0 1 1 4.3 2.5c-1 .6-1.5 1.2-1.5 2.5M12 17.5v.5",
 } as const;
 
 export type IconName = keyof typeof PATHS;
@@ -27,4 +27,10 @@ export function icon(name: IconName): SVGSVGElement {
   const filled = name === "play" || name === "back" || name === "forward";
   const path = madeSvg("path", { d: PATHS[name], ...(filled ? { fill: "currentColor" } : {}) });
   return madeSvg("svg", { viewBox: "0 0 24 24", "aria-hidden": "true", class: "icon" }, path);
+}
+
+export function button(face: IconName, label: string, action: () => void, extra = ""): HTMLButtonElement {
+  const element = made("button", { type: "button", "aria-label": label, title: label, class: extra }, icon(face));
+  element.addEventListener("click", action);
+  return element;
 }

@@ -42,7 +42,8 @@ const FLY: Readonly<Record<string, readonly [right: number, down: number, forwar
 const FLY_SPEED = 0.7;
 const TURN_RADIANS = 0.08;
 const DOLLY = 0.9;
-const RATES = [0.1, 0.25, 0.5, 1, 1.5, 2, 4];
+/** Speeds to choose from. */
+export const RATES = [0.1, 0.25, 0.5, 1, 1.5, 2, 4];
 
 export class Keyboard {
   private readonly held = new Set<string>();
@@ -90,14 +91,14 @@ export class Keyboard {
       player.playbackRate = RATES[Math.min(Math.max(at + by, 0), RATES.length - 1)]!;
     };
     const act: Readonly<Record<string, () => void>> = {
-      " ": () => (engine?.paused ? engine.play() : engine?.pause()),
-      k: () => (engine?.paused ? engine.play() : engine?.pause()),
+      " ": () => player.toggle(),
+      k: () => player.toggle(),
       ArrowLeft: () => engine?.seek(engine.currentTime - 1),
       ArrowRight: () => engine?.seek(engine.currentTime + 1),
       ",": () => engine?.step(-1),
       ".": () => engine?.step(1),
       Home: () => engine?.seekFrame(0),
-      End: () => (engine?.edge.live ? engine.goLive() : engine?.seekFrame(Number.MAX_SAFE_INTEGER)),
+      End: () => player.goToNewest(),
       "<": () => faster(-1),
       ">": () => faster(1),
       l: () => player.setLoop(!player.loop),

@@ -2,7 +2,7 @@
 /** What the player says: one short note at a time, and what stands in the middle while there is no picture. */
 
 import { made, setText } from "./dom.js";
-import { icon } from "./icons.js";
+import { button } from "./icons.js";
 
 const NOTE_SECONDS = 6;
 
@@ -17,9 +17,10 @@ export class Notes {
   private passing = false;
 
   constructor() {
-    const close = made("button", { type: "button", "aria-label": "Close" }, icon("close"));
-    close.addEventListener("click", () => this.hide());
-    this.note.append(this.text, close);
+    this.note.append(
+      this.text,
+      button("close", "Close", () => this.hide()),
+    );
     this.root.append(this.middle, this.note, this.spoken);
   }
 

@@ -5,13 +5,12 @@ import type { Player } from "../player.js";
 import type { QualityChoice, QualityControl } from "../view/quality.js";
 import type { Rig, RigCamera } from "../view/rig.js";
 import { made } from "./dom.js";
-import { icon } from "./icons.js";
+import { button } from "./icons.js";
 import { KEYS } from "./keyboard.js";
 
 export function panel(title: string, close: () => void, ...children: Node[]): HTMLElement {
-  const shut = made("button", { type: "button", "aria-label": "Close", title: "Close" }, icon("close"));
-  shut.addEventListener("click", close);
-  return made("section", { class: "panel glass", "aria-label": title }, made("h2", {}, title, shut), ...children);
+  const head = made("h2", {}, title, button("close", "Close", close));
+  return made("section", { class: "panel glass", "aria-label": title }, head, ...children);
 }
 
 function choice<Value extends string>(

@@ -11,7 +11,7 @@ import { Compare } from "./compare.js";
 import { made } from "./dom.js";
 import { bytesText } from "./format.js";
 import { Gestures } from "./gestures.js";
-import { icon } from "./icons.js";
+import { button } from "./icons.js";
 import { Keyboard } from "./keyboard.js";
 import { Notes } from "./notes.js";
 import { Overlay } from "./overlay.js";
@@ -175,8 +175,7 @@ export class Surface {
     root.addEventListener("drop", (event) => {
       event.preventDefault();
       this.drop.hidden = true;
-      const file = event.dataTransfer?.files[0];
-      if (file) this.options.open({ kind: "blob", blob: file, name: file.name });
+      this.openFirst(event.dataTransfer?.files);
     });
     player.on("opening", ({ loadedBytes, totalBytes, ended }) => {
       const rest = ended
@@ -206,8 +205,7 @@ export class Surface {
   private pictureCame(): void {
     if (this.playButton) return;
     const { engine } = this.options.player;
-    this.playButton = made("button", { type: "button", class: "big glass", "aria-label": "Play" }, icon("play"));
-    this.playButton.addEventListener("click", () => engine?.play());
+    this.playButton = button("play", "Play", () => engine?.play(), "big glass");
     if (engine?.paused && (!engine.edge.grows || engine.edge.live) && engine.frames.count > 1)
       this.notes.show(this.playButton);
     else this.notes.show();
@@ -228,10 +226,8 @@ export class Surface {
   }
 
   private tapped(): void {
-    const { engine } = this.options.player;
     if (this.opened) this.closePanel();
-    else if (engine?.paused) engine.play();
-    else engine?.pause();
+    else this.options.player.toggle();
   }
 
   private go(camera: RigCamera, seconds?: number): void {
@@ -301,11 +297,13 @@ export class Surface {
 
   private chooseFile(): void {
     const input = made("input", { type: "file", accept: ".sgs" });
-    input.addEventListener("change", () => {
-      const file = input.files?.[0];
-      if (file) this.options.open({ kind: "blob", blob: file, name: file.name });
-    });
+    input.addEventListener("change", () => this.openFirst(input.files));
     input.click();
+  }
+
+  private openFirst(files: FileList | null | undefined): void {
+    const file = files?.[0];
+    if (file) this.options.open({ kind: "blob", blob: file, name: file.name });
   }
 
   private async share(): Promise<void> {
