@@ -76,6 +76,13 @@ def test_tracked_positions_and_two_rounds_reach_the_far_frame() -> None:
     assert tracked.counts["corrected"] > 0
 
 
+def test_it_has_the_iterations_of_four_online_frames_unless_told() -> None:
+    world = scenery(movers=20)
+    config = replace(CONFIG, iterations=3)
+    usual = replace(START, iterations=None, rounds=3)
+    assert fit(world, truth(world, 20), start=usual, config=config).iterations == 12
+
+
 def test_what_does_not_change_keeps_the_bits_of_frame_0() -> None:
     world = scenery(movers=0)
     found = fit(world, truth(world, 0))

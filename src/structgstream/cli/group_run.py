@@ -41,8 +41,8 @@ class ReconstructGroup:
     """The segment to write."""
     track: Annotated[Path | None, tyro.conf.arg(metavar="TRACK", help_behavior_hint="")] = None
     """The track of the capture; may be left out for A = 0 only."""
-    iterations: int = 225
-    """Optimisation steps of the group's first frame."""
+    iterations: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Optimisation steps of the group's first frame. Default: four times those of an online frame."""
     rounds: int = 3
     """Rounds of flow, births and iterations of the group's first frame."""
     device: Device = "auto"
@@ -57,7 +57,7 @@ def main(arguments: list[str]) -> None:
     matched = re.fullmatch(r"(\d+):(\d+)", options.frames)
     if matched is None:
         raise UsageError(f"--frames {options.frames} with --init; a group is A:B, such as --frames 60:120.")
-    if options.iterations < 1 or options.rounds < 1:
+    if (options.iterations is not None and options.iterations < 1) or options.rounds < 1:
         raise UsageError("--iterations and --rounds must be at least 1.")
     first, end = int(matched[1]), int(matched[2])
     if first >= end:

@@ -30,13 +30,17 @@ from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.views import View
 
+USUAL_FRAMES = 4
+"""A group's first frame has the iterations of so many online frames. With 1.5 of them births stand in for what
+iterations would have mended, which costs bytes, and late groups fall behind (docs/groups.md)."""
+
 
 @dataclass(frozen=True)
 class GroupStartConfig:
     """The fit of a group's first frame; not in the paper."""
 
-    iterations: int = 225
-    """Optimisation steps of all rounds together."""
+    iterations: int | None = None
+    """Optimisation steps of all rounds together; None for :data:`USUAL_FRAMES` times those of an online frame."""
     rounds: int = 3
     """Rounds of flow, births and iterations."""
     flow_rounds: int = 2
@@ -78,9 +82,10 @@ def fit_group_start(
         light: of frame 0, for ``config.light``; None for none.
         on_step: called after every iteration.
     """
+    iterations = USUAL_FRAMES * config.iterations if start.iterations is None else start.iterations
     each = replace(
         config,
-        iterations=-(-start.iterations // start.rounds),
+        iterations=-(-iterations // start.rounds),
         births=replace(config.births, most=start.births),
     )
     if config.light.enabled and light is not None:
