@@ -182,7 +182,8 @@ def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None
     assert steps.check(steps.points(content)) == findings
     assert again.steps.skipped == ["points"]
     assert report.is_file()
-    assert one.told["check"].endswith("findings; report/index.html")
+    count = f"{len(findings)} finding{'s' * (len(findings) != 1)}"
+    assert one.told["check"] == f"{count}; report/index.html"
 
 
 def test_a_size_that_cannot_be(tmp_path: Path) -> None:
