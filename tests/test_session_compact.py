@@ -104,7 +104,9 @@ def test_steps_are_float32_and_come_from_a_pixel() -> None:
     dynamic = CONFIG.online.dynamic
     assert header.steps.keys() == {p.name for p in parameters_of(dynamic) if p.step}
     assert all(float(np.float32(step)) == step for step in header.steps.values())
-    pixel = pixel_size(header.reference["anchor_positions"], header.similarity.rig(header.rig))
+    rig = header.similarity.rig(header.rig)
+    pixel = pixel_size(header.reference["anchor_positions"], [rig[name] for name in rig.training])
+    assert pixel is not None
     assert header.steps["anchor_positions"] == pytest.approx(0.02 * pixel, rel=1e-2)
     assert header.reference.keys() == dynamic.difference(["free", "free_births"])
 

@@ -13,6 +13,7 @@ from structgstream.errors import ConfigError
 from structgstream.periods import PeriodConfig
 from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig, ThinBirthConfig
+from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.environment import EnvironmentConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
@@ -303,6 +304,7 @@ COMPACT = replace(
         start=MotionStartConfig(enabled=True),
         births=BirthConfig(enabled=True, thin=ThinBirthConfig(enabled=True)),
         motion_prior=0.7,
+        coherence=CoherenceConfig(weight=8e-4),
         rounding=RoundingConfig(free_priced=True),
     ),
 )

@@ -14,6 +14,7 @@ from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.scene.bins import round_to_bins
 from structgstream.codec.sinks import FileSink
+from structgstream.errors import CalibrationError
 from structgstream.pipeline import FrameTask, StreamFacts
 from structgstream.presets import StreamConfig
 from structgstream.scene.appearance import with_appearance
@@ -114,7 +115,13 @@ class CompactCodec(SceneCodec):
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
         scene, sensitivity = regauge(scene, estimate_sensitivity(scene, task.rig, backend=task.backend, seed=task.seed))
         scene = self._with_dynamic_fields(scene)
-        known = rounding.steps(pixel_size(scene.anchors.positions, task.rig))
+        pixel = pixel_size(scene.anchors.positions, [task.rig[name] for name in task.rig.training])
+        if pixel is None:
+            raise CalibrationError(
+                "No training camera sees an anchor of frame 0, so positions have no step; check the calibration with "
+                "structgstream prepare --check."
+            )
+        known = rounding.steps(pixel)
         used = {parameter.name for parameter in parameters_of(dynamic)}
         steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
         voxel_size = self.config.initial.voxel_size

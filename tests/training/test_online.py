@@ -11,6 +11,7 @@ from backends import quickest_backend
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
+from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame
@@ -53,6 +54,24 @@ def test_anchors_follow_motion(backend: Callable[[], Backend]) -> None:
     moved = (result.scene.anchors.positions - world.scene.anchors.positions).mean(0)
     assert moved[0] > 0.015  # The truth is 0.03.
     assert moved[1:].abs().max() < 0.01
+
+
+def test_neighbours_move_more_alike_where_that_has_a_price() -> None:
+    world = moving_world(2)
+    truth = world.frames[1].images["cam00"]  # Held out.
+    free = fit(world.scene, world, 1, config=without_patching(QUICK))
+    config = replace(without_patching(QUICK), coherence=CoherenceConfig(weight=3e-3))
+    priced = fit(world.scene, world, 1, config=config)
+
+    def scatter(scene: Scene) -> float:
+        moved = scene.anchors.positions - world.scene.anchors.positions
+        return float(moved.std(0).norm())
+
+    assert scatter(priced.scene) < 0.7 * scatter(free.scene)
+    scores = [psnr(rendered(result.scene, world, "cam00"), truth) for result in (free, priced)]
+    assert scores[1] > scores[0] - 0.3
+    assert priced.losses["coherence"] > 0.0
+    assert "coherence" not in free.losses
 
 
 def test_static_fields_keep_every_bit() -> None:

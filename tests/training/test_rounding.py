@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from rigs import arc_rig, random_scene
+from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.scene.appearance import with_appearance
@@ -86,11 +87,16 @@ def test_every_field_follows_the_quality() -> None:
 
 def test_a_pixel_is_as_large_as_it_is_seen() -> None:
     """On the arc, at distance 3 with 40 pixels of focal length, a pixel covers 3 / 40."""
-    rig = arc_rig(5, radius=3.0)
+    cameras = _cameras(arc_rig(5, radius=3.0))
     points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * 0.05
     distance = math.hypot(3.0, 0.3)
-    assert pixel_size(points, rig) == pytest.approx(distance / 40, rel=0.01)
+    assert pixel_size(points, cameras) == pytest.approx(distance / 40, rel=0.01)
     behind = torch.cat([points, torch.full((1000, 3), 100.0)])
-    assert pixel_size(behind, rig) == pytest.approx(distance / 40, rel=0.01), "what no camera sees does not count"
+    assert pixel_size(behind, cameras) == pytest.approx(distance / 40, rel=0.01), "what no camera sees does not count"
     wider = arc_rig(5, radius=6.0)
-    assert pixel_size(points, wider) == pytest.approx(math.hypot(6.0, 0.3) / 40, rel=0.01)
+    assert pixel_size(points, _cameras(wider)) == pytest.approx(math.hypot(6.0, 0.3) / 40, rel=0.01)
+    assert pixel_size(behind[400:], cameras) is None
+
+
+def _cameras(rig: CameraRig) -> list[Camera]:
+    return [rig[name] for name in rig.training]

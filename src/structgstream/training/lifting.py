@@ -3,14 +3,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.motion_types import Neighbors, ViewFlows
+from structgstream.training.neighbours import nearest
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View
 
@@ -70,7 +69,7 @@ def lift_motion(
     informed = (evidence.weights.amax(0) > 0).nonzero()[:, 0]
     if not len(informed):
         return LiftedMotion(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
-    near, distances = _nearest(centers, centers[informed], config.neighbours)
+    near, distances = nearest(centers, centers[informed], config.neighbours)
     spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
     affinities = torch.exp(-0.5 * (distances / spread).square())
     neighbours = informed[near]
@@ -89,15 +88,3 @@ def lift_motion(
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
     return LiftedMotion(displacements, lifted)
-
-
-def _nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rows and distances ``[T, N]`` of the ``count`` (or all) nearest ``among`` to each of ``points``."""
-    try:
-        from scipy.spatial import KDTree
-    except ImportError as error:
-        raise MissingExtraError("scipy", "capture") from error
-    count = min(count, len(among))
-    ranks: Any = list(range(1, count + 1))  # A list, so that the result has two dimensions even for one neighbour.
-    distances, rows = KDTree(among.double().numpy(force=True)).query(points.double().numpy(force=True), k=ranks)
-    return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)

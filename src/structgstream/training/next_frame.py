@@ -11,6 +11,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
+from structgstream.training.coherence import MotionCoherence
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
@@ -20,7 +21,7 @@ from structgstream.training.parameters import Parameters
 from structgstream.training.partition import Partition
 from structgstream.training.population import Population
 from structgstream.training.price import BitPrice
-from structgstream.training.step import SceneLoss, view_loss
+from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View
 
@@ -63,6 +64,7 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
         parameters: of the scene.
         losses: weights of the terms.
         bit_price: the price of changing bins; None for none.
+        coherence: the price of incoherent motion; None for none.
         population: of the free Gaussians.
         early_stopping: early stopping.
         patch_at: the iteration after which free Gaussians are pruned and spawned, unless the frame stops before.
@@ -79,6 +81,7 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
     parameters: Parameters
     losses: LossWeights
     bit_price: BitPrice | None
+    coherence: MotionCoherence | None
     population: Population
     early_stopping: EarlyStopping
     patch_at: int
@@ -109,12 +112,18 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             self.early_stopping.add(sample.index, loss.total)
         if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
+        loss = self._with_prices(loss)
         self.last_pass.add(iteration, loss, sample)
-        return (
-            loss
-            if self.bit_price is None
-            else replace(loss, total=loss.total + self.bit_price.price(self.parameters.values))
-        )
+        return loss
+
+    def _with_prices(self, loss: SceneLoss) -> SceneLoss:
+        values = self.parameters.values
+        if self.coherence is not None:
+            difference = self.coherence.difference(values["anchor_positions"])
+            loss = with_term(loss, "coherence", difference, weight=self.coherence.weight)
+        if self.bit_price is None:
+            return loss
+        return replace(loss, total=loss.total + self.bit_price.price(values))
 
     def _drawn_now(self, focus: Focus | None, sample: View) -> tuple[Focus | None, bool]:
         """``focus``, in most visits of a view without the tiles in which nothing has changed; and whether the loss can

@@ -23,6 +23,7 @@ from structgstream.kernels.cuda_tiles import run_with_pair_budget
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
 from structgstream.training.births import BirthConfig
+from structgstream.training.coherence import CoherenceConfig, MotionCoherence
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.light import LightConfig, LightReference, with_light_of
@@ -91,6 +92,8 @@ class OnlineConfig:
     """Initial displacements of movers; only with ``motion``."""
     births: BirthConfig = field(default_factory=BirthConfig)
     """Births of free Gaussians from geometry, and removal of outliers; only with ``motion``."""
+    coherence: CoherenceConfig = field(default_factory=CoherenceConfig)
+    """The price of moving unlike the neighbours."""
     motion_prior: float = 0.0
     """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
     mean_of_last: float = 0.0
@@ -281,6 +284,7 @@ class FrameFit:
             parameters=parameters,
             losses=config.losses,
             bit_price=bit_price,
+            coherence=MotionCoherence.of(scene, [view.camera for view in start.views], config=config.coherence),
             population=population,
             early_stopping=EarlyStopping(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
             patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),

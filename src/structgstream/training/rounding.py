@@ -8,13 +8,14 @@ gradients pass the rounding unchanged (straight-through). Bins are absolute, so 
 integers and errors do not accumulate.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import Camera
 from structgstream.scene.state import PARAMETERS, ParameterName
 
 
@@ -63,7 +64,7 @@ class RoundingConfig:
     """Root mean square error that quantizing frame 0 may add to the pictures, in 8-bit levels."""
     first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
     """Step of the MLPs' weights in frame 0."""
-    rate_weight: float = field(default=1e-4, metadata=_NO_STEP)
+    rate_weight: float = field(default=7e-5, metadata=_NO_STEP)
     """Weight in the loss of the mean bits per moving anchor."""
     free_priced: bool = field(default=False, metadata=_NO_STEP)
     """Whether bits of free Gaussians that existed in the last frame are priced too."""
@@ -85,20 +86,23 @@ class RoundingConfig:
         return {p.name: getattr(plain, p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
 
 
-def pixel_size(positions: Tensor, rig: CameraRig) -> float:
-    """Size of a pixel, in scene units, at the median distance of the anchors for the median training camera.
+def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:
+    """Size of a pixel, in scene units, at the median distance of the anchors for the median camera.
 
     Args:
         positions: ``[M, 3]`` of anchors.
-        rig: in units of the scene.
+        cameras: of the training views, in units of the scene.
+
+    Returns:
+        None if no camera sees an anchor.
     """
     sizes = []
-    for name in rig.training:
-        viewmat, K = rig[name].viewport(positions)[:2]
+    for camera in cameras:
+        viewmat, K = camera.viewport(positions)[:2]
         points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]
         pixels = (points @ K.T)[:, :2] / points[:, 2:]
-        size = pixels.new_tensor([rig[name].width, rig[name].height])
-        seen = (points[:, 2] > rig[name].near) & ((pixels >= 0) & (pixels < size)).all(1)
+        size = pixels.new_tensor([camera.width, camera.height])
+        seen = (points[:, 2] > camera.near) & ((pixels >= 0) & (pixels < size)).all(1)
         if seen.any():
             sizes.append(float(points[seen, 2].median() / K[0, 0]))
-    return float(torch.tensor(sizes).median())
+    return float(torch.tensor(sizes).median()) if sizes else None

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from structgstream.errors import MissingExtraError
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.growth import cell_keys
+from structgstream.training.neighbours import nearest
 
 
 def warm_start(scene: Scene, *, cell: float) -> Scene:
@@ -46,18 +45,8 @@ def _anchors_of(free: FreeGaussians, anchors: AnchorCloud, cell: float) -> Ancho
         log_offset_scales=log_scales.contiguous(),
         log_base_scales=log_scales.contiguous(),
         offsets=means.new_zeros(len(unique), anchors.offsets_per_anchor, 3),
-        features=anchors.features[_nearest(means[:, :3], anchors.positions)],
+        features=anchors.features[nearest(means[:, :3], anchors.positions, 1)[0][:, 0]],
     )
-
-
-def _nearest(points: Tensor, positions: Tensor) -> Tensor:
-    """For each of ``points`` ``[P, 3]`` the row of the nearest of ``positions``, ``[P]``."""
-    try:
-        from scipy.spatial import KDTree
-    except ImportError as error:
-        raise MissingExtraError("scipy", "capture") from error
-    _, rows = KDTree(positions.double().numpy(force=True)).query(points.double().numpy(force=True), k=1)
-    return torch.from_numpy(np.asarray(rows, dtype=np.int64)).to(positions.device)
 
 
 def _joined(first: AnchorCloud, second: AnchorCloud) -> AnchorCloud:

@@ -74,6 +74,7 @@ def test_what_the_switches_are() -> None:
     assert whole.light.enabled
     assert not dark.light.enabled
     assert whole.dynamic - dark.dynamic == {"color_mlp"}
+    assert online["compact-without-coherence"].coherence.weight == 0.0 < whole.coherence.weight
     assert whole.births.thin.enabled
     assert not online["compact-without-thin-births"].births.thin.enabled
     trained = online["compact-with-covariance-mlp"]

@@ -134,6 +134,8 @@ def _of_coding(rows: _Rows) -> None:
     prior = 0.0 if whole.motion_prior else 1.0
     title = "with motion prior" if prior else "w/o motion prior"
     rows.online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
+    incoherent = replace(whole, coherence=replace(whole.coherence, weight=0.0))
+    rows.online("without-coherence", "w/o price of incoherent motion", incoherent, "coherence.weight")
 
 
 def _of_iterations(rows: _Rows) -> None:

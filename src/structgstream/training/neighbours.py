@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nearest neighbours in space."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from structgstream.errors import MissingExtraError
+
+
+def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Rows and distances ``[P, N]`` of the ``count`` (or all) nearest ``among`` to each of ``points`` ``[P, 3]``.
+
+    Raises:
+        MissingExtraError: SciPy is not installed.
+    """
+    try:
+        from scipy.spatial import KDTree
+    except ImportError as error:
+        raise MissingExtraError("scipy", "capture") from error
+    count = min(count, len(among))
+    # As a list of ranks the result has two dimensions even for one neighbour.
+    distances, rows = KDTree(among.detach().double().numpy(force=True)).query(
+        points.detach().double().numpy(force=True), k=list(range(1, count + 1))
+    )
+    return torch.from_numpy(np.asarray(rows)).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
+
+
+def nearest_others(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Rows and distances ``[P, N]`` of the ``count`` (or all) nearest others to each of ``points`` ``[P, 3]``.
+
+    Raises:
+        MissingExtraError: SciPy is not installed.
+    """
+    count = min(count, len(points) - 1)
+    rows, distances = nearest(points, points, count + 1)
+    # Of points at one place any may come first: each is taken out of its own neighbours wherever it is.
+    itself = rows == torch.arange(len(rows), device=rows.device)[:, None]
+    itself[~itself.any(1), -1] = True
+    return rows[~itself].reshape(-1, count), distances[~itself].reshape(-1, count)

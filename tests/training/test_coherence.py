@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The price of moving unlike the neighbours."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rigs import arc_rig, random_scene
+from structgstream.cameras import Camera
+from structgstream.errors import ConfigError
+from structgstream.scene.scene import Scene
+from structgstream.training.coherence import CoherenceConfig, MotionCoherence
+from structgstream.training.rounding import pixel_size
+
+CONFIG = CoherenceConfig(weight=1.0, neighbours=4, feature_bandwidth=0.0)
+
+
+def _cameras() -> list[Camera]:
+    rig = arc_rig(3)
+    return [rig[name] for name in rig.training]
+
+
+def _grid(features: torch.Tensor | None = None) -> Scene:
+    """Five by five anchors, a tenth apart."""
+    scene = random_scene(25)
+    steps = 0.1 * (torch.arange(5.0) - 2.0)
+    positions = torch.cartesian_prod(steps, steps, torch.zeros(1))
+    anchors = replace(scene.anchors, positions=positions)
+    return replace(scene, anchors=anchors if features is None else replace(anchors, features=features))
+
+
+def _price(scene: Scene, config: CoherenceConfig = CONFIG) -> MotionCoherence:
+    found = MotionCoherence.of(scene, _cameras(), config=config)
+    assert found is not None
+    return found
+
+
+def test_what_moves_as_one_is_free() -> None:
+    scene = _grid()
+    moved = scene.anchors.positions + torch.tensor([0.3, -0.2, 0.1])
+    assert _price(scene).difference(moved).item() == pytest.approx(0.0, abs=1e-4)
+
+
+def test_one_that_moves_alone_pays_its_way_in_pixels() -> None:
+    scene = _grid()
+    price = _price(scene)
+    pixel = pixel_size(scene.anchors.positions, _cameras())
+    assert pixel is not None
+    moved = scene.anchors.positions.clone()
+    moved[12, 0] += 8.0 * pixel
+    length = (64.0 + 0.25**2) ** 0.5 - 0.25
+    # Its own difference counts whole, and as a share of those whose neighbour it is.
+    share = float(price.shares[price.neighbours == 12].sum())
+    assert price.difference(moved).item() == pytest.approx((1.0 + share) * length / 25, rel=1e-4)
+
+
+def test_it_pulls_an_outlier_to_its_neighbours() -> None:
+    scene = _grid()
+    moved = scene.anchors.positions.clone()
+    moved[12, 0] += 0.2
+    moved.requires_grad_()
+    (gradient,) = torch.autograd.grad(_price(scene).difference(moved), [moved])
+    assert gradient[12, 0] > 0.0
+    assert gradient.sum(0).abs().max() < 1e-3 * gradient.abs().max(), "the whole is not pulled anywhere"
+
+
+def test_what_looks_different_does_not_count() -> None:
+    """Two halves of different features pass each other for nothing; without the weight by features they pay."""
+    scene = _grid()
+    features = torch.zeros_like(scene.anchors.features)
+    right = scene.anchors.positions[:, 0] > 0.05
+    features[right] = 20.0
+    scene = _grid(features)
+    moved = scene.anchors.positions.clone()
+    moved[right, 1] += 0.2
+    by_features = replace(CONFIG, feature_bandwidth=0.1)
+    assert _price(scene, by_features).difference(moved).item() < 0.05 * _price(scene).difference(moved).item()
+
+
+def test_there_is_no_price_without_weight_company_or_view() -> None:
+    scene = _grid()
+    assert MotionCoherence.of(scene, _cameras(), config=replace(CONFIG, weight=0.0)) is None
+    alone = replace(scene, anchors=scene.anchors.select(torch.arange(1)))
+    assert MotionCoherence.of(alone, _cameras(), config=CONFIG) is None
+    assert MotionCoherence.of(scene, [], config=CONFIG) is None
+
+
+def test_two_anchors_are_each_others_neighbours() -> None:
+    scene = _grid()
+    price = _price(replace(scene, anchors=scene.anchors.select(torch.arange(2))))
+    assert price.neighbours.tolist() == [[1], [0]]
+
+
+@pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"neighbours": 0}, {"bandwidth": 0.0}, {"slack_pixels": 0.0}])
+def test_wrong_values_are_refused(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match=r"online\.coherence"):
+        CoherenceConfig(**wrong)
