@@ -45,7 +45,7 @@ def test_each_second_belongs_to_one_stage(monkeypatch: pytest.MonkeyPatch) -> No
             yield number
 
     scene = small_scene(4, free=2)
-    fit = FitResult(scene, iterations=3, train_psnr=30.0, moving=2, seconds={"backward": 4.0})
+    fit = FitResult(scene, iterations=3, train_psnr=30.0, moving=2, seconds={"backward": 4.0}, losses={"l1": 0.5})
     reports = []
     for meter, number in metered(frames(), CPU):
         clock.wall += 10.0
@@ -57,4 +57,5 @@ def test_each_second_belongs_to_one_stage(monkeypatch: pytest.MonkeyPatch) -> No
     assert [report.index for report in reports] == [0, 1]
     for report in reports:
         assert report.seconds == {"read": 1.0, "backward": 4.0, "fit": 10.0, "write": 100.0, "total": 111.0}
+        assert report.losses == {"l1": 0.5}
         assert (report.bytes, report.moving, report.anchors, report.free) == (9, 2, 4, 2)

@@ -30,6 +30,7 @@ class FrameReport:
     Peaks of memory are by stage: ``read``, ``fit``, ``store`` (encoding and writing), and ``prepare`` (computing frame
     0's data for later frames). ``peak_memory_kind`` states whether they are per stage (Note [Peaks]);
     ``peak_device_bytes`` are the GPU's, if any. ``cpu_seconds`` is the CPU time of all threads of the process.
+    ``losses`` are the means of the loss terms, without their weights, over the fit's last pass through the cameras.
     ``absent`` are the cameras without a picture of this frame, held-out ones among them. ``begins`` says why the frame
     begins another period, and is None if it does not.
     """
@@ -53,6 +54,7 @@ class FrameReport:
     peak_memory_kind: PeakKind = PeakKind.NONE
     cpu_seconds: float = 0.0
     counts: Mapping[str, int] = field(default_factory=dict)
+    losses: Mapping[str, float] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     begins: str | None = None
 
@@ -99,6 +101,7 @@ class FrameMeter:
             grown=fit.grown,
             removed=fit.removed,
             counts=dict(fit.counts),
+            losses=dict(fit.losses),
             seconds={**read, **fit.seconds, **self._seconds, "total": self._last - self._started},
             peak_memory_bytes=self._peaks.process_bytes,
             peak_device_bytes=self._peaks.device_bytes,
