@@ -13,7 +13,16 @@ from structgstream.groups.boundaries import check_length, equal_groups, quiet_gr
 def test_equal_groups_have_every_frame_once(frames: int, length: int) -> None:
     groups = equal_groups(frames, length)
     assert [frame for first, end in groups for frame in range(first, end)] == [*range(frames)]
-    assert all(end - first == length for first, end in groups[:-1])
+    assert all(end - first == length for first, end in groups[:-2])
+    assert groups[-1][1] - groups[-1][0] in range(2, length + 2) or length == 1 or frames == 1
+
+
+def test_a_last_frame_by_itself_goes_to_the_group_before() -> None:
+    assert equal_groups(61, 30) == [(0, 30), (30, 61)]
+    assert equal_groups(62, 30) == [(0, 30), (30, 60), (60, 62)]
+    assert equal_groups(1, 30) == [(0, 1)]
+    assert equal_groups(3, 1) == [(0, 1), (1, 2), (2, 3)], "as was asked for"
+    assert quiet_groups(61, 30, {30: 0.1, 60: 0.0}) == [(0, 30), (30, 61)]
 
 
 @given(st.integers(1, 20), st.integers(1, 4), st.data())

@@ -21,15 +21,21 @@ def check_length(length: int, *, key_interval: int) -> None:
 
 
 def equal_groups(frames: int, length: int) -> list[tuple[int, int]]:
-    """Groups ``(first frame, end)`` of ``length`` frames; the last may be shorter."""
-    return [(first, min(first + length, frames)) for first in range(0, frames, length)]
+    """Groups ``(first frame, end)`` of ``length`` frames; the last may be shorter, or one frame longer.
+
+    A last frame by itself goes to the group before: handing over needs a group's second frame (``hand_over.py``).
+    """
+    firsts = [*range(0, frames, length)]
+    if length > 1 and len(firsts) > 1 and frames - firsts[-1] == 1:
+        firsts.pop()
+    return [*zip(firsts, [*firsts[1:], frames], strict=True)]
 
 
 def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
     """Groups of about ``length`` frames that begin where little moves.
 
     Of all divisions into groups of at least half and at most one and a half times ``length``, the one in which the
-    sum of ``changed`` over the borders is least for their number; the last group may be shorter.
+    sum of ``changed`` over the borders is least for their number; the last group may be shorter, but has two frames.
 
     Args:
         frames: of all groups.
@@ -45,7 +51,11 @@ def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list
         if found and frame < frames:
             cost, first = min(found)
             best[frame] = (cost + changed[frame] + mean, first)
-    ends = [(cost, first) for first, (cost, _) in best.items() if frames - first <= most]
+    ends = [
+        (cost, first)
+        for first, (cost, _) in best.items()
+        if frames - first <= most and (frames - first > 1 or not first)
+    ]
     if not ends:
         return equal_groups(frames, length)
     first, end, groups = min(ends)[1], frames, []
