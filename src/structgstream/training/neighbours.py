@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nearest neighbours in space."""
 
-import numpy as np
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -19,11 +20,10 @@ def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
     count = min(count, len(among))
-    # As a list of ranks the result has two dimensions even for one neighbour.
-    distances, rows = KDTree(among.detach().double().numpy(force=True)).query(
-        points.detach().double().numpy(force=True), k=list(range(1, count + 1))
-    )
-    return torch.from_numpy(np.asarray(rows)).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
+    ranks: Any = list(range(1, count + 1))  # A list, so that the result has two dimensions even for one neighbour.
+    tree = KDTree(among.detach().double().numpy(force=True))
+    distances, rows = tree.query(points.detach().double().numpy(force=True), k=ranks)
+    return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
 
 
 def nearest_others(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
