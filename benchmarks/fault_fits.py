@@ -7,6 +7,7 @@ import signal
 import time
 import traceback
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 from benchmarks.fault_viewers import NAME, NUMBER, Trainer, ViewerRow, finish, wait_for_viewers, watched
@@ -22,8 +23,10 @@ def killed_fits(*, kills: int, seed: int, folder: Path, players: int, page: bool
     Trainer(partial(_fit, folder / "whole")).end(None)
     frame_seconds = (time.monotonic() - began) / FRAMES
     whole = content(folder / "whole")
-    while row.kills < kills:
-        place = folder / f"after-{row.kills}"
+    for number in count():
+        if row.kills >= kills:
+            break
+        place = folder / f"stream-{number}"  # A stream may end before its first kill.
         place.mkdir()
         one = _stream(rng, whole, place, players=players, page=page, most=kills - row.kills, seconds=frame_seconds)
         added_up(row, one)
