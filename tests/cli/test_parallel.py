@@ -9,13 +9,13 @@ from quick_streams import CLIP, QUARTER, error_of
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 
-GROUPS = ["--frames", "5", "--groups", "2", "--odd", "--executor", "inline"]
+GROUPS = ["--frames", "6", "--groups", "2", "--odd", "--executor", "inline"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 
 
 @pytest.fixture(scope="module")
 def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five frames in groups of two, hardly trained."""
+    """Six frames in groups of two, hardly trained."""
     path = tmp_path_factory.mktemp("parallel") / "clip.sgs"
     assert main(["parallel", CLIP, "-o", str(path), *GROUPS, *QUARTER]) == 0
     return path
@@ -23,12 +23,12 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_result_is_an_ordinary_stream(stream: Path) -> None:
     with open_stream(stream) as reader:
-        assert len(reader) == 5
+        assert len(reader) == 6
     parts = stream.with_name("clip.sgs.parts")
     assert sorted(path.name for path in (parts / "segments").glob("*.sgs")) == [
         "group-000000-000002.sgs",
         "group-000002-000004.sgs",
-        "group-000004-000005.sgs",
+        "group-000004-000006.sgs",
     ]
 
 
