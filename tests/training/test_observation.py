@@ -25,6 +25,13 @@ def test_movers_are_anchors_then_free_gaussians() -> None:
     assert found.tolist() == [sum(range(i * k, i * k + k)) for i in range(4)] + [4 * k, 4 * k + 1]
 
 
+def test_all_movers_may_be_free_gaussians() -> None:
+    """A scene without anchors is what moves where only free Gaussians do."""
+    scene = random_scene(0, free=2)
+    assert sum_by_mover(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), scene).tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert torch.equal(mover_centers(scene, torch.ones(2)), scene.free.means)
+
+
 def test_gathered_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from_it() -> None:
     scene = random_scene(30, free=3)
     gaussians = scene.gaussians(CAMERA, BACKEND)

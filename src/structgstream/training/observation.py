@@ -73,7 +73,7 @@ def slot_count(scene: Scene) -> int:
 def sum_by_mover(sums: Tensor, scene: Scene) -> Tensor:
     """Sums by id ``[M * K + F, C]`` as sums by mover ``[M + F, C]``."""
     m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
-    return torch.cat([sums[: m * k].reshape(m, k, -1).sum(1), sums[m * k :]])
+    return torch.cat([sums[: m * k].reshape(m, k, sums.shape[1]).sum(1), sums[m * k :]])
 
 
 def flow_evidence(sums: Sequence[Tensor], *, least_pixels: float, most_pixels: float) -> MotionEvidence:
@@ -100,6 +100,6 @@ def mover_centers(scene: Scene, coverage: Tensor) -> Tensor:
     """
     anchors, m = scene.anchors, len(scene.anchors) * scene.anchors.offsets_per_anchor
     reach = anchors.offsets * anchors.log_offset_scales.exp()[:, None]
-    weights = coverage[:m].reshape(len(anchors), -1, 1)
+    weights = coverage[:m].reshape(len(anchors), anchors.offsets_per_anchor, 1)
     mean = (reach * weights).sum(1) / weights.sum(1).clamp(min=1e-6)
     return torch.cat([anchors.positions + mean, scene.free.means])
