@@ -14,6 +14,7 @@ from benchmarks.fault_viewers import NAME, NUMBER, Trainer, ViewerRow, finish, w
 from benchmarks.stream_writers import content, edge_of, real_writer
 
 FRAMES = 12
+MOST_UNKILLED = 10
 
 
 def killed_fits(*, kills: int, seed: int, folder: Path, players: int, page: bool) -> ViewerRow:
@@ -23,13 +24,19 @@ def killed_fits(*, kills: int, seed: int, folder: Path, players: int, page: bool
     Trainer(partial(_fit, folder / "whole")).end(None)
     frame_seconds = (time.monotonic() - began) / FRAMES
     whole = content(folder / "whole")
-    for number in count():
-        if row.kills >= kills:
-            break
-        place = folder / f"stream-{number}"  # A stream may end before its first kill.
+    streams, unkilled = count(), 0
+    while row.kills < kills:
+        place = folder / f"stream-{next(streams)}"
         place.mkdir()
         one = _stream(rng, whole, place, players=players, page=page, most=kills - row.kills, seconds=frame_seconds)
         added_up(row, one)
+        # A stream may end before its first kill, on a busy machine even many in a row.
+        unkilled = 0 if one.kills else unkilled + 1
+        if unkilled == MOST_UNKILLED:
+            raise RuntimeError(
+                f"{unkilled} streams in a row ended before their first kill, after {row.kills} of {kills} kills; the "
+                "machine starts the viewers too slowly for streams this short: try --no-page or fewer --players."
+            )
     return row
 
 

@@ -5,16 +5,18 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from benchmarks.fault_cameras import FILMED, Seen, State, Viewer, camera_row
 from benchmarks.fault_film import PERIOD_SECONDS, Film, Moment, film_of, pictures, read_film, write_film
-from benchmarks.fault_fits import added_up
+from benchmarks.fault_fits import added_up, killed_fits
 from benchmarks.fault_report import table
 from benchmarks.fault_viewers import ViewerRow, killed_servers, killed_trainers
 from benchmarks.faults import parsed
 
+from benchmarks import fault_fits
 from repeated_streams import small_sent
 from structgstream.frames import MultiViewFrame
 
@@ -109,6 +111,16 @@ def test_all_is_asked_for_by_default() -> None:
     assert options.moments >= 200
     assert options.kills >= 200
     assert np.isfinite(options.down_seconds)
+
+
+def test_a_series_of_streams_that_end_before_their_first_kill_ends(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(fault_fits, "Trainer", lambda work: SimpleNamespace(end=lambda signal: 0))
+    monkeypatch.setattr(fault_fits, "content", lambda folder: b"")
+    monkeypatch.setattr(fault_fits, "_stream", lambda *args, **options: ViewerRow("one stream", equal=True))
+    with pytest.raises(RuntimeError, match="10 streams in a row .* after 0 of 3 kills"):
+        killed_fits(kills=3, seed=0, folder=tmp_path, players=1, page=False)
 
 
 def test_streams_of_the_trainer_that_fits_are_added_up() -> None:

@@ -92,7 +92,10 @@ def test_two_anchors_are_each_others_neighbours() -> None:
     assert price.neighbours.tolist() == [[1], [0]]
 
 
-@pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"neighbours": 0}, {"bandwidth": 0.0}, {"slack_pixels": 0.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"weight": -1.0}, {"neighbours": 0}, {"bandwidth": 0.0}, {"feature_bandwidth": -1.0}, {"slack_pixels": 0.0}],
+)
 def test_wrong_values_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=r"online\.coherence"):
         CoherenceConfig(**wrong)

@@ -35,7 +35,8 @@ def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list
     """Groups of about ``length`` frames that begin where little moves.
 
     Of all divisions into groups of at least half and at most one and a half times ``length``, the one in which the
-    sum of ``changed`` over the borders is least for their number; the last group may be shorter, but has two frames.
+    sum of ``changed`` over the borders is least for their number; the last group may be shorter, but has at least
+    two frames.
 
     Args:
         frames: of all groups.

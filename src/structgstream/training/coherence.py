@@ -37,11 +37,12 @@ class CoherenceConfig:
     """Differences far below this cost in proportion to their square, those far above it to their length."""
 
     def __post_init__(self) -> None:
-        if self.weight < 0.0 or self.neighbours < 1 or self.bandwidth <= 0.0 or self.slack_pixels <= 0.0:
+        least_of_two = min(self.weight, self.feature_bandwidth)
+        if least_of_two < 0.0 or self.neighbours < 1 or self.bandwidth <= 0.0 or self.slack_pixels <= 0.0:
             raise ConfigError(
                 f"online.coherence has weight {self.weight:g}, {self.neighbours} neighbours, bandwidth "
-                f"{self.bandwidth:g} and slack {self.slack_pixels:g}; expected a weight of at least 0, at least one "
-                "neighbour, and the others above 0."
+                f"{self.bandwidth:g}, feature bandwidth {self.feature_bandwidth:g} and slack {self.slack_pixels:g}; "
+                "expected a weight and a feature bandwidth of at least 0, at least one neighbour, and the others above 0."
             )
 
 
