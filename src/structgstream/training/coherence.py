@@ -42,7 +42,7 @@ class CoherenceConfig:
             raise ConfigError(
                 f"online.coherence has weight {self.weight:g}, {self.neighbours} neighbours, bandwidth "
                 f"{self.bandwidth:g}, feature bandwidth {self.feature_bandwidth:g} and slack {self.slack_pixels:g}; "
-                "expected a weight and a feature bandwidth of at least 0, at least one neighbour, and the others above 0."
+                "expected a weight and a feature bandwidth of at least 0, at least one neighbour, the others above 0."
             )
 
 
