@@ -64,8 +64,8 @@ class Now:
         self.instant = 0
         self._kept = KeptFrames(self.folder, cameras=self.rig.training, resume=self.resume)
 
-    def keep(self, first: int, *, last: int) -> None:
-        self._kept.need(first, last=last)
+    def keep(self, *first: int, last: int) -> None:
+        self._kept.need(*first, last=last)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         index = start

@@ -69,15 +69,15 @@ class TimedPictures(Protocol):
 class KeepsFrames(Protocol):
     """What a stream adds that can hand out only those of its older frames again which it was told to keep."""
 
-    def keep(self, first: int, *, last: int) -> None:
-        """Keep frame ``first``, and at any time the ``last`` frames handed out; others may go."""
+    def keep(self, *first: int, last: int) -> None:
+        """Keep the frames ``first``, and at any time the ``last`` frames handed out; others may go."""
         ...
 
 
-def keep_frames(source: FrameStream, first: int, *, last: int) -> None:
+def keep_frames(source: FrameStream, *first: int, last: int) -> None:
     """Ask for what a resumed run reads again, which recordings have anyway."""
     if isinstance(source, KeepsFrames):
-        source.keep(first, last=last)
+        source.keep(*first, last=last)
 
 
 def is_recording(source: FrameStream) -> TypeGuard[FrameSource]:

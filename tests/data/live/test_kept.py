@@ -46,6 +46,17 @@ def test_what_a_period_needs_is_kept_instead(tmp_path: Path) -> None:
     assert found == [11, *range(14, 20)]
 
 
+def test_several_periods_keep_a_first_frame_each(tmp_path: Path) -> None:
+    """As those of several qualities, which need not begin with the same frame."""
+    frames = kept(tmp_path / "x.live")
+    for index in range(20):
+        frames.keep(frame(index), origin_seconds=0.0)
+        if index == 6:
+            frames.need(4, 6, last=0)
+    found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").iterdir())
+    assert found == [4, 6, 17, 18, 19]
+
+
 def test_frames_of_a_run_that_was_resumed_earlier_are_removed(tmp_path: Path) -> None:
     """A stream that lost its last frames goes on before those that are kept."""
     frames = kept(tmp_path / "x.live")

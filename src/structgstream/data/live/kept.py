@@ -39,13 +39,13 @@ class KeptFrames:
 
     def __init__(self, folder: Path, *, cameras: tuple[str, ...], resume: bool) -> None:
         self._folder, self._cameras = folder, cameras
-        self._first, self._last = 0, LAST
+        self._first, self._last = frozenset({0}), LAST
         if not resume:
             self._remove(self._files())
 
-    def need(self, first: int, *, last: int) -> None:
-        """From now on frame ``first`` is kept, and so are ``last`` frames before the one that is fitted."""
-        self._first, self._last = first, max(last + LAST - 1, LAST)
+    def need(self, *first: int, last: int) -> None:
+        """From now on the frames ``first`` are kept, and so are ``last`` frames before the one that is fitted."""
+        self._first, self._last = frozenset(first), max(last + LAST - 1, LAST)
 
     def keep(self, frame: MultiViewFrame, *, origin_seconds: float) -> None:
         """Keeps a frame's pictures, and removes those that are no longer needed.
@@ -67,7 +67,7 @@ class KeptFrames:
         write_pictures(self._path(frame.index), kept, sync=True, origin_seconds=origin_seconds)
         oldest = frame.index - self._last + 1
         files = self._files().items()
-        self._remove({n: file for n, file in files if n > frame.index or (n < oldest and n != self._first)})
+        self._remove({n: file for n, file in files if n > frame.index or (n < oldest and n not in self._first)})
 
     def following(self, start: int) -> Iterator[MultiViewFrame]:
         """The kept frames from number ``start`` on, without a gap; none if the next frame is ``start``.

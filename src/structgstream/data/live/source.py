@@ -127,9 +127,9 @@ class LiveSource:
         """See ``ArrivingFrames``."""
         return self._options.policy == "latest"
 
-    def keep(self, first: int, *, last: int) -> None:
+    def keep(self, *first: int, last: int) -> None:
         """See ``KeepsFrames``."""
-        self._kept.need(first, last=last)
+        self._kept.need(*first, last=last)
 
     def stop(self) -> None:
         """The stream ends instead of handing out another frame; may be called from any thread or a signal's handler."""
