@@ -58,6 +58,31 @@ def test_rates_stages_and_sizes_are_of_the_last_frames(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.partial"))
 
 
+def test_each_quality_has_its_own_numbers(tmp_path: Path) -> None:
+    metrics = RunMetrics(tmp_path / "x", fps=10.0, qualities=("low", "high"))
+    metrics.quality("low", frame_report(0, bytes=100, train_psnr=25.0, anchors=7, seconds={"total": 1.0}))
+    values = metrics.values()
+    assert values["qualities"]["low"] == {
+        "frames": 1,
+        "pts_seconds": 0.0,
+        "bytes": 100,
+        "bits_per_second": pytest.approx(8000.0),
+        "seconds_by_stage": {"total": 1.0},
+        "train_psnr": 25.0,
+        "anchors": 7,
+        "free": 0,
+    }
+    assert values["qualities"]["high"]["bytes"] == 0
+    assert values["qualities"]["high"]["frames"] is values["qualities"]["high"]["train_psnr"] is None
+    metrics.quality("high", frame_report(0, bytes=300, train_psnr=30.0, seconds={"total": 2.0}))
+    metrics.frame(frame_report(0, bytes=400, seconds={"total": 3.0}))
+    values = read(tmp_path / "x")
+    assert (values["frames"], values["bytes"], values["seconds_by_stage"]) == (1, 400, {"total": 3.0})
+    assert values["train_psnr"] is values["anchors"] is values["free"] is None
+    assert values["qualities"]["high"]["train_psnr"] == 30.0
+    assert "qualities" not in RunMetrics(tmp_path / "y", fps=10.0).values()
+
+
 def test_before_the_first_frame_and_of_a_recording_what_is_unknown_is_null(tmp_path: Path) -> None:
     metrics = RunMetrics(tmp_path / "x.sgs", fps=30.0, total=12)
     metrics.write()

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from enum import StrEnum
@@ -45,6 +45,42 @@ def metrics_path(stream: Path) -> Path:
     return stream.with_suffix(".metrics.json")
 
 
+class Figures:
+    """What the last frames of a stream, or of all qualities of one, took.
+
+    Args:
+        fps: frames a second of the media.
+    """
+
+    def __init__(self, fps: float) -> None:
+        self._fps = fps
+        self._recent: deque[FrameReport] = deque(maxlen=RECENT)
+        self._bytes = 0
+
+    def add(self, report: FrameReport) -> None:
+        """Takes a frame's report."""
+        self._recent.append(report)
+        self._bytes += report.bytes
+
+    @property
+    def frames(self) -> int | None:
+        """How many there are up to the newest one; None before the first report."""
+        return self._recent[-1].index + 1 if self._recent else None
+
+    def values(self) -> dict[str, Any]:
+        """Sizes, times and Gaussians, as plain JSON values; what is not known is None."""
+        last = self._recent[-1] if self._recent else None
+        return {
+            "pts_seconds": None if last is None else last.pts_seconds,
+            "bytes": self._bytes,
+            "bits_per_second": _bit_rate([*self._recent], self._fps),
+            "seconds_by_stage": _mean([report.seconds for report in self._recent]),
+            "train_psnr": None if last is None or not math.isfinite(last.train_psnr) else last.train_psnr,
+            "anchors": None if last is None else last.anchors,
+            "free": None if last is None else last.free,
+        }
+
+
 class RunMetrics:
     """Collects what a run does.
 
@@ -55,6 +91,7 @@ class RunMetrics:
         done: number of frames that were there before.
         live: what live cameras do; None for a recording.
         captured: when a frame was filmed, Unix time, by its number; None where that is not known.
+        qualities: names of those that the run makes of each frame; none where it makes one stream.
         now: monotonic seconds.
         unix: Unix time.
     """
@@ -68,6 +105,7 @@ class RunMetrics:
         done: int = 0,
         live: Callable[[], LiveStatus] | None = None,
         captured: Callable[[int], float | None] | None = None,
+        qualities: Sequence[str] = (),
         now: Callable[[], float] = time.monotonic,
         unix: Callable[[], float] = time.time,
     ) -> None:
@@ -76,18 +114,26 @@ class RunMetrics:
         self._age: float | None = None
         self._begun = now()
         self._state = RunState.WAITING
-        self._recent: deque[tuple[float, FrameReport]] = deque(maxlen=RECENT)
+        self._figures = Figures(fps)
+        self._absent: list[str] | None = None
+        self._qualities = {name: Figures(fps) for name in qualities}
+        self._stored: deque[tuple[float, int]] = deque(maxlen=RECENT)
         self._arrived: deque[tuple[float, int]] = deque(maxlen=RECENT)
-        self._bytes = 0
         self._lock, self._writing = threading.Lock(), threading.Lock()
 
+    def quality(self, name: str, report: FrameReport) -> None:
+        """Takes a frame's report of one of the qualities, before that of the whole frame."""
+        with self._lock:
+            self._qualities[name].add(report)
+
     def frame(self, report: FrameReport) -> dict[str, Any]:
-        """Takes a frame's report; what its line of the log gets besides, if the run is live."""
+        """Takes a frame's report, of all qualities; what its line of the log gets besides, if the run is live."""
         with self._lock:
             self._state = RunState.RUNNING
-            self._recent.append((self._now(), report))
+            self._figures.add(report)
+            self._stored.append((self._now(), report.index))
+            self._absent = list(report.absent)
             self._done = report.index + 1
-            self._bytes += report.bytes
             filmed = None if self._captured is None else self._captured(report.index)
             self._age = None if filmed is None else self._unix() - filmed
         self.write()
@@ -101,11 +147,14 @@ class RunMetrics:
         """Everything, as plain JSON values."""
         live = None if self._live is None else self._live()
         with self._lock:
-            now, recent = self._now(), [*self._recent]
+            now, figures = self._now(), self._figures.values()
             if live is not None:
                 self._arrived.append((now, live.sets))
-            arrived = [*self._arrived]
-            last = recent[-1][1] if recent else None
+            several: dict[str, Any] = {}
+            if self._qualities:  # Gaussians and decibels are those of a quality.
+                figures |= {"train_psnr": None, "anchors": None, "free": None}
+                each = {name: {"frames": own.frames, **own.values()} for name, own in self._qualities.items()}
+                several["qualities"] = each
             return {
                 "format": FORMAT,
                 "version": VERSION,
@@ -117,20 +166,15 @@ class RunMetrics:
                 "frames": self._done,
                 "frames_total": self._total,
                 "fps": self._fps,
-                "frames_in_per_second": None if live is None else _rate(arrived),
-                "frames_out_per_second": _rate([(at, report.index) for at, report in recent]),
-                "pts_seconds": None if last is None else last.pts_seconds,
+                "frames_in_per_second": None if live is None else _rate([*self._arrived]),
+                "frames_out_per_second": _rate([*self._stored]),
                 "stored_after_seconds": self._age,
-                "bytes": self._bytes,
-                "bits_per_second": _bit_rate([report for _, report in recent], self._fps),
-                "seconds_by_stage": _mean([report.seconds for _, report in recent]),
-                "train_psnr": None if last is None or not math.isfinite(last.train_psnr) else last.train_psnr,
-                "anchors": None if last is None else last.anchors,
-                "free": None if last is None else last.free,
-                "absent": None if last is None else list(last.absent),
+                **figures,
+                "absent": self._absent,
                 "disk_free_bytes": free_bytes(self._stream),
                 "resident_bytes": resident_bytes(),
                 "live": None if live is None else asdict(live),
+                **several,
             }
 
     def write(self) -> None:

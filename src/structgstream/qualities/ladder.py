@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which qualities a run makes: their names, and how fine each one is."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from structgstream.codec.segments.quality_list import MOST_QUALITIES, is_quality_name
+from structgstream.errors import ConfigError
+from structgstream.presets import MOST_QUALITY, StreamConfig, with_budget
+
+_GIVEN = re.compile(r"([^=]*)=([^=]*)")
+
+
+@dataclass(frozen=True)
+class Quality:
+    """One of the qualities.
+
+    Args:
+        name: of its folder.
+        fineness: ``online.rounding.quality``: 0 is the preset's own, 1 halves every quantization step.
+    """
+
+    name: str
+    fineness: float
+
+
+def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
+    """The qualities of texts such as ``low=-1``, the coarsest first: viewers begin with that one.
+
+    Raises:
+        ConfigError: a text is none, two have one name or are equally fine, or they are too few or too many.
+    """
+    qualities = sorted(map(_parsed, given), key=lambda quality: quality.fineness)
+    if not 2 <= len(qualities) <= MOST_QUALITIES:
+        raise ConfigError(
+            f"--qualities takes 2 to {MOST_QUALITIES} qualities, which is what players choose from, got "
+            f"{len(qualities)}; for a single one give --quality."
+        )
+    # Not every file system tells large letters from small ones.
+    for what, values in (("name", [q.name.lower() for q in qualities]), ("Q", [f"{q.fineness:g}" for q in qualities])):
+        if twice := [one for one, other in pairwise(sorted(values)) if one == other]:
+            raise ConfigError(
+                f"--qualities has the {what} {twice[0]} twice; each quality needs a name and a Q of its own."
+            )
+    return tuple(qualities)
+
+
+def configured(config: StreamConfig, quality: Quality) -> StreamConfig:
+    """``config`` with a quality, as ``--quality`` makes it.
+
+    Raises:
+        ConfigError: the codec has no such knob.
+    """
+    if config.codec != "compact":
+        raise ConfigError(
+            f"--qualities is for streams with the codec compact, got the codec {config.codec}; add --preset compact."
+        )
+    return with_budget(config, name=None, quality=quality.fineness, mbits=None)
+
+
+def _parsed(text: str) -> Quality:
+    match = _GIVEN.fullmatch(text)
+    try:
+        name, fineness = ("", float("nan")) if match is None else (match[1], float(match[2]))
+    except ValueError:
+        name, fineness = "", float("nan")
+    if not is_quality_name(name) or not abs(fineness) <= MOST_QUALITY:
+        raise ConfigError(
+            f"--qualities {text} is no quality; expected NAME=Q, a name of letters, digits, '-' and '_' and a Q from "
+            f"{-MOST_QUALITY:g} to {MOST_QUALITY:g}, such as low=-1 or high=1."
+        )
+    return Quality(name, fineness)

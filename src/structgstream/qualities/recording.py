@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several qualities of one stream, written frame by frame from one reading of the cameras.
+
+Note [In step]
+~~~~~~~~~~~~~~
+Each quality is a session of its own, as a run with that quality alone would be. The one with the fewest frames is
+always advanced, the coarsest first where several have as many. So all are given the same frames (Note [Readers]), no
+two are more than one frame apart whenever the process is killed, and one that lacks a frame gets it before any other
+goes on.
+"""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from structgstream.codec.packets import PacketSink
+from structgstream.data.prefetch import read_ahead
+from structgstream.data.shared_frames import SharedFrames
+from structgstream.data.source import FrameStream
+from structgstream.errors import StorageError
+from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
+from structgstream.frame_report import FrameReport
+from structgstream.kernels.backend import Backend
+from structgstream.pipeline import Pipeline, StoredStream
+from structgstream.presets import StreamConfig
+from structgstream.qualities.bit_rates import BitRates
+from structgstream.qualities.joint_frame import joint_entry, joint_report
+from structgstream.qualities.ladder import Quality, configured
+from structgstream.qualities.shared_work import SharedWork, shared_pipeline
+from structgstream.recorder import Storage, log_reports
+from structgstream.run_metrics import RunMetrics
+from structgstream.scene.scene import Scene
+from structgstream.session import Session
+from structgstream.training.result import StepListener
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """A stored frame of a quality.
+
+    Args:
+        quality: its name.
+        report: of the frame.
+        whole: whether all qualities have the frame now.
+    """
+
+    quality: str
+    report: FrameReport
+    whole: bool
+
+
+@dataclass(frozen=True)
+class QualitiesRun:
+    """A reconstruction into several qualities.
+
+    Args:
+        done: number of frames that all of them had before.
+        reports: of the further frames; advancing the generator fits, stores and logs one frame of one quality.
+    """
+
+    done: int
+    reports: Generator[QualityReport, None, None]
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A quality before it goes on: its name and pipeline, its sink, and the frames that it has."""
+
+    name: str
+    pipeline: Pipeline[Scene, Any]
+    sink: PacketSink
+    stored: StoredStream[Scene] | None
+
+    @property
+    def done(self) -> int:
+        return 0 if self.stored is None else len(self.stored)
+
+    @property
+    def start(self) -> int:
+        """The first frame that its session reads: the one before the next, if changes since that are needed."""
+        return max(self.done - self.pipeline.method.needs_before, 0)
+
+    @property
+    def first(self) -> int:
+        """The first frame of its period, which a resumed session reads again."""
+        return 0 if self.stored is None or not self.done else self.stored.period(self.done - 1).first_frame
+
+
+def record_qualities(
+    folder: Path,
+    source: FrameStream,
+    config: StreamConfig,
+    qualities: Sequence[Quality],
+    backend: Backend,
+    *,
+    storages: Mapping[str, Storage[Scene]],
+    resume: bool = False,
+    metadata: Mapping[str, object] | None = None,
+    on_step: StepListener | None = None,
+    metrics: RunMetrics | None = None,
+) -> QualitiesRun:
+    """Reconstructs a capture in several qualities (Note [In step]), with a log of each and of the run.
+
+    The call checks existing streams, starts the logs and writes the list of qualities; streams are written as the
+    reports are consumed.
+
+    Args:
+        folder: holds ``qualities.json`` and a folder for each quality; logs lie beside what they are of.
+        source: the capture, or live cameras.
+        config: of all qualities but for their fineness.
+        qualities: at least one, the coarsest first.
+        backend: the compute back-end.
+        storages: opens the sink of each, by name.
+        resume: continue after the last whole frame of each.
+        metadata: plain JSON values for the headers.
+        on_step: called after every optimisation step.
+        metrics: is told of every frame, and has these qualities.
+
+    Raises:
+        ConfigError: a stream to resume was made with another configuration or from another capture.
+        StreamError: a stream to resume is damaged so that it cannot be continued.
+        StorageError: a stream, a log or the list cannot be written; whole frames stay.
+    """
+    work = SharedWork()
+    opened = []
+    for quality in qualities:
+        sink, stored = storages[quality.name](resume)
+        opened.append(_Opened(quality.name, shared_pipeline(configured(config, quality), work), sink, stored))
+    starts, firsts = [one.start for one in opened], [one.first for one in opened]
+    frames = SharedFrames(read_ahead(source), starts=starts, first=firsts)
+    reports = {}
+    for one, reader in zip(opened, frames.readers, strict=True):
+        session = Session(
+            reader, one.sink, one.pipeline, backend, resumed=one.stored, metadata=metadata, on_step=on_step
+        )
+        reports[one.name] = log_reports(session.run(), folder / one.name, done=one.done)
+    done = {one.name: one.done for one in opened}
+    rates, least = BitRates(folder, qualities), min(done.values())
+    rates.begin(resume=resume)
+    begin_log(folder, frames=least)
+    return QualitiesRun(least, _told(_in_step(reports, done, frames.close), folder, [*done], rates, metrics))
+
+
+def _in_step(
+    reports: Mapping[str, Generator[FrameReport, None, None]], done: Mapping[str, int], close: Callable[[], object]
+) -> Generator[QualityReport, None, None]:
+    """The reports of all sessions, always of the one with the fewest frames (Note [In step]).
+
+    Args:
+        reports: of each session, by name; they are closed with the result.
+        done: number of frames that each has.
+        close: called after that.
+    """
+    frames, going = dict(done), [*reports]
+    with ExitStack() as stack:
+        stack.callback(close)
+        for own in reports.values():
+            stack.enter_context(closing(own))
+        while going:
+            name = min(going, key=frames.__getitem__)
+            report = next(reports[name], None)
+            if report is None:
+                going.remove(name)
+                continue
+            frames[name] = report.index + 1
+            yield QualityReport(name, report, min(frames.values()) > report.index)
+
+
+def _told(
+    reports: Generator[QualityReport, None, None],
+    folder: Path,
+    names: Sequence[str],
+    rates: BitRates,
+    metrics: RunMetrics | None,
+) -> Generator[QualityReport, None, None]:
+    """The reports, each told to the list, the metrics and the run's log before it is yielded."""
+    now: dict[str, FrameReport] = {}
+    try:
+        with closing(reports):
+            for one in reports:
+                now[one.quality] = one.report
+                rates.add(one.quality, one.report)
+                if metrics is not None:
+                    metrics.quality(one.quality, one.report)
+                if one.whole:
+                    rates.refresh()
+                    joint = joint_report(now)
+                    further = {} if metrics is None else metrics.frame(joint)
+                    append_log(folder, joint_entry(joint, _lines(folder, names, now)) | further)
+                    now = {}
+                yield one
+    finally:
+        with suppress(StorageError):  # The streams are closed; what ended the run is to be told.
+            rates.refresh(last=True)
+
+
+def _lines(folder: Path, names: Sequence[str], now: Mapping[str, FrameReport]) -> dict[str, Mapping[str, Any]]:
+    """What the log of each quality says of a frame; of those that had it when the run was resumed, it is read."""
+    (index,) = {report.index for report in now.values()}
+    lines = {name: log_entry(now[name]) if name in now else read_log(folder / name).get(index) for name in names}
+    return {name: line for name, line in lines.items() if line is not None}

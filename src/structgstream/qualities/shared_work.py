@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is the same in all qualities of a stream is computed once: pictures, their changes, first frames.
+
+Note [Shared work]
+~~~~~~~~~~~~~~~~~~
+Qualities differ in quantization steps and in the price of a bit. Neither is used in preprocessing pictures, nor in the
+fit of frame 0 (or of a period that begins from points), which is quantized only afterwards. So each is computed for the
+quality that asks first, and the others get the same values: their bytes are those of a run of their own. Qualities
+fit a frame one after the other, so few results are wanted again; older ones are dropped.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, TypeVar
+
+from structgstream.cameras import CameraRig
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.pipeline import FrameTask, Past, Pipeline
+from structgstream.presets import StreamConfig
+from structgstream.scene.scene import Scene
+from structgstream.struct_gstream import FirstFrame, StructGStream, stream_pipeline
+from structgstream.training.pictures import FramePictures
+from structgstream.training.result import FitResult
+
+Value = TypeVar("Value")
+PICTURES_KEPT = 3
+"""Of the frame that is fitted, of the one after it, which may be read ahead, and of one before, where one lacks it."""
+
+
+class Once(Generic[Value]):
+    """Values that are computed for whoever asks first; others wait for them. Thread-safe.
+
+    Args:
+        most: number of values that are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._found: OrderedDict[Hashable, Future[Value]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def value(self, key: Hashable, make: Callable[[], Value]) -> tuple[Value, bool]:
+        """The value of ``key``, and whether it was made now. What ``make`` raises, all who wait for it get."""
+        with self._lock:
+            found = self._found.get(key)
+            mine = found is None
+            if found is None:
+                found = self._found[key] = Future()
+                while len(self._found) > self._most:
+                    self._found.popitem(last=False)
+        if mine:
+            try:
+                found.set_result(make())
+            except BaseException as error:
+                found.set_exception(error)
+                self._forget(key)
+        return found.result(), mine
+
+    def clear(self) -> None:
+        """Forgets all of them."""
+        with self._lock:
+            self._found.clear()
+
+    def _forget(self, key: Hashable) -> None:
+        with self._lock:
+            self._found.pop(key, None)
+
+
+@dataclass(frozen=True)
+class SharedWork:
+    """What the qualities of one run have in common.
+
+    Args:
+        pictures: preprocessed, by the numbers of a frame and of the one before it.
+        first: fits of first frames, by their numbers.
+    """
+
+    pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
+    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))
+
+
+@dataclass(frozen=True)
+class SharedMethod(StructGStream):
+    """The method of one of several qualities (Note [Shared work]).
+
+    Args:
+        shared: what they have in common.
+    """
+
+    shared: SharedWork = field(default_factory=SharedWork)
+
+    def observe(
+        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+    ) -> FramePictures:
+        """See ``StructGStream``."""
+        key = frame.index, None if before is None else before.index
+        observe = super().observe
+        return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
+
+    def first(self, task: FrameTask) -> FitResult[Scene]:
+        """See ``StructGStream``; the seconds of the fit are told once."""
+        first = super().first
+        fit, mine = self.shared.first.value(task.frame.index, lambda: first(task))
+        return fit if mine else replace(fit, seconds={})
+
+    def next(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
+        """See ``StructGStream``."""
+        if task.begins is None:  # Every quality has the frame before, so the fit of a first one is not needed again.
+            self.shared.first.clear()
+        return super().next(past, task)
+
+
+def shared_pipeline(config: StreamConfig, shared: SharedWork) -> Pipeline[Scene, Any]:
+    """The pipeline of one of several qualities.
+
+    Raises:
+        ConfigError: see ``stream_pipeline``.
+    """
+    return replace(stream_pipeline(config), method=SharedMethod(config, shared=shared))
