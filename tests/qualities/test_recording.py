@@ -271,9 +271,19 @@ def test_a_run_that_was_killed_between_two_qualities_goes_on_to_the_same_bytes(
     assert all([*entry["qualities"]] == list(NAMES) for entry in log.values())
 
 
-@pytest.mark.parametrize("after", [("low", 2), ("low", 3), ("high", 3)])
-@pytest.mark.parametrize("newest_only", [False, True])
-def test_periods_of_a_live_run_that_was_killed(tmp_path: Path, after: tuple[str, int], newest_only: bool) -> None:
+@pytest.fixture(scope="module")
+def periods_alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes of a run with one quality, two periods each."""
+    folder = tmp_path_factory.mktemp("alone")
+    return {name: alone(folder / f"{name}.sgs", name, PERIODS) for name in NAMES}
+
+
+@pytest.mark.parametrize(
+    ("after", "newest_only"), [(("low", 2), True), (("low", 3), True), (("low", 3), False), (("high", 3), True)]
+)
+def test_periods_of_a_live_run_that_was_killed(
+    periods_alone: dict[str, bytes], tmp_path: Path, after: tuple[str, int], newest_only: bool
+) -> None:
     """At the frame that begins another one in one quality and not yet in the other."""
     folder = tmp_path / "out"
     left_by_a_kill(begun(folder, Live(folder, newest_only=newest_only), PERIODS), folder, after=after)
@@ -281,7 +291,7 @@ def test_periods_of_a_live_run_that_was_killed(tmp_path: Path, after: tuple[str,
     for name in NAMES:
         with open_stream(folder / name) as reader:
             assert [period.first_frame for period in reader.periods] == [0, 3]
-        assert archived(folder, name) == alone(tmp_path / f"{name}.sgs", name, PERIODS)
+        assert archived(folder, name) == periods_alone[name]
 
 
 def test_what_is_complete_is_left_as_it_is(whole: Path, tmp_path: Path) -> None:
