@@ -125,3 +125,21 @@ def test_of_many_cameras_on_few_lines_the_last_are_cut_off(tmp_path: Path) -> No
     assert "frame 5" in drawn
     assert "cam00" in drawn
     assert "cam59" not in drawn
+
+
+def test_each_quality_has_a_row(tmp_path: Path) -> None:
+    made = RunMetrics(tmp_path / "x", fps=30.0, live=lambda: STATUS, qualities=("low", "high"))
+    made.quality("low", REPORT)
+    out = console(terminal=True)
+    with live_display(made.values, frames=None, console=out) as shown:
+        shown.frame(REPORT, quality="low")
+    last = text(out).splitlines()[-30:]
+    (row,) = (line for line in last if line.strip("│ ").startswith("low "))
+    assert row.strip("│ ").split() == ["low", "5", "480.0", "2.0", "kB", "31.20", "3.00"]
+    (row,) = (line for line in last if line.strip("│ ").startswith("high "))
+    assert row.strip("│ ").split() == ["high", "-", "-", "0", "B", "-", "-"]
+    assert any("frame 5  low  train 31.20 dB" in line for line in last)
+    lines = console(terminal=False)
+    with live_display(made.values, frames=None, console=lines) as shown:
+        shown.frame(REPORT, quality="low")
+    assert text(lines).startswith("frame 5  low  train 31.20 dB")

@@ -97,3 +97,13 @@ def test_bars_show_frames_iterations_and_the_last_frame() -> None:
 )
 def test_bytes_for_reading(count: float, words: str) -> None:
     assert human_bytes(count) == words
+
+
+def test_several_qualities_of_a_frame_are_told_apart() -> None:
+    for terminal in (False, True):
+        out = console(terminal=terminal)
+        with display(20, done=1, console=out) as shown:
+            for quality in ("low", "high"):
+                shown.step(Step(1, 100, 0.5, 34_512, 0))
+                shown.frame(REPORT, quality=quality)
+        assert "frame  2/20  high  train 31.20 dB" in text(out)

@@ -10,6 +10,7 @@ from segment_streams import header, packets
 from structgstream.cli.app import UsageError
 from structgstream.cli.segment_options import SegmentOptions
 from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.errors import StorageError
@@ -94,3 +95,16 @@ def test_a_folder_that_is_there_is_asked_for(tmp_path: Path) -> None:
         pass
     with options.storage(tmp_path / "now", may_exist=True, tell=print) as storage:
         assert storage is not None
+
+
+def test_each_quality_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    options, out = SegmentOptions(sink="segments"), tmp_path / "out"
+    found = options.quality_folders(out, ["low", "high"], resume=False, overwrite=False)
+    assert [*found] == ["low", "high"]
+    assert all((out / name).is_dir() for name in found)
+    write_list(out, [ListedQuality(name, f"{name}/{MANIFEST}", 1e6) for name in ("low", "high")])
+    assert SegmentOptions().quality_folders(out, ["high", "low"], resume=True, overwrite=False)
+    with pytest.raises(UsageError, match="holds the qualities low, high, got low, mid; give the same names"):
+        options.quality_folders(out, ["low", "mid"], resume=True, overwrite=False)
+    with pytest.raises(UsageError, match="holds several qualities of one stream; continue them with --qualities"):
+        options.chosen(out)

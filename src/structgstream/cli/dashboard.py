@@ -46,10 +46,10 @@ class LiveLines(Lines):
         super().__init__(frames, done, console=console)
         self._values = values
 
-    def frame(self, report: "FrameReport") -> None:
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Prints the frame's line."""
         self._current = report.index + 1
-        self._print(f"{summary(report, self._frames)}  {state_line(self._values())}")
+        self._print(f"{summary(report, self._frames, quality=quality)}  {state_line(self._values())}")
 
 
 class Dashboard:
@@ -77,9 +77,10 @@ class Dashboard:
         """Notes the iteration."""
         self._step = f"frame {self._next}  iteration {step.iteration}/{step.iterations}  loss {step.loss:.4f}"
 
-    def frame(self, report: "FrameReport") -> None:
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Notes the frame."""
-        self._step, self._last, self._next = "", summary(report, self._frames), report.index + 2
+        self._step, self._last = "", summary(report, self._frames, quality=quality)
+        self._next = report.index + 2
 
     def _drawn(self) -> Panel:
         values = self._values()
@@ -90,6 +91,8 @@ class Dashboard:
         parts += [Flow(self._last.split("  "))] if self._last else []
         doing = self._step or ("" if self._ended else self._between(values))
         parts += [Text(doing, style="dim")] if doing else []
+        if values.get("qualities"):
+            parts += [Text(), qualities_table(values["qualities"])]
         if values.get("live") is not None:
             parts += [Text(), cameras_table(values["live"]["cameras"])]
         title = f"{values['stream']}  {values['state']}  {_duration(values['running_seconds'])}"
@@ -155,6 +158,24 @@ def stage_parts(values: Mapping[str, Any]) -> list[str]:
     """Seconds by stage of the last frames' mean, the longest first."""
     stages = sorted(values["seconds_by_stage"].items(), key=lambda item: -item[1])
     return [f"{name} {seconds:.2f} s" for name, seconds in stages if name != "total"][:8]
+
+
+def qualities_table(qualities: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A row a quality: its frames, its rate and bytes, decibels on training views, and seconds a frame."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("quality", "frames", "kbit/s", "bytes", "train dB", "s a frame"):
+        table.add_column(title, justify="left" if title == "quality" else "right")
+    for name, own in qualities.items():
+        bits = own["bits_per_second"]
+        table.add_row(
+            Text(name),
+            "-" if own["frames"] is None else f"{own['frames']:,}",
+            "-" if bits is None else f"{bits / 1e3:,.1f}",
+            human_bytes(own["bytes"]),
+            _number(own["train_psnr"], 2),
+            _number(own["seconds_by_stage"].get("total"), 2),
+        )
+    return table
 
 
 def cameras_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:

@@ -4,12 +4,12 @@
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import tyro
 
@@ -21,6 +21,19 @@ if TYPE_CHECKING:
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import FrameStream
     from structgstream.run_metrics import RunMetrics
+
+
+class Stoppable(Protocol):
+    """What can be asked to end after the frame that is being made, such as a ``LiveSource``."""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was asked."""
+        ...
+
+    def stop(self) -> None:
+        """Asks; may be called by a signal's handler."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -77,15 +90,16 @@ def open_live(scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream:
         return LiveSource(scene, stream, options)
 
 
-def run_metrics(source: "FrameStream", stream: Path) -> "RunMetrics":
-    """The metrics of a run that writes ``stream``."""
+def run_metrics(source: "FrameStream", stream: Path, *, qualities: Sequence[str] = ()) -> "RunMetrics":
+    """The metrics of a run that writes ``stream``, in several ``qualities`` if there are names of some."""
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
     from structgstream.run_metrics import RunMetrics
 
     if isinstance(source, LiveSource):
-        return RunMetrics(stream, fps=source.fps, live=source.status, captured=source.captured)
-    return RunMetrics(stream, fps=source.fps, total=frame_count(source))
+        live, captured = source.status, source.captured
+        return RunMetrics(stream, fps=source.fps, live=live, captured=captured, qualities=qualities)
+    return RunMetrics(stream, fps=source.fps, total=frame_count(source), qualities=qualities)
 
 
 def ending_of(source: "FrameStream") -> Callable[[], object]:
@@ -114,7 +128,7 @@ def watched(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -
 
 
 @contextmanager
-def stopping(source: "LiveSource") -> Iterator[None]:
+def stopping(source: Stoppable) -> Iterator[None]:
     """The first Ctrl-C ends the stream after the frame that is fitted, the second one at once."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -29,8 +29,8 @@ class Display(AbstractContextManager["Display"], Protocol):
         """Called after each iteration."""
         ...
 
-    def frame(self, report: "FrameReport") -> None:
-        """Called after a frame is stored."""
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
+        """Called after a frame is stored, with the name of its quality where the run makes several."""
         ...
 
 
@@ -46,12 +46,12 @@ def display(frames: int | None, *, done: int = 0, console: Console | None = None
     return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
 
 
-def summary(report: "FrameReport", frames: int | None) -> str:
-    """One frame in one line, of ``frames`` where that is known."""
+def summary(report: "FrameReport", frames: int | None, *, quality: str | None = None) -> str:
+    """One frame in one line, of ``frames`` where that is known, and its quality where there are several."""
     number = str(report.index + 1) if frames is None else f"{report.index + 1:>{len(str(frames))}}/{frames}"
     moving = f" ({report.moving:,} moving)" if report.index and report.moving < report.anchors else ""
     return (
-        f"frame {number}  train {report.train_psnr:5.2f} dB  "
+        f"frame {number}{'' if quality is None else f'  {quality}'}  train {report.train_psnr:5.2f} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
         f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}{absences(report.absent)}"
@@ -122,10 +122,10 @@ class Lines:
                 f"loss {step.loss:.4f}, {step.anchors:,} anchors"
             )
 
-    def frame(self, report: "FrameReport") -> None:
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Prints the frame's line."""
         self._current = report.index + 1
-        self._print(summary(report, self._frames))
+        self._print(summary(report, self._frames, quality=quality))
 
     def _print(self, text: str) -> None:
         say(self._console, text)
@@ -167,9 +167,10 @@ class Bars:
         note = f"loss {step.loss:.4f}  {step.anchors:,} anchors  {step.free:,} free"
         self._progress.update(self._one, completed=step.iteration, total=step.iterations, note=note)
 
-    def frame(self, report: "FrameReport") -> None:
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Advances the bar of frames and resets that of iterations."""
-        note = f"{report.seconds['total']:.1f} s a frame"
+        note = f"{report.seconds['total']:.1f} s a frame" if quality is None else f"{quality} has it"
+        following = f"frame {report.index + 2}" if quality is None else "next"
         self._progress.update(self._all, completed=report.index + 1, note=note)
-        self._progress.reset(self._one, total=None, description=f"frame {report.index + 2}", note="")
-        self._last.plain = summary(report, self._frames)
+        self._progress.reset(self._one, total=None, description=following, note="")
+        self._last.plain = summary(report, self._frames, quality=quality)

@@ -27,7 +27,7 @@ from structgstream.cli.segment_options import SegmentOptions
 from structgstream.cli.termination import Terminated, Termination
 
 if TYPE_CHECKING:
-    from structgstream.cli.segment_options import SegmentsStorage
+    from structgstream.cli.segment_options import Captured, SegmentsStorage
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
     from structgstream.presets import StreamConfig
@@ -55,6 +55,8 @@ class Reconstruct:
 
     Example: structgstream reconstruct rig.toml -o now.sgs --live --preset fast --record take1
 
+    Example: structgstream reconstruct rig.toml -o now --live --sink segments --qualities low=-1 high=1
+
     With --init HEADER.sgs it fits one group of frames, which are joined later (reconstruct --init --help,
     docs/groups.md):
 
@@ -73,6 +75,11 @@ class Reconstruct:
     """Compact streams only: 0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
     mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """Compact streams only: target rate in Mbit/s over every second, without the header. Default: constant quality."""
+    qualities: Annotated[
+        tuple[str, ...] | None, tyro.conf.arg(metavar="NAME=Q NAME=Q [NAME=Q ...]", help_behavior_hint="")
+    ] = None
+    """Several qualities of the same frames, each a folder OUT/NAME of segments with --quality Q, and a list from which
+    players choose (docs/live.md). With --sink segments."""
     device: Device = "auto"
     """Compute back-end; auto takes the first available of cuda, cpu, reference."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
@@ -101,6 +108,11 @@ def main(arguments: list[str]) -> None:
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)
+    if options.qualities is not None:
+        from structgstream.cli import quality_run
+
+        quality_run.reconstruct(options, config, preset=preset)
+        return
     from structgstream.presets import with_budget
 
     with usage_errors():
@@ -120,6 +132,46 @@ def _reconstruct(
     storage: "SegmentsStorage | None",
     console: Console,
 ) -> None:
+    opened = open_scene(options, preset=preset, console=console)
+    peaks = run_reconstruction(
+        opened.source,
+        config,
+        output=options.output,
+        backend=opened.backend,
+        metadata=opened.metadata,
+        resume=options.resume,
+        storage=None if storage is None else storage(opened.captured),
+        metrics=run_metrics(opened.source, options.output),
+    )
+    if peaks:
+        stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
+        say(console, f"Peak memory by stage: {stages}.")
+
+
+@dataclass(frozen=True)
+class OpenedScene:
+    """What a run reads, and with what it computes.
+
+    Args:
+        source: a recording, or live cameras.
+        captured: when a frame was filmed, Unix time, by its number; None for a recording.
+        backend: the compute back-end.
+        metadata: of the run, for headers.
+    """
+
+    source: "FrameStream"
+    captured: "Captured | None"
+    backend: "Backend"
+    metadata: Mapping[str, object]
+
+
+def open_scene(options: Reconstruct, *, preset: str, console: Console) -> OpenedScene:
+    """The capture, or the live cameras, that the options name; says what it is.
+
+    Raises:
+        UsageError: options that contradict each other.
+        StructGStreamError: it cannot be read, or the back-end is not available.
+    """
     from structgstream.kernels.backend import select_backend
     from structgstream.presets import departures
 
@@ -138,19 +190,8 @@ def _reconstruct(
     )
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
-    peaks = run_reconstruction(
-        source,
-        config,
-        output=options.output,
-        backend=backend,
-        metadata={"preset": preset, "start": options.capture.start, "scale": options.capture.scale},
-        resume=options.resume,
-        storage=None if storage is None else storage(captured),
-        metrics=run_metrics(source, options.output),
-    )
-    if peaks:
-        stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
-        say(console, f"Peak memory by stage: {stages}.")
+    metadata = {"preset": preset, "start": options.capture.start, "scale": options.capture.scale}
+    return OpenedScene(source, captured, backend, metadata)
 
 
 def run_reconstruction(

@@ -2,7 +2,7 @@
 """Options of a stream that is written as segments, and where it goes."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -50,14 +50,61 @@ class SegmentOptions:
             UsageError: options of segments for a file, or values that make no sense.
         """
         from structgstream.codec.segments.manifest import MANIFEST
+        from structgstream.codec.segments.quality_list import read_list
 
+        if read_list(output) is not None:
+            raise UsageError(
+                f"{output} holds several qualities of one stream; continue them with --qualities, or choose another "
+                "name."
+            )
         found: Sink = "segments" if (output / MANIFEST).is_file() else "file"
         sink = self.sink or found
         if sink == "file" and (self.window is not None or self.publish is not None):
             raise UsageError(f"{'--publish' if self.window is None else '--window'} is for --sink segments.")
+        self._check_seconds()
+        return sink
+
+    def _check_seconds(self) -> None:
         if not (self.window is None or 0 < self.window < math.inf) or not self.keep >= 0:
             raise UsageError("--window must be a positive number of seconds, and --keep zero or more.")
-        return sink
+
+    def quality_folders(
+        self, output: Path, names: Sequence[str], *, resume: bool, overwrite: bool
+    ) -> "dict[str, SegmentsStorage]":
+        """Where each quality of a stream goes, a folder in ``output``, checked before anything takes time.
+
+        Raises:
+            UsageError: options that make no sense for several qualities, or ``output`` holds something else.
+            StorageError: a folder exists and may not be replaced, or cannot be written.
+        """
+        from structgstream.codec.segments.manifest import MANIFEST
+        from structgstream.codec.segments.quality_list import read_list
+        from structgstream.codec.segments.retention import SegmentsOptions
+        from structgstream.recorder import segments_folder
+
+        listed = read_list(output)
+        if self.sink == "file" or (self.sink is None and listed is None):
+            got = "no --sink" if self.sink is None else "--sink file"
+            raise UsageError(
+                f"--qualities writes a folder of segments for each quality, got {got}; add --sink segments."
+            )
+        if self.publish is not None:
+            raise UsageError(
+                "--publish copies one stream, and --qualities writes several; copy the folder with another program, or "
+                "run without it."
+            )
+        self._check_seconds()
+        if (output / MANIFEST).is_file():
+            raise UsageError(f"{output} holds one stream, and --qualities writes several; choose another name.")
+        there = [] if listed is None else [quality.name for quality in listed]
+        if listed is not None and (resume or overwrite) and sorted(there) != sorted(names):
+            raise UsageError(
+                f"{output} holds the qualities {', '.join(there)}, got {', '.join(names)}; give the same names, or "
+                "choose another OUT."
+            )
+        stores = {name: segments_folder(output / name, may_exist=resume or overwrite) for name in names}
+        options = SegmentsOptions(self.window, self.keep)
+        return {name: partial(_storage, store, options) for name, store in stores.items()}
 
     @contextmanager
     def storage(

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``reconstruct --qualities``: what it writes, what it refuses, how it ends and goes on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from quick_streams import CLIP, QUARTER, error_of
+from structgstream.cli import main
+from structgstream.cli.progress import Lines
+from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.quality_list import QUALITIES, read_list
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.segments.stored_bytes import read_manifest
+from structgstream.frame_report import FrameReport
+from test_live_source import files
+
+pytestmark = pytest.mark.usefixtures("quick_tiny")
+
+NAMES = ("low", "high")
+GIVEN = ["--sink", "segments", "--qualities", "high=1.5", "low=-2"]
+
+
+def asked(out: Path, *more: str, frames: int = 3) -> list[str]:
+    return ["reconstruct", CLIP, "-o", str(out), "--frames", str(frames), *QUARTER, *GIVEN, *more]
+
+
+def archived(folder: Path, out: Path) -> bytes:
+    assert main(["archive", str(folder), "-o", str(out), "--overwrite"]) == 0
+    return out.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames of the clip in two qualities."""
+    out = tmp_path_factory.mktemp("made") / "out"
+    assert main(asked(out)) == 0
+    return out
+
+
+def test_each_quality_is_what_a_run_with_it_writes(made: Path, tmp_path: Path) -> None:
+    for name, quality in (("low", "-2"), ("high", "1.5")):
+        alone = tmp_path / f"{name}.sgs"
+        single = ["reconstruct", CLIP, "-o", str(alone), "--frames", "3", *QUARTER, "--quality", quality]
+        assert main(single) == 0
+        assert archived(made / name, tmp_path / "a.sgs") == alone.read_bytes()
+
+
+def test_the_list_and_the_numbers_lie_where_they_belong(made: Path) -> None:
+    listed = read_list(made)
+    assert listed is not None
+    assert [(one.name, one.manifest) for one in listed] == [(name, f"{name}/manifest.json") for name in NAMES]
+    low, high = (one.bits_per_second for one in listed)
+    assert low < high
+    values = json.loads(made.with_suffix(".metrics.json").read_text())
+    assert (values["state"], values["frames"], values["frames_total"]) == ("finished", 3, 3)
+    assert [values["qualities"][name]["frames"] for name in NAMES] == [3, 3]
+    log = [json.loads(line) for line in made.with_suffix(".log.jsonl").read_text().splitlines()]
+    for name in NAMES:
+        own = [json.loads(line) for line in (made / f"{name}.log.jsonl").read_text().splitlines()]
+        assert [entry["qualities"][name]["bytes"] for entry in log] == [entry["bytes"] for entry in own]
+        assert values["qualities"][name]["bytes"] == sum(entry["bytes"] for entry in own)
+    assert {path.name for path in made.iterdir()} == {QUALITIES, *NAMES, *(f"{name}.log.jsonl" for name in NAMES)}
+
+
+def test_a_line_is_told_of_each_frame_and_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(asked(out, frames=2)) == 0
+    said = capsys.readouterr().out
+    lines = [line.split("  ")[:2] for line in said.splitlines() if line.startswith("frame ")]
+    assert lines == [[f"frame {number}/2", name] for number in (1, 2) for name in NAMES]
+    assert f"Wrote {out}: low, high" in said.replace("\n", " ")
+    error = error_of(asked(out), capsys, status=1)
+    assert "holds a stream; continue it with --resume" in error
+    assert main(asked(out, "--resume")) == 0
+    assert [len(open_stream(out / name)) for name in NAMES] == [3, 3]
+
+
+def test_resume_needs_no_word_on_segments(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [word for word in asked(out, frames=2) if word not in ("--sink", "segments")]
+    assert main([*command, "--sink", "segments"]) == 0
+    assert main([*command, "--frames", "3", "--resume"]) == 0
+    for name in NAMES:
+        assert archived(out / name, tmp_path / "a.sgs") == archived(made / name, tmp_path / "b.sgs")
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--quality", "1"], "got --quality besides"),
+        (["--mbits", "5"], "got --mbits besides"),
+        (["--sink", "file"], "got --sink file; add --sink segments"),
+        (["--publish", "s3://bucket/x"], "--publish copies one stream"),
+        (["--window", "0"], "--window must be a positive number"),
+        (["--qualities", "low=1"], "got 1; for a single one give --quality"),
+        (["--qualities", "low=1", "low=2"], "has the name low twice"),
+        (["--qualities", "a.b=1", "high=2"], "a.b=1 is no quality; expected NAME=Q"),
+        (["--qualities", "low=1", "high=9"], "a Q from -6 to 6"),
+        (["--preset", "rig"], "got the codec raw; add --preset compact"),
+        (["--resume", "--overwrite"], "choose one"),
+        (["--policy", "every"], "give --live and a rig file"),
+        (["--init", "x.sgs"], "--qualities"),
+    ],
+)
+def test_options_that_make_no_sense(
+    tmp_path: Path, more: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = error_of([*asked(tmp_path / "out"), *more], capsys, status=2)
+    assert said in " ".join(error.split())
+    assert not (tmp_path / "out" / QUALITIES).exists()
+
+
+def test_without_a_word_on_segments_it_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs"), *QUARTER, "--qualities", "low=-1", "high=1"]
+    assert "got no --sink; add --sink segments" in error_of(command, capsys, status=2)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_folder_of_something_else_is_left_alone(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file()}
+    for more in (["--resume"], ["--overwrite"]):
+        other = [word if word != "low=-2" else "lowest=-2" for word in asked(made, *more)]
+        assert "holds the qualities low, high, got lowest, high; give the same" in error_of(other, capsys, status=2)
+        one = ["reconstruct", CLIP, "-o", str(made), *QUARTER, "--sink", "segments", *more]
+        assert "holds several qualities of one stream" in error_of(one, capsys, status=2)
+    finer = [word if word != "low=-2" else "low=-1" for word in asked(made, "--resume")]
+    assert "online.rounding.quality differ" in error_of(finer, capsys, status=1)
+    assert {path: path.read_bytes() for path in made.rglob("*") if path.is_file()} == before
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "manifest.json").write_text("{}")
+    assert "holds one stream, and --qualities writes several" in error_of(asked(tmp_path / "one"), capsys, status=2)
+
+
+def test_ctrl_c_finishes_the_frame_in_all_and_resume_goes_on(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(self: Lines, report: FrameReport, *, quality: str | None = None) -> None:
+        if (report.index, quality) == (1, "low"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Lines, "frame", interrupted)
+        error = error_of(asked(out), capsys, status=130)
+    assert "has 2 of 3 frames in all qualities; continue with the same command and --resume" in " ".join(error.split())
+    for name in NAMES:
+        manifest = read_manifest(FolderStore(out / name))
+        assert (manifest.edge.frame, manifest.live) == (1, False)
+    assert main(asked(out, "--resume")) == 0
+    for name in NAMES:
+        assert archived(out / name, tmp_path / "a.sgs") == archived(made / name, tmp_path / "b.sgs")
+
+
+def test_sigterm_finishes_the_frame_in_all(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    # The fixture does not reach another process.
+    command = [sys.executable, "-m", "structgstream", *asked(out, "--points.max-points", "1500", frames=12)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    try:
+        while not (out / "low" / "manifest.json").is_file() and process.poll() is None:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGTERM)
+        _, error = process.communicate(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == 143, error
+    manifests = [read_manifest(FolderStore(out / name)) for name in NAMES]
+    done = manifests[0].edge.frame + 1
+    assert [(one.edge.frame, one.live, one.parts) for one in manifests] == [(done - 1, False, ())] * 2
+    assert 1 <= done < 12
+    assert f"{out} has {done} of 12 frames in all qualities" in error.decode()
+    assert json.loads((tmp_path / "out.metrics.json").read_text())["state"] == "finished"
+
+
+def live(out: Path, rig: Path, *more: str) -> int:
+    return main(["reconstruct", str(rig), "-o", str(out), "--live", *QUARTER[2:], *GIVEN, *more])
+
+
+def test_live_cameras_are_read_once_for_all_and_a_resumed_run_goes_on(tmp_path: Path) -> None:
+    rig, out = files(tmp_path, frames=60), tmp_path / "out"
+    assert live(out, rig, "--policy", "every", "--frames", "3", "--record", str(tmp_path / "take")) == 0
+    assert live(out, rig, "--frames", "5", "--resume") == 0
+    readers = [open_stream(out / name) for name in NAMES]
+    times = [[(info.index, info.pts_seconds) for info in reader.packets] for reader in readers]
+    assert times[0] == times[1]
+    assert len(times[0]) == 5
+    assert times[0] == sorted(times[0], key=lambda one: one[1])
+    manifests = [read_manifest(FolderStore(out / name)) for name in NAMES]
+    captured = [one.edge.captured_unix_seconds for one in manifests]
+    assert captured[0] == captured[1]
+    assert captured[0] is not None
+    assert len([*(tmp_path / "take").glob("*.ts")]) == 3
+    last = json.loads((tmp_path / "out.log.jsonl").read_text().splitlines()[-1])
+    assert set(last["qualities"]) == set(NAMES)
+    assert set(last["run"]["live"]["cameras"]) == {"a", "b", "c"}
