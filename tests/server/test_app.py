@@ -16,6 +16,7 @@ from segment_folders import GrowingFolder
 from serving import Served, hosted
 from streams import small_stream
 from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.quality_list import ListedQuality, list_from_json, write_list
 from structgstream.player.bundle import bundle
 from structgstream.server.catalog import ServedStream
 from structgstream.server.settings import Limits, ServerSettings
@@ -326,3 +327,43 @@ def test_requests_go_on_while_a_preview_is_made(folder: Path) -> None:
         assert not any(one.done() for one in waiting)
         free.set()
         assert [one.result(20).body for one in waiting] == [PNG, PNG]
+
+
+def test_several_qualities_of_one_stream(server: Served, folder: Path) -> None:
+    """As a run makes them, that comes while the server runs."""
+    listed = [ListedQuality(name, f"{name}/manifest.json", bits) for name, bits in (("high", 6e6), ("low", 1e6))]
+    (folder / "show").mkdir()
+    write_list(folder / "show", listed)
+    growing = {name: GrowingFolder(folder / "show" / name, STREAM) for name in ("low", "high")}
+    growing["low"].write()
+    assert server.ask("/streams/show/").status == 404, "high has no frame yet"
+    growing["high"].write()
+    last = time.monotonic() + 20
+    while server.ask("/streams/show/").status == 404:
+        assert time.monotonic() < last
+    assert 'src="qualities.json"' in server.ask("/streams/show/").body.decode()
+    told = server.ask("/streams/show/qualities.json")
+    assert list_from_json(told.body, name="it") == tuple(listed)
+    assert (told.headers["cache-control"], told.headers["content-type"]) == ("no-cache", "application/json")
+    assert server.ask("/streams/show/qualities.json", If_None_Match=told.headers["etag"]).status == 304
+    write_list(folder / "show", listed[::-1])
+    assert server.ask("/streams/show/qualities.json", If_None_Match=told.headers["etag"]).status == 200
+    for name in ("low", "high"):
+        manifest = manifest_from_json(server.ask(f"/streams/show/{name}/manifest.json").body, name="it")
+        part = server.ask(f"/streams/show/{name}/{manifest.parts[0].file}")
+        assert hashlib.sha256(part.body).hexdigest() == manifest.parts[0].sha256
+        assert part.headers["cache-control"] == YEAR
+    sequence = growing["low"].manifest.sequence if growing["low"].manifest else 0
+    asked = ThreadPoolExecutor(1).submit(server.ask, f"/streams/show/low/manifest.json?after={sequence}")
+    growing["low"].write()
+    assert manifest_from_json(asked.result().body, name="it").sequence == sequence + 1
+    for address in (
+        "show/manifest.json", "show/none/manifest.json", "show/low/qualities.json", "show/low/",
+        "studio/qualities.json", "studio/studio/manifest.json", "show/low/low/manifest.json",
+        "ball.sgs/low/manifest.json",
+    ):  # fmt: skip
+        assert server.ask(f"/streams/{address}").status == 404, address
+    numbers = server.ask("/metrics").body.decode()
+    assert 'structgstream_viewers{stream="show/low"}' in numbers
+    assert 'structgstream_requests_total{stream="show",kind="qualities",status="200"} 2' in numbers
+    assert server.ask("/streams/show/preview").body == PNG + b"show/high"

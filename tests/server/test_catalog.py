@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.errors import PlayerError
 from structgstream.server.catalog import LOOK_AGAIN_SECONDS, Catalog, StreamKind
 
@@ -68,3 +69,48 @@ def test_files_beside_a_stream_are_named_after_it(tmp_path: Path) -> None:
         assert opened is not None
         with opened:
             assert opened[:].decode() == name.removesuffix(".sgs")
+
+
+def several(folder: Path, *names: str, listed: tuple[str, ...] | None = None) -> None:
+    """A folder of several qualities, of which the last one listed takes the least."""
+    for name in names:
+        (folder / name).mkdir(parents=True)
+        (folder / name / "manifest.json").write_text("{}")
+    given = names if listed is None else listed
+    write_list(folder, [ListedQuality(name, f"{name}/manifest.json", 9.0 - n) for n, name in enumerate(given)])
+
+
+def test_several_qualities_of_one_stream_are_one(tmp_path: Path) -> None:
+    several(tmp_path / "studio", "high", "low")
+    (tmp_path / "studio.metrics.json").write_text("{}")
+    for folder in (tmp_path, tmp_path / "studio"):
+        (one,) = Catalog(folder).found.values()
+        assert (one.name, one.kind, one.qualities) == ("studio", StreamKind.QUALITIES, ("low", "high"))
+        assert [(own.name, own.kind) for own in one.made_of] == [
+            ("studio/low", StreamKind.SEGMENTS),
+            ("studio/high", StreamKind.SEGMENTS),
+        ]
+        assert all(own.made_of == (own,) for own in one.made_of)
+        for opened in (
+            one.open("qualities.json"),
+            one.made_of[0].open("manifest.json"),
+            one.open_beside(".metrics.json"),
+        ):
+            assert opened is not None
+            opened.close()
+        assert one.made_of[0].open_beside(".metrics.json") is None
+    assert StreamKind.QUALITIES.source == "qualities.json"
+
+
+def test_several_qualities_are_served_when_all_have_a_frame(tmp_path: Path) -> None:
+    several(tmp_path / "waits", "high", listed=("high", "low"))
+    (tmp_path / "waits" / "low").mkdir()
+    several(tmp_path / "elsewhere", "high", "low", listed=("high", "low", "x/low"))
+    several(tmp_path / "linked", "high", listed=("high", "low"))
+    (tmp_path / "linked" / "low").symlink_to(tmp_path / "waits" / "high")
+    several(tmp_path / "broken", "high", "low")
+    (tmp_path / "broken" / "qualities.json").write_text("[]")
+    several(tmp_path / "one", "low", listed=("low",))
+    assert [*Catalog(tmp_path).found] == ["one"]
+    (tmp_path / "waits" / "low" / "manifest.json").touch()
+    assert [*Catalog(tmp_path).found] == ["one", "waits"]

@@ -13,6 +13,7 @@ from rigs import random_scene
 from segment_folders import GrowingFolder
 from serving import hosted
 from streams import compact_header, moved, write_stream
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.sinks import MemorySink
 from structgstream.evaluation.png import png_bytes
 from structgstream.server.catalog import ServedStream
@@ -67,3 +68,48 @@ def test_without_a_token_nothing_is_shown(tab: Tab, folder: Path) -> None:
     with hosted(ServerSettings(folder, keys=KEYS, previews=False)) as server:
         tab.open(server.address)
         tab.wait_for('document.body.innerText === "An access token is needed here."')
+
+
+def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: Path) -> None:
+    """By hand, in the panel, with a token of that stream alone; these two qualities show different scenes."""
+    folder = tmp_path / "streams"
+    for name, seed in (("low", 4), ("high", 9)):
+        sink = MemorySink()
+        scenes = [moved(random_scene(60, seed=seed), step) for step in range(6)]
+        write_stream(sink, scenes, header=compact_header(scenes[0]))
+        GrowingFolder(folder / "show" / name, sink.data).write_all()
+    listed = [ListedQuality(name, f"{name}/manifest.json", bits) for name, bits in (("low", 1e6), ("high", 1e12))]
+    write_list(folder / "show", listed)
+    player = 'document.querySelector("structgstream-player")'
+    panel = f"{player}.shadowRoot.querySelector('[aria-label^=Picture]')"
+    found = f"[...{player}.shadowRoot.querySelectorAll('select')].find((one) => one.innerText.includes('high'))"
+    soon = int(time.time()) + 600
+    token, all_streams = (KEYS.token(name, expires_unix_seconds=soon) for name in ("show", EVERY_STREAM))
+
+    def shown(frame: int) -> np.ndarray:
+        """What a frame looks like."""
+        hidden = f"{player}.setAttribute('controls', 'off')"
+        tab.evaluate(f"{player}.pause(), {hidden}, {player}.seek({frame + 0.5} / 30), 1")
+        tab.wait_for(f"{SHOWN} && {player}.stats.frameIndex === {frame}")
+        return tab.screenshot().astype(float)
+
+    def numbers() -> str:
+        return server.ask("/metrics", Authorization=f"Bearer {all_streams}").body.decode()
+
+    with hosted(ServerSettings(folder, keys=KEYS, previews=False)) as server:
+        tab.open(f"{server.address}streams/show/?token={token}", width=900, height=600)
+        tab.wait_for(SHOWN)
+        low = shown(2)
+        assert 'structgstream_requests_total{stream="show/low",kind="segment",status="20' in numbers()
+        assert 'requests_total{stream="show/high"' not in numbers(), "no connection bears it"
+        tab.evaluate(f"{player}.removeAttribute('controls'), {panel}.click(), 1")
+        assert tab.wait_for(f"{found}?.innerText").split() == ["automatic", "low", "high"]
+        tab.evaluate(f"((one) => {{ one.value = '1'; one.dispatchEvent(new Event('change')); }})({found}), 1")
+        tab.evaluate(f"{panel}.click(), {player}.seek(0.01), {player}.play(), 1")
+        tab.wait_for(f"{player}.stats.frameIndex >= 4")
+        high = shown(2)
+        told = numbers()
+    assert 'structgstream_requests_total{stream="show/high",kind="segment",status="20' in told
+    assert 'status="401"' not in told
+    assert np.abs(low - high).mean() > 5
+    assert not tab.complaints

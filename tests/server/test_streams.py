@@ -9,6 +9,7 @@ import pytest
 
 from segment_folders import GrowingFolder
 from streams import small_stream
+from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.server import streams as module
 from structgstream.server.catalog import LOOK_AGAIN_SECONDS, Catalog, ServedStream
 from structgstream.server.metrics import Family
@@ -204,5 +205,32 @@ def test_a_preview_of_what_is_gone(folder: Path) -> None:
         (folder / "studio" / "manifest.json").unlink()
         assert await found.preview(ball) is None
         assert rendered == ["studio"]
+
+    asyncio.run(run())
+
+
+def test_several_qualities_are_one_stream_of_the_list_and_several_of_the_numbers(tmp_path: Path) -> None:
+    for name, frames in (("low", 2), ("high", 1)):
+        growing = GrowingFolder(tmp_path / "show" / name, STREAM)
+        for _ in range(frames):
+            growing.write()
+    write_list(
+        tmp_path / "show", [ListedQuality(n, f"{n}/manifest.json", bits) for n, bits in (("high", 9.0), ("low", 2.0))]
+    )
+    (tmp_path / "show.metrics.json").write_text('{"qualities": {"low": {"train_psnr": 30.5, "bytes": 7}}}')
+
+    async def run() -> None:
+        rendered: list[str] = []
+        found = streams(tmp_path, rendered=rendered)
+        (show,) = await found.all()
+        listed = await found.listed(show)
+        assert (listed.kind, listed.live, listed.seconds) == ("qualities", True, pytest.approx(1 / 30))
+        assert listed.as_json()["stream"] == "streams/show/qualities.json"
+        assert await found.preview(show) is not None
+        assert rendered == ["show/high"]
+        shown = numbers(await found.families())
+        assert shown["edge_frame"] == {"show/low": 1.0, "show/high": 0.0}
+        assert shown["live"] == {"show/low": 1.0, "show/high": 1.0}
+        assert shown["run"] == {"show/qualities_low_train_psnr": 30.5, "show/qualities_low_bytes": 7.0}
 
     asyncio.run(run())

@@ -72,6 +72,19 @@ class Gate:
             raise Refused(404, _NOTHING_HERE)
         return found
 
+    async def quality(self, request: Request) -> ServedStream:
+        """The quality of a stream that the address names, if the token opens the stream.
+
+        Raises:
+            Refused: it does not, or there is none.
+        """
+        stream = await self.stream(request)
+        name = f"{stream.name}/{request.path_params['quality']}"
+        found = next((own for own in stream.made_of if own.name == name), None)
+        if found is None:
+            raise Refused(404, _NOTHING_HERE)
+        return found
+
     async def visible(self, request: Request) -> list[ServedStream]:
         """The streams that the token opens.
 

@@ -7,16 +7,18 @@ Addresses name streams and files with plain names, and each name is looked up: o
 only the files that a sink writes, previews and the numbers of the run. With keys every address but ``/health``,
 ``/player.js`` needs a token; that is checked before anything is looked for, so that nobody learns which streams exist.
 
-==============================  ==========================================================
-``/``, ``/streams.json``        the streams that the token opens
-``/streams/NAME/``              the player
-``/streams/NAME/manifest.json`` the manifest; ``?after=N`` waits for one that is newer
-``/streams/NAME/FILE``          an immutable file of the segments
-``/streams/NAME/stream.sgs``    the bytes of a stream that is one file, which may grow
-``/streams/NAME/state``         of such a file: length, and whether it is complete
-``/streams/NAME/preview``       a picture
-``/metrics``, ``/health``       for those who run the server
-==============================  ==========================================================
+==================================  ==========================================================
+``/``, ``/streams.json``            the streams that the token opens
+``/streams/NAME/``                  the player
+``/streams/NAME/manifest.json``     the manifest; ``?after=N`` waits for one that is newer
+``/streams/NAME/FILE``              an immutable file of the segments
+``/streams/NAME/qualities.json``    the qualities of a stream
+``/streams/NAME/QUALITY/FILE``      manifest and files of one of them, as above
+``/streams/NAME/stream.sgs``        the bytes of a stream that is one file, which may grow
+``/streams/NAME/state``             of such a file: length, and whether it is complete
+``/streams/NAME/preview``           a picture
+``/metrics``, ``/health``           for those who run the server
+==================================  ==========================================================
 """
 
 import time
@@ -34,11 +36,10 @@ from starlette.routing import Route
 from structgstream.player.bundle import bundle
 from structgstream.player.page import SERVED_POLICY, linked_page, policy
 from structgstream.server.access import Gate, Refused
-from structgstream.server.catalog import Catalog, StreamKind
+from structgstream.server.catalog import Catalog
 from structgstream.server.guard import METHODS, Guard
 from structgstream.server.manifest_watch import BrokenManifest
 from structgstream.server.metrics import CONTENT_TYPE, Family, Metrics, exposition
-from structgstream.server.names import MANIFEST
 from structgstream.server.pages import LIST_POLICY, list_page
 from structgstream.server.previews import Render, rendered_apart
 from structgstream.server.serving import Serving
@@ -139,6 +140,7 @@ class _Routes:
             Route("/streams/{name}", self.without_slash),
             Route("/streams/{name}/", self.page),
             Route("/streams/{name}/{file}", self.file),
+            Route("/streams/{name}/{quality}/{file}", self.file_of_quality),
         ]
 
     async def index(self, request: Request) -> Response:
@@ -183,8 +185,7 @@ class _Routes:
         """The player of a stream, with the token in the addresses that it asks for."""
         stream = await self._gate.stream(request)
         request.scope["answered"] = (stream.name, "page")
-        source = MANIFEST if stream.kind is StreamKind.SEGMENTS else "stream.sgs"
-        address = f"{source}{self._gate.passed_on(request)}"
+        address = f"{stream.kind.source}{self._gate.passed_on(request)}"
         page = linked_page(stream.name, stream=address, module="../../player.js")
         rules = policy(**SERVED_POLICY, frame_ancestors="'self'")
         return HTMLResponse(page, headers={**self._passing, "Content-Security-Policy": rules})
@@ -193,6 +194,11 @@ class _Routes:
         """One file of a stream."""
         stream = await self._gate.stream(request)
         return await self._serving.answer(stream, request.path_params["file"], request)
+
+    async def file_of_quality(self, request: Request) -> Response:
+        """One file of one of the qualities of a stream."""
+        quality = await self._gate.quality(request)
+        return await self._serving.answer(quality, request.path_params["file"], request)
 
 
 async def _refused(request: Request, error: Exception) -> Response:

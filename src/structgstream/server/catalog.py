@@ -12,7 +12,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from structgstream.errors import PlayerError
+from structgstream.codec.segments.quality_list import MOST_LIST_BYTES, QUALITIES, list_from_json
+from structgstream.errors import PlayerError, StreamError
 from structgstream.server.files import OpenedFile, open_below
 from structgstream.server.names import MANIFEST, STREAM_SUFFIX, is_stream_name
 
@@ -24,24 +25,46 @@ class StreamKind(Enum):
     """How a stream is stored."""
 
     SEGMENTS = "segments"
+    QUALITIES = "qualities"
     FILE = "file"
+
+    @property
+    def source(self) -> str:
+        """Which of its addresses a player is given."""
+        return {"segments": MANIFEST, "qualities": QUALITIES, "file": "stream.sgs"}[self.value]
 
 
 @dataclass(frozen=True)
 class ServedStream:
-    """A stream in the folder ``root``: the folder of segments ``name``, or the file ``name``, with its suffix."""
+    """A stream in the folder ``root``.
+
+    Args:
+        root: the folder.
+        name: a folder of segments, a folder of several qualities of one stream, or a file, with its suffix; one of the
+            qualities has the folder's name, a slash, and its own.
+        kind: which of them.
+        qualities: folders of segments in the folder of several, the one with the lowest bit rate first.
+    """
 
     root: Path
     name: str
     kind: StreamKind
+    qualities: tuple[str, ...] = ()
+
+    @property
+    def made_of(self) -> tuple["ServedStream", ...]:
+        """The streams of segments: itself, or its qualities, or none."""
+        if self.kind is StreamKind.SEGMENTS:
+            return (self,)
+        return tuple(ServedStream(self.root, f"{self.name}/{one}", StreamKind.SEGMENTS) for one in self.qualities)
 
     def open(self, file: str) -> OpenedFile | None:
-        """A file of its segments folder; None if there is none. Blocks.
+        """A file of its folder; None if there is none. Blocks.
 
         Raises:
             OSError: the system cannot open files now.
         """
-        return open_below(self.root, self.name, file)
+        return open_below(self.root, *self.name.split("/"), file)
 
     def open_whole(self) -> OpenedFile | None:
         """The stream's only file; None if it is gone. Blocks.
@@ -57,13 +80,14 @@ class ServedStream:
         Raises:
             OSError: the system cannot open files now.
         """
-        return open_below(self.root, Path(self.name).with_suffix(suffix).name)
+        *folders, own = self.name.split("/")
+        return open_below(self.root, *folders, Path(own).with_suffix(suffix).name)
 
 
 class Catalog:
     """The streams of a folder, looked for again when the last look is a second old. Thread-safe.
 
-    A folder that is itself a segments folder holds one stream: itself.
+    A folder that is itself one of segments, or of several qualities, holds one stream: itself.
 
     Args:
         folder: the folder.
@@ -105,26 +129,54 @@ class Catalog:
                 self._look()
 
     def _look(self) -> None:
-        if _has_manifest(self._folder):
-            found = {self._folder.name: ServedStream(self._folder.parent, self._folder.name, StreamKind.SEGMENTS)}
+        itself = _in_folder(self._folder.parent, self._folder.name) if self._folder.name else None
+        if itself is not None:
+            found = {itself.name: itself}
         else:
             with os.scandir(self._folder) as entries:
-                kinds = {entry.name: kind for entry in islice(entries, MOST_ENTRIES) if (kind := _kind(entry))}
-            found = {name: ServedStream(self._folder, name, kinds[name]) for name in sorted(kinds)}
+                streams = [_stream(self._folder, entry) for entry in islice(entries, MOST_ENTRIES)]
+            found = {one.name: one for one in sorted(filter(None, streams), key=lambda one: one.name)}
         self.found = {name: stream for name, stream in found.items() if is_stream_name(name)}
         self.unnamed = tuple(name for name in found if not is_stream_name(name))
         self._looked_at = self._clock()
 
 
-def _kind(entry: "os.DirEntry[str]") -> StreamKind | None:
+def _stream(root: Path, entry: "os.DirEntry[str]") -> ServedStream | None:
     """What an entry of the folder is; None for what is no stream, links included (Note [No links])."""
     if entry.name.startswith("."):
         return None
     if entry.is_file(follow_symlinks=False):
-        return StreamKind.FILE if entry.name.endswith(STREAM_SUFFIX) else None
-    if entry.is_dir(follow_symlinks=False) and _has_manifest(Path(entry.path)):
-        return StreamKind.SEGMENTS
-    return None
+        return ServedStream(root, entry.name, StreamKind.FILE) if entry.name.endswith(STREAM_SUFFIX) else None
+    return _in_folder(root, entry.name) if entry.is_dir(follow_symlinks=False) else None
+
+
+def _in_folder(root: Path, name: str) -> ServedStream | None:
+    """The stream that is the folder ``name``: of segments, or of several qualities as soon as all have a manifest."""
+    if _has_manifest(root / name):
+        return ServedStream(root, name, StreamKind.SEGMENTS)
+    try:
+        folders = _qualities(root, name)
+        whole = all(one and is_stream_name(one) and _opens(root, name, one, MANIFEST) for one in folders)
+    except (OSError, StreamError):
+        return None
+    return ServedStream(root, name, StreamKind.QUALITIES, tuple(filter(None, folders))) if folders and whole else None
+
+
+def _qualities(root: Path, name: str) -> list[str | None]:
+    """The folders beside the list of a folder, by rising bit rate: None for what is elsewhere; empty without a list."""
+    opened = open_below(root, name, QUALITIES)
+    if opened is None:
+        return []
+    with opened:
+        listed = list_from_json(opened.read(0, min(len(opened), MOST_LIST_BYTES + 1)), name=name)
+    return [one.folder for one in sorted(listed, key=lambda one: one.bits_per_second)]
+
+
+def _opens(root: Path, *parts: str) -> bool:
+    opened = open_below(root, *parts)
+    if opened is not None:
+        opened.close()
+    return opened is not None
 
 
 def _has_manifest(folder: Path) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from structgstream.player.page import html_page, policy
+from structgstream.server.catalog import StreamKind
 
 _STYLE = """<style>
 :root{color-scheme:light dark;font:16px/1.5 system-ui,sans-serif}
@@ -32,7 +33,7 @@ class Listed:
 
     Args:
         name: of the stream.
-        kind: ``segments`` or ``file``.
+        kind: ``segments``, ``qualities`` or ``file``.
         live: whether it is being made; None where that is not known.
         seconds: of media up to its end; None where that is not known.
     """
@@ -45,7 +46,7 @@ class Listed:
     def as_json(self) -> dict[str, Any]:
         """Its entry in ``streams.json``; addresses are relative to that."""
         base = f"streams/{self.name}/"
-        source = "manifest.json" if self.kind == "segments" else "stream.sgs"
+        source = StreamKind(self.kind).source
         addresses = {"page": base, "stream": f"{base}{source}", "preview": f"{base}preview"}
         return {"name": self.name, "kind": self.kind, "live": self.live, "seconds": self.seconds, **addresses}
 

@@ -2,6 +2,7 @@
 """The answers to requests for a stream's files."""
 
 import asyncio
+import hashlib
 from collections.abc import AsyncGenerator, Coroutine, Mapping
 from functools import partial
 from typing import Final
@@ -11,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 
 from structgstream.codec.container.records import footer_offset
+from structgstream.codec.segments.quality_list import MOST_LIST_BYTES, QUALITIES
 from structgstream.player.byte_range import requested_part
 from structgstream.server.access import query_of
 from structgstream.server.catalog import ServedStream, StreamKind
@@ -52,6 +54,8 @@ class Serving:
         digest = hash_in_name(file)
         if file == "preview":
             return await self._preview(stream, request)
+        if stream.kind is StreamKind.QUALITIES and file == QUALITIES:
+            return await self._qualities(stream, request)
         if stream.kind is StreamKind.SEGMENTS and file == MANIFEST:
             return await self._manifest(stream, request)
         if stream.kind is StreamKind.SEGMENTS and digest is not None:
@@ -65,6 +69,24 @@ class Serving:
 
     def _seen(self, stream: ServedStream, request: Request) -> None:
         self._metrics.viewers.see(stream.name, request.scope.get("client"))
+
+    async def _qualities(self, stream: ServedStream, request: Request) -> Response:
+        request.scope["answered"] = (stream.name, "qualities")
+        opened = await to_thread.run_sync(stream.open, QUALITIES)
+        if opened is None:
+            return self._nothing(stream)
+        with opened:
+            content = await to_thread.run_sync(opened.read, 0, min(len(opened), MOST_LIST_BYTES))
+        etag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+        headers = {**self._headers, "Cache-Control": self._asked_again, "ETag": etag}
+        if knows(request.headers, etag):
+            return Response(status_code=304, headers=headers)
+        return Response(content, headers=headers, media_type="application/json")
+
+    @property
+    def _asked_again(self) -> str:
+        """What caches are told of what changes."""
+        return "no-cache" if self._visible == "public" else "private, no-cache"
 
     async def _manifest(self, stream: ServedStream, request: Request) -> Response:
         request.scope["answered"] = (stream.name, "manifest")
@@ -84,7 +106,7 @@ class Serving:
         etags = (f'"{found.digest}"', f'"{found.digest}-gzip"')
         headers = {
             **self._headers,
-            "Cache-Control": "no-cache" if self._visible == "public" else "private, no-cache",
+            "Cache-Control": self._asked_again,
             "ETag": etags[zipped],
             "Vary": "Accept-Encoding",
             **({"Retry-After": str(retry_seconds)} if retry_seconds else {}),

@@ -73,7 +73,9 @@ class Streams:
             return None
 
     async def preview(self, stream: ServedStream) -> Picture | None:
-        """The preview picture; None if there is none, or none yet."""
+        """The preview picture, of several qualities that of the finest; None if there is none, or none yet."""
+        if stream.kind is StreamKind.QUALITIES:
+            return await self.preview(stream.made_of[-1])
         if stream.kind is StreamKind.FILE:
             key = await to_thread.run_sync(_file_key, stream)
         else:
@@ -83,14 +85,15 @@ class Streams:
 
     async def listed(self, stream: ServedStream) -> Listed:
         """What the list says of a stream."""
-        found = await self.manifest(stream)
+        found = await self.manifest(stream.made_of[0]) if stream.made_of else None
         live, seconds = (None, None) if found is None else (found.live, _number(found.values, "edge", "pts_seconds"))
         return Listed(stream.name, stream.kind.value, live, seconds)
 
     async def families(self) -> list[Family]:
         """Gauges of all streams, and the numbers of the runs that make them."""
         streams = await self.all()
-        found = {stream.name: snapshot for stream in streams if (snapshot := await self.manifest(stream))}
+        each = [own for stream in streams for own in stream.made_of]
+        found = {own.name: snapshot for own in each if (snapshot := await self.manifest(own))}
         published = {name: _number(one.values, "edge", "published_unix_seconds") for name, one in found.items()}
         frames = {name: _number(one.values, "edge", "frame") for name, one in found.items()}
         waiting = {name: float(watch.waiters) for name, watch in self._watches.items()}
