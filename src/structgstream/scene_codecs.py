@@ -57,9 +57,12 @@ class SceneCodec(ABC):
         """A sink to the file, which is replaced unless it is resumed; ``frames`` is not used.
 
         Raises:
+            StorageError: another process writes to the file.
             StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
         """
-        return FileSink.resume(path) if resume else (FileSink(path, overwrite=True), None)
+        sink = FileSink(path, overwrite=True)
+        sink.check_unused()
+        return FileSink.resume(path) if resume else (sink, None)
 
     def coder(self, header: StreamHeader, device: torch.device) -> SceneEncoder:
         """The encoder of the stream, on the CPU."""

@@ -122,6 +122,29 @@ def test_an_existing_file_stays_unless_it_may_be_replaced(tmp_path: Path) -> Non
     assert path.read_bytes() == small_stream()
 
 
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_file_that_is_being_written_is_not_opened_by_another(tmp_path: Path, resumed: bool) -> None:
+    """Whichever process it is in; the lock belongs to the open file."""
+    path, sent = tmp_path / "a.sgs", packets()
+    first = FileSink(path)
+    first.open(header_for(SCENES[0]))
+    first.write(sent[0])
+    second = FileSink.resume(path)[0] if resumed else FileSink(path, overwrite=True)
+    for refused in (second.check_unused, lambda: second.open(header_for(SCENES[0]))):
+        with pytest.raises(StorageError, match="Another process writes to .*a.sgs; wait for its end"):
+            refused()
+    second.close()
+    for packet in sent[1:]:
+        first.write(packet)
+    first.close()
+    second.check_unused()
+    assert path.read_bytes() == small_stream()
+    if resumed:
+        with pytest.raises(StorageError, match="has been written to by another process since it was read"):
+            second.open(header_for(SCENES[0]))
+        assert path.read_bytes() == small_stream()
+
+
 def test_a_place_where_nothing_can_be_written(tmp_path: Path) -> None:
     for path, overwrite in ((tmp_path / "no" / "a.sgs", False), (tmp_path, True)):
         sink = FileSink(path, overwrite=overwrite)

@@ -18,6 +18,7 @@ from structgstream.codec.header import pack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError
+from structgstream.file_locks import lock_file
 from structgstream.whole_files import sync_folder
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
@@ -119,12 +120,16 @@ class _Writer:
 
 
 class FileSink:
-    """A stream file. Every packet is on the disk when ``write`` returns; a failed write is truncated."""
+    """A stream file. Every packet is on the disk when ``write`` returns; a failed write is truncated.
+
+    From :meth:`open` to :meth:`close` no other sink, of this process or another, can write to the file.
+    """
 
     def __init__(self, path: Path | str, *, overwrite: bool = False) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
         self._resumed: tuple[int, StreamReader] | None = None
+        self._size = 0  # of the file that is resumed
         self._writer: _Writer | None = None
         self._file: BinaryIO | None = None
 
@@ -140,6 +145,7 @@ class FileSink:
         """
         sink = cls(path, overwrite=True)
         data: ByteSource = FileBytes(path) if sink.path.exists() else b""
+        sink._size = len(data)
         end = readable_part(data, name=str(path))
         reader = None if end is None else StreamReader(ByteSlice(data, 0, end), name=str(path))
         if end is None or reader is None or not reader.packets:
@@ -147,29 +153,59 @@ class FileSink:
         sink._resumed = (end, reader)
         return sink, reader
 
+    def check_unused(self) -> None:
+        """Find out before a long fit what :meth:`open` would find after it.
+
+        Raises:
+            StorageError: another sink writes to the file now.
+        """
+        with suppress(OSError), self.path.open("rb+") as file:  # What cannot be opened is told by open().
+            self._lock(file)
+
     def open(self, header: StreamHeader) -> int:
         """Create the file and write the init record, or continue a resumed file, which already has one.
 
         Raises:
-            StorageError: it exists and may not be overwritten, or cannot be written.
+            StorageError: it exists and may not be overwritten, is written to by another sink or has been since it was
+                resumed, or cannot be written.
         """
         if self.path.exists() and not self._overwrite:
             raise StorageError(
                 f"{self.path} exists; continue it with --resume, replace it with --overwrite, or choose another name."
             )
-        mode = "wb" if self._resumed is None else "rb+"
         try:
-            self._file = self.path.open(mode, buffering=0)  # type: ignore[assignment]
-            self._writer = _Writer(self._file, str(self.path), free=partial(free_bytes, self.path))  # type: ignore[arg-type]
+            self._file = self._opened()
+            self._writer = _Writer(self._file, str(self.path), free=partial(free_bytes, self.path))
             if self._resumed is not None:
                 self._writer.continue_at(*self._resumed)
                 return 0
+            if os.stat(self._file.fileno()).st_size:  # Devices have no size, and cannot be truncated.
+                self._file.truncate(0)
             sync_folder(self.path.parent)
         except OSError as error:
             raise StorageError(
                 f"Cannot open {self.path} for writing ({error.strerror}); choose another place or mend its permissions."
             ) from error
         return self._writer.open(header)
+
+    def _opened(self) -> BinaryIO:
+        """The file, locked before anything in it is changed."""
+        self.path.touch()  # "w" would empty a file that another process writes.
+        file: BinaryIO = self.path.open("rb+", buffering=0)  # type: ignore[assignment]
+        try:
+            self._lock(file)
+            if self._resumed is not None and os.stat(file.fileno()).st_size != self._size:
+                raise StorageError(
+                    f"{self.path} has been written to by another process since it was read; give the command again."
+                )
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def _lock(self, file: BinaryIO) -> None:
+        if not lock_file(file):
+            raise StorageError(f"Another process writes to {self.path}; wait for its end, or choose another name.")
 
     def begin(self, header: StreamHeader) -> int:
         """Begin another period with the next packet; its init record is written with that.
