@@ -138,7 +138,12 @@ def test_a_ghost_dies() -> None:
 BLIND = replace(CONFIG, missing_threshold=0.9)
 """By these rules nothing is missing."""
 THIN = ThinBirthConfig(
-    enabled=True, picture_width=96, missing_threshold=0.10, most_contradictions=0.34, most_cost=0.12, least_hits=2
+    enabled=True,
+    picture_width=96,
+    missing_threshold=0.10,
+    most_contradictions=0.34,
+    most_cost=0.12,
+    least_hits=2,
 )
 
 
@@ -155,6 +160,14 @@ def test_the_second_sweep_is_left_out_where_the_first_one_bears() -> None:
     alone, both = (renewed(reference_backend(), config=config) for config in (CONFIG, replace(CONFIG, thin=THIN)))
     assert torch.equal(alone.new_free.means, both.new_free.means)
     assert both.thin_count == 0
+
+
+def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_content() -> None:
+    """In a throw everything that lags would be born, and stand where anchors belong."""
+    number = len(renewed(reference_backend(), config=replace(BLIND, thin=THIN)).new_free)
+    for most, born in ((number, number), (number - 1, 0)):
+        found = renewed(reference_backend(), config=replace(BLIND, thin=replace(THIN, most=most)))
+        assert len(found.new_free) == found.thin_count == born
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:

@@ -45,8 +45,12 @@ class ThinBirthConfig:
     most_contradictions: float = 0.5
     most_cost: float = 0.2
     least_hits: int = 3
+    most: int = 150
+    coarsen: bool = False
+    """Thin content is little. Where more would be born, what moves is not where it should be, as in a throw: births in
+    its place follow it worse and cost more than what they stand for."""
     most_missing_share: float = 0.02
-    """Thin content is little: 0.0005 of the pictures where a pitcher pours. More is light that changed."""
+    """Of the pictures 0.0005 lack something where a pitcher pours. More is light that changed."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,9 @@ class BirthConfig:
     least_hits: int = 4
     """Least number of ray points within 1.8 voxels for a birth."""
     most: int = 500
-    """Largest number of births per frame: for more, voxels and births are larger."""
+    """Largest number of births per frame."""
+    coarsen: bool = True
+    """Whether voxels and births are larger where there would be more than ``most``, or there are none."""
     most_missing_share: float = 0.25
     """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
     size: float = 0.7
@@ -223,6 +229,8 @@ def _merge_points(
         enough = hits >= config.least_hits
         if int(enough.sum()) <= config.most or voxel > COARSEST * float(spacings.median()):
             break
+        if not config.coarsen:
+            return FreeGaussians.empty(points)
         voxel *= 2.0**0.5  # Too many: what is missing is large, and is born coarser.
     order = hits.argsort(descending=True, stable=True)
     chosen = order[enough[order]][: config.most].sort().values
