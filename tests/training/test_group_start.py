@@ -2,12 +2,16 @@
 """A far frame is fitted from frame 0 and tracked positions, in a world whose motion is known."""
 
 from dataclasses import replace
+from typing import Any
 
+import pytest
 import torch
 
 from backends import quickest_backend
 from structgstream.scene.state import state_of
+from structgstream.training import group_start
 from structgstream.training.births import BirthConfig
+from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.group_start import GroupStartConfig, fit_group_start
 from structgstream.training.motion import MotionConfig, detect_changes
 from structgstream.training.motion_start import MotionStartConfig
@@ -76,11 +80,11 @@ def test_tracked_positions_and_two_rounds_reach_the_far_frame() -> None:
     assert tracked.counts["corrected"] > 0
 
 
-def test_it_has_the_iterations_of_four_online_frames_unless_told() -> None:
+def test_it_has_the_iterations_of_six_online_frames_unless_told() -> None:
     world = scenery(movers=20)
     config = replace(CONFIG, iterations=3)
     usual = replace(START, iterations=None, rounds=3)
-    assert fit(world, truth(world, 20), start=usual, config=config).iterations == 12
+    assert fit(world, truth(world, 20), start=usual, config=config).iterations == 18
 
 
 def test_what_does_not_change_keeps_the_bits_of_frame_0() -> None:
@@ -98,6 +102,34 @@ def test_changes_are_priced_against_frame_0() -> None:
     cheap, paid = (fit(world, away, config=config).scene.anchors.positions for config in (CONFIG, dear))
     first = world.scene.anchors.positions
     assert (paid - first).abs().mean() < (cheap - first).abs().mean()
+
+
+def test_nothing_is_born_before_the_second_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the first one births would stand in for what iterations can mend."""
+    bore, renew = [], group_start.renew_free_gaussians
+
+    def renewed(*args: Any, config: BirthConfig, **options: Any) -> Any:
+        bore.append(config.enabled)
+        return renew(*args, config=config, **options)
+
+    monkeypatch.setattr(group_start, "renew_free_gaussians", renewed)
+    world = scenery(movers=20)
+    for rounds, expected in ((1, [True]), (2, [False, True]), (3, [False, True, True])):
+        bore.clear()
+        fit(world, truth(world, 20), start=replace(START, iterations=3, rounds=rounds))
+        assert bore == expected
+
+
+def test_motion_is_coherent_since_frame_0_and_not_since_the_round_began() -> None:
+    world = scenery()
+    noisy = truth(world)
+    noisy[:60] += 0.01 * torch.randn(60, 3, generator=torch.Generator().manual_seed(3))
+
+    def spread(weight: float) -> float:
+        found = fit(world, noisy, config=replace(CONFIG, coherence=CoherenceConfig(weight)))
+        return float((found.scene.anchors.positions - world.scene.anchors.positions)[:60].std(0).norm())
+
+    assert spread(1.0) < 0.8 * spread(0.0)
 
 
 def test_births_of_several_rounds_have_identities_of_their_own() -> None:

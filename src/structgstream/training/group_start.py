@@ -30,7 +30,7 @@ from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.views import View
 
-USUAL_FRAMES = 4
+USUAL_FRAMES = 6
 """A group's first frame has the iterations of so many online frames. With 1.5 of them births stand in for what
 iterations would have mended, which costs bytes, and late groups fall behind (docs/groups.md)."""
 
@@ -43,10 +43,12 @@ class GroupStartConfig:
     """Optimisation steps of all rounds together; None for :data:`USUAL_FRAMES` times those of an online frame."""
     rounds: int = 3
     """Rounds of flow, births and iterations."""
-    flow_rounds: int = 2
-    """Displacements by flow from the rendering to the pictures before the iterations of a round."""
+    flow_rounds: int = 1
+    """Displacements by flow from the rendering to the pictures before the iterations of a round. Each adds noise."""
     births: int = 2000
     """Largest number of births in a round: content that came since frame 0."""
+    births_from: int = 2
+    """The first round with births, from 1: before, iterations mend what anchors can show."""
 
 
 def fit_group_start(
@@ -95,8 +97,8 @@ def fit_group_start(
     def fit_with(fit: FrameFit) -> FitResult[Scene]:
         rounds = _Rounds(fit, start, scene, views, changes, floor)
         current, results = with_displacements(scene, displacements), []
-        for _ in range(start.rounds):
-            results.append(rounds.run(current))
+        for number in range(1, start.rounds + 1):
+            results.append(rounds.run(current, bears=number >= min(start.births_from, start.rounds)))
             current = results[-1].scene
         return _together(results)
 
@@ -123,8 +125,8 @@ class _Rounds:
     changes: list[PictureChange | None]
     floor: ResidualFloor | None
 
-    def run(self, current: Scene) -> FitResult[Scene]:
-        """One round from ``current``, whose anchors are those of frame 0."""
+    def run(self, current: Scene, *, bears: bool) -> FitResult[Scene]:
+        """One round from ``current``, whose anchors are those of frame 0, with births or without."""
         fit, config, backend = self.fit, self.fit.config, self.fit.backend
         with fit.watch.stage("find motion"):
             partition = self._partition(current)
@@ -141,7 +143,7 @@ class _Rounds:
                 floor=self.floor,
                 room=config.patching.max_free - len(partition.still.free),
                 least_pixels=config.motion.least_pixels,
-                config=config.births,
+                config=config.births if bears else replace(config.births, enabled=False),
                 backend=backend,
             )
         moving = replace(displaced.moving, free=displaced.moving.free.select(new.kept))

@@ -37,8 +37,8 @@ class StartingPoint:
         partition: of which the scene is the moving part; None for a whole scene.
         focuses: by view index, the focus on the scene; None for whole pictures of all views.
         new_free: free Gaussians to add.
-        reference: anchors as in ``scene``, from whose values changes are priced; free Gaussians then have no price.
-            None: changes since ``scene``.
+        reference: anchors as in ``scene``, from whose values changes and motion are priced; free Gaussians then have no
+            price. None: since ``scene``.
     """
 
     scene: Scene
@@ -48,6 +48,11 @@ class StartingPoint:
     focuses: Mapping[int, Focus] | None = None
     new_free: FreeGaussians | None = None
     reference: Scene | None = None
+
+    @property
+    def known(self) -> Scene:
+        """What changes and motion are counted from."""
+        return self.scene if self.reference is None else self.reference
 
     @property
     def seen(self) -> list[View]:

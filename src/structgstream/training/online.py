@@ -284,7 +284,7 @@ class FrameFit:
             parameters=parameters,
             losses=config.losses,
             bit_price=bit_price,
-            coherence=MotionCoherence.of(scene, [view.camera for view in start.views], config=config.coherence),
+            coherence=MotionCoherence.of(start.known, [view.camera for view in start.views], config=config.coherence),
             population=population,
             early_stopping=EarlyStopping(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
             patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),
