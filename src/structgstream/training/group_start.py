@@ -48,8 +48,8 @@ class GroupStartConfig:
     births: int = 2000
     """Largest number of births in a round: content that came since frame 0."""
     coherence_share: float = 0.25
-    """Weight of ``online.coherence``, which counts from frame 0 here, relative to that of other frames. All of it is best
-    for bodies that move, but costs 0.8 dB where looks change in place, as displacements also stand in for them."""
+    """Weight of ``online.coherence``, which counts from frame 0 here, relative to that of other frames. All of it suits
+    bodies that move, but costs 0.8 dB where looks change in place, as displacements also stand in for them."""
 
 
 def fit_group_start(
