@@ -2,41 +2,24 @@
 """Sessions of sources whose length nobody knows: asked when the trainer is free, ended, resumed exactly."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from backends import quickest_backend
-from rigs import arc_rig
+from moving_block import PERIODS, RIG, filmed
 from small_presets import QUICK
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.frames import MultiViewFrame
-from structgstream.periods import PeriodConfig
 from structgstream.presets import StreamConfig
 from structgstream.recorder import record
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
-
-RIG = arc_rig(4, width=40, height=30)
-PERIODS = replace(
-    QUICK, key_interval_seconds=0.1, period=PeriodConfig(seconds=0.7, residual=9.0, frames=2, start="scene", share=0.5)
-)
-"""Another period begins with frame 3."""
-
-
-def filmed(number: int) -> dict[str, np.ndarray]:
-    """A bright block that moves, in every camera."""
-    images = {}
-    for turn, name in enumerate(RIG):
-        picture = np.full((30, 40, 3), 60 + 10 * turn, np.uint8)
-        picture[8:20, (number * 2) % 28 : (number * 2) % 28 + 10] = (220, 180, 40)
-        images[name] = picture
-    return images
 
 
 @dataclass

@@ -4,14 +4,11 @@
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from quick_streams import CLIP, QUARTER, error_of
+from quick_streams import CLIP, QUARTER, error_of, stopped_by_sigterm
 from structgstream.cli import main
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
@@ -162,22 +159,12 @@ def test_ctrl_c_finishes_the_frame_in_all_and_resume_goes_on(
 
 def test_sigterm_finishes_the_frame_in_all(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    # The fixture does not reach another process.
-    command = [sys.executable, "-m", "structgstream", *asked(out, "--points.max-points", "1500", frames=12)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-    try:
-        while not (out / "low" / "manifest.json").is_file() and process.poll() is None:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGTERM)
-        _, error = process.communicate(timeout=300)
-    finally:
-        process.kill()
-    assert process.returncode == 143, error
+    error = stopped_by_sigterm(asked(out, frames=12), written=out / "low" / "manifest.json")
     manifests = [read_manifest(FolderStore(out / name)) for name in NAMES]
     done = manifests[0].edge.frame + 1
     assert [(one.edge.frame, one.live, one.parts) for one in manifests] == [(done - 1, False, ())] * 2
     assert 1 <= done < 12
-    assert f"{out} has {done} of 12 frames in all qualities" in error.decode()
+    assert f"{out} has {done} of 12 frames in all qualities" in error
     assert json.loads((tmp_path / "out.metrics.json").read_text())["state"] == "finished"
 
 

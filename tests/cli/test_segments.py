@@ -2,16 +2,12 @@
 """A folder of segments goes through every command as a file does, and the two are the same bytes."""
 
 import json
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from backends import QUICKEST
-from quick_streams import CLIP, QUARTER
+from quick_streams import CLIP, QUARTER, stopped_by_sigterm
 from s3_emulator import BUCKET, emulator
 from structgstream.cli import main, segment_options
 from structgstream.codec.reader import open_stream
@@ -96,23 +92,13 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_sigterm_finishes_the_frame_and_closes_the_stream(tmp_path: Path) -> None:
     """Status 143; with --resume it goes on."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "structgstream", "reconstruct", CLIP, *QUARTER, "-o", str(out)]
-    command += ["--sink", "segments"]
-    command += ["--points.max-points", "1500"]  # The fixture does not reach another process.
-    process = subprocess.Popen([*command, "--frames", "12"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-    try:
-        while not (out / "manifest.json").is_file() and process.poll() is None:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGTERM)
-        _, error = process.communicate(timeout=300)
-    finally:
-        process.kill()
-    assert process.returncode == 143, error
+    asked = ["reconstruct", CLIP, *QUARTER, "-o", str(out), "--sink", "segments", "--frames", "12"]
+    error = stopped_by_sigterm(asked, written=out / "manifest.json")
     manifest = read_manifest(FolderStore(out))
     assert (manifest.live, manifest.parts) == (False, ())
     done = manifest.edge.frame + 1
     assert 1 <= done < 12
-    assert f"{out} has {done} of 12 frames; continue with the same command and --resume." in error.decode()
+    assert f"{out} has {done} of 12 frames; continue with the same command and --resume." in error
 
 
 def test_publishing_to_s3(

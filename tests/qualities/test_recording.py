@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from backends import quickest_backend
-from rigs import arc_rig
+from moving_block import PERIODS, RIG, filmed
 from small_presets import QUICK
 from structgstream import session, struct_gstream
 from structgstream.cameras import CameraRig
@@ -28,7 +28,6 @@ from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
-from structgstream.periods import PeriodConfig
 from structgstream.presets import StreamConfig
 from structgstream.qualities.ladder import configured, qualities_in
 from structgstream.qualities.recording import QualitiesRun, QualityReport, record_qualities
@@ -37,24 +36,9 @@ from structgstream.run_metrics import RunMetrics
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
 
-RIG = arc_rig(4, width=40, height=30)
 QUALITIES = qualities_in(["high=2", "low=-2"])
 NAMES = ("low", "high")
 FRAMES = 5
-PERIODS = replace(
-    QUICK, key_interval_seconds=0.1, period=PeriodConfig(seconds=0.7, residual=9.0, frames=2, start="scene", share=0.5)
-)
-"""Another period begins with frame 3."""
-
-
-def filmed(number: int) -> dict[str, np.ndarray]:
-    """A bright block that moves, in every camera."""
-    images = {}
-    for turn, name in enumerate(RIG):
-        picture = np.full((30, 40, 3), 60 + 10 * turn, np.uint8)
-        picture[8:20, (number * 2) % 28 : (number * 2) % 28 + 10] = (220, 180, 40)
-        images[name] = picture
-    return images
 
 
 @dataclass

@@ -59,9 +59,11 @@ def test_drawn_again_the_same_is_missing() -> None:
 def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> None:
     swept = sweep()
     missing = swept.missing()
-    assert not len(swept.births(missing, first_birth=0, room=0))
-    assert len(swept.births(missing, first_birth=0, room=2)) == 2
-    assert not len(sweep(replace(CONFIG, least_supports=6)).births(missing, first_birth=0, room=9)), "six others of six"
+    assert not len(swept.births(missing, first_birth=0, room=0).free)
+    assert len(swept.births(missing, first_birth=0, room=2).free) == 2
+    unsupported = sweep(replace(CONFIG, least_supports=6)).births(missing, first_birth=0, room=9)
+    assert not len(unsupported.free), "six others of six"
+    assert not unsupported.refused_count
 
 
 def test_a_depth_map_is_infinite_where_nothing_is_drawn() -> None:

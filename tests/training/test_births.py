@@ -59,7 +59,8 @@ def test_without_anything_missing_nothing_is_born() -> None:
     views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
-    assert not len(sweep_births(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend()))
+    found = sweep_births(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend())
+    assert (len(found.free), found.refused_count) == (0, 0)
 
 
 def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> None:
@@ -75,7 +76,7 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
 
     def born(last: ViewResidual) -> int:
         found = [view_residual(without[v.index].clamp(0, 1), v, floor=floor, config=config) for v in views[:-1]]
-        return len(sweep_births([*found, last], depths, color, first_birth=0, config=config, backend=backend))
+        return len(sweep_births([*found, last], depths, color, first_birth=0, config=config, backend=backend).free)
 
     last = views[-1]
     silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))

@@ -168,6 +168,7 @@ def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_conte
     for most, born in ((number, number), (number - 1, 0)):
         found = renewed(reference_backend(), config=replace(BLIND, thin=replace(THIN, most=most)))
         assert len(found.new_free) == found.thin_count == born
+        assert found.counts["thin births refused"] == number - born, "told in the log"
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:

@@ -13,11 +13,8 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
-import numpy as np
-from numpy.typing import NDArray
-
-from structgstream.cameras import CameraRig
 from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead
+from structgstream.data.wrappers import SourceFacts
 from structgstream.frames import MultiViewFrame
 
 
@@ -116,32 +113,16 @@ class SharedFrames:
         keep_frames(self._source, *firsts, last=max(last for _, last in self._needs))
 
 
-class _Reader:
+class _Reader(SourceFacts[FrameStream]):
     """One of several readers of a stream."""
 
     def __init__(self, shared: SharedFrames, source: FrameStream, number: int) -> None:
-        self._shared, self._source, self._number = shared, source, number
-
-    @property
-    def rig(self) -> CameraRig:
-        return self._source.rig
-
-    @property
-    def fps(self) -> float:
-        return self._source.fps
-
-    @property
-    def name(self) -> str:
-        return self._source.name
-
-    @property
-    def points(self) -> NDArray[np.float64] | None:
-        return self._source.points
+        self._shared, self.source, self._number = shared, source, number
 
     @property
     def newest_only(self) -> bool:
         """See ``ArrivingFrames``."""
-        return not may_read_ahead(self._source)
+        return not may_read_ahead(self.source)
 
     def keep(self, *first: int, last: int) -> None:
         """See ``KeepsFrames``."""
@@ -160,7 +141,7 @@ class _RecordingReader(_Reader):
     """One of several readers of a recording."""
 
     def __len__(self) -> int:
-        count = frame_count(self._source)
+        count = frame_count(self.source)
         assert count is not None, "a recording"
         return count
 

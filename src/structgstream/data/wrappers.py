@@ -4,24 +4,25 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Protocol, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.images import ImageSource, opencv, reduced_mask
-from structgstream.data.source import FrameSource, TimedPictures
+from structgstream.data.source import FrameSource, FrameStream, TimedPictures
 from structgstream.data.video import VideoSource
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 
+Source = TypeVar("Source", bound=FrameStream)
 
-@dataclass(frozen=True)
-class SourceWrapper:
-    """A source that passes everything through; base class of the wrappers."""
 
-    source: FrameSource
+class SourceFacts(Generic[Source]):
+    """What a wrapper tells about its ``source`` unchanged."""
+
+    source: Source
 
     @property
     def rig(self) -> CameraRig:
@@ -38,6 +39,13 @@ class SourceWrapper:
     @property
     def points(self) -> NDArray[np.float64] | None:
         return self.source.points
+
+
+@dataclass(frozen=True)
+class SourceWrapper(SourceFacts[FrameSource]):
+    """A recording that passes everything through; base class of the wrappers."""
+
+    source: FrameSource
 
     def __len__(self) -> int:
         return len(self.source)

@@ -16,7 +16,7 @@ from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.births import BirthConfig, ViewResidual, sweep_births, view_residual
+from structgstream.training.births import BirthConfig, Births, ViewResidual, sweep_births, view_residual
 from structgstream.training.partition import changed_tiles
 from structgstream.training.residuals import ResidualFloor, apply_camera_color
 from structgstream.training.views import View, mean_of_counting
@@ -92,10 +92,10 @@ class Sweep:
         """The same views, drawn again."""
         return [self._drawn(entry) for entry in missing]
 
-    def births(self, missing: Sequence[Missing], *, first_birth: int, room: int) -> FreeGaussians:
+    def births(self, missing: Sequence[Missing], *, first_birth: int, room: int) -> Births:
         """New free Gaussians where several views miss the same; at most ``room``."""
         if not self._enough(missing):
-            return FreeGaussians.empty(self.moving.free.means)
+            return Births(FreeGaussians.empty(self.moving.free.means))
         residuals = [entry.residual for entry in missing]
         return sweep_births(
             residuals,

@@ -142,6 +142,20 @@ def blamed_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, config:
     return (bad >= config.blame_views) & (2 * bad >= seen.sum(0))
 
 
+@dataclass(frozen=True)
+class Births:
+    """What a sweep bears.
+
+    Args:
+        free: the new free Gaussians.
+        refused_count: how many it would have borne, had they not been more than allowed
+            (``BirthConfig.most`` without ``coarsen``); then ``free`` is empty.
+    """
+
+    free: FreeGaussians
+    refused_count: int = 0
+
+
 def sweep_births(
     missing: Sequence[ViewResidual],
     depths: Mapping[int, Tensor],
@@ -150,7 +164,7 @@ def sweep_births(
     first_birth: int,
     config: BirthConfig,
     backend: Backend,
-) -> FreeGaussians:
+) -> Births:
     """New free Gaussians at points whose colour is missing in several views.
 
     Args:
@@ -191,7 +205,7 @@ def sweep_births(
         colors.append(view.colors[rows[good], columns[good]])
         spacings.append(config.pixel_step * z / K[0, 0])
     if not points or not sum(len(group) for group in points):
-        return FreeGaussians.empty(views[0].colors)
+        return Births(FreeGaussians.empty(views[0].colors))
     return _merge_points(
         torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, config=config
     )
@@ -214,9 +228,7 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
     return mask
 
 
-def _merge_points(
-    points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, config: BirthConfig
-) -> FreeGaussians:
+def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, config: BirthConfig) -> Births:
     """One free Gaussian per voxel of the points, if at least ``least_hits`` points lie around it."""
     try:
         from scipy.spatial import KDTree
@@ -227,10 +239,11 @@ def _merge_points(
     while True:
         means, hits = _cells(values, tree, voxel)
         enough = hits >= config.least_hits
-        if int(enough.sum()) <= config.most or voxel > COARSEST * float(spacings.median()):
+        wanted = int(enough.sum())
+        if wanted <= config.most or voxel > COARSEST * float(spacings.median()):
             break
         if not config.coarsen:
-            return FreeGaussians.empty(points)
+            return Births(FreeGaussians.empty(points), wanted)
         voxel *= 2.0**0.5  # Too many: what is missing is large, and is born coarser.
     order = hits.argsort(descending=True, stable=True)
     chosen = order[enough[order]][: config.most].sort().values
@@ -239,13 +252,15 @@ def _merge_points(
     sizes = sizes * (voxel / float(spacings.median()))
     unit = points.new_tensor([1.0, 0.0, 0.0, 0.0])
     opacity = torch.logit(torch.tensor(config.opacity)).to(points)
-    return FreeGaussians(
-        means=centers.contiguous(),
-        log_scales=(config.size * sizes).log().expand(count, 3).contiguous(),
-        quats=unit.expand(count, 4).clone(),
-        logit_opacities=opacity.expand(count).clone(),
-        colors=looks.contiguous(),
-        births=first_birth + torch.arange(count, device=points.device),
+    return Births(
+        FreeGaussians(
+            means=centers.contiguous(),
+            log_scales=(config.size * sizes).log().expand(count, 3).contiguous(),
+            quats=unit.expand(count, 4).clone(),
+            logit_opacities=opacity.expand(count).clone(),
+            colors=looks.contiguous(),
+            births=first_birth + torch.arange(count, device=points.device),
+        )
     )
 
 

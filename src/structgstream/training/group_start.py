@@ -164,7 +164,7 @@ class _Rounds:
             scene=displaced.merge(result.scene),
             pruned=result.pruned + int((~new.kept).sum()),
             spawned=result.spawned + len(new.new_free),
-            counts={"corrected": lifted, "born": len(new.new_free), "births refused": int(new.refused)},
+            counts={"corrected": lifted, **new.counts},
         )
 
     def _partition(self, current: Scene) -> Partition:

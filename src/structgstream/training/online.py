@@ -372,19 +372,15 @@ def _fit_moving_part(
     result = fit.optimize(
         StartingPoint(moving, trusted, start.displacements[alive], partition, start.focuses, new.new_free)
     )
-    died = int((~new.kept).sum())
     return replace(
         result,
         scene=partition.merge(result.scene),
-        pruned=result.pruned + int(segmentation.unseen.sum()) + died,
+        pruned=result.pruned + int(segmentation.unseen.sum()) + new.counts["blamed"],
         spawned=result.spawned + len(new.new_free),
         counts={
             "lifted": start.lifted_count,
             "corrected": start.corrected_count,
-            "born": len(new.new_free),
-            "born thin": new.thin_count,
-            "blamed": died,
-            "births refused": int(new.refused),
+            **new.counts,
             "views left out": len(views) - len(trusted),
             "jumps": int(segmentation.scene_cut),
         },

@@ -12,7 +12,7 @@ from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.birth_sweep import Missing, Sweep, missing_share
-from structgstream.training.births import BirthConfig, blamed_mask
+from structgstream.training.births import BirthConfig, Births, blamed_mask
 from structgstream.training.observation import gather_maps
 from structgstream.training.partition import Partition
 from structgstream.training.residuals import ResidualFloor
@@ -27,6 +27,7 @@ class Renewal:
         kept: mask ``[F]`` of those that are kept.
         new_free: those that are born.
         thin_count: how many of them are thin content's.
+        thin_refused_count: how many thin ones were not born because they would have been too many.
         missing_share: share of missing pixels in all training views.
         refused: whether too much is missing for births.
     """
@@ -34,8 +35,20 @@ class Renewal:
     kept: Tensor
     new_free: FreeGaussians
     thin_count: int = 0
+    thin_refused_count: int = 0
     missing_share: float = 0.0
     refused: bool = False
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often each part acted, for the log."""
+        return {
+            "born": len(self.new_free),
+            "born thin": self.thin_count,
+            "thin births refused": self.thin_refused_count,
+            "blamed": int((~self.kept).sum()),
+            "births refused": int(self.refused),
+        }
 
 
 def renew_free_gaussians(
@@ -81,18 +94,18 @@ def renew_free_gaussians(
             sweep = replace(sweep, moving=replace(moving, free=moving.free.select(kept)))
             missing = sweep.drawn(missing)
         room = max(0, room - int(kept.sum()))
-        new, thin_count = sweep.births(missing, first_birth=first_birth, room=room), 0
-        if config.thin.enabled and not len(new):
-            new = _thin_births(replace(sweep, config=config.for_thin), first_birth=first_birth, room=room)
-            thin_count = len(new)
-    return Renewal(kept, new, thin_count, share)
+        large = sweep.births(missing, first_birth=first_birth, room=room)
+        if len(large.free) or not config.thin.enabled:
+            return Renewal(kept, large.free, missing_share=share)
+        thin = _thin_births(replace(sweep, config=config.for_thin), first_birth=first_birth, room=room)
+    return Renewal(kept, thin.free, len(thin.free), thin.refused_count, share)
 
 
-def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> FreeGaussians:
+def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Births:
     """Births of thin content, where nothing large is born."""
     missing = sweep.missing(blames=False)
     if missing_share(missing) > sweep.config.most_missing_share:
-        return FreeGaussians.empty(sweep.moving.free.means)
+        return Births(FreeGaussians.empty(sweep.moving.free.means))
     return sweep.births(missing, first_birth=first_birth, room=room)
 
 
