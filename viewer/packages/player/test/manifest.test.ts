@@ -104,6 +104,8 @@ test.each([
   7,
 ])("a file may not be called %j", (file) => {
   for (const path of ["periods.0.file", "segments.0.file", "history.0.file", "parts.0.file"]) {
+    const shown = path.replace(/\.0/, "[0]");
+    expect(() => parsed(but(path, file))).toThrow(`manifest.json: ${shown} is `);
     expect(() => parsed(but(path, file))).toThrow("expected the plain name of a file beside it");
   }
 });

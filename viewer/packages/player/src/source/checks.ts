@@ -27,7 +27,7 @@ export function whole(least = 0, most = 2 ** 32 - 1): Check<number> {
 
 export function number(least = -1e15): Check<number> {
   const holds = (value: unknown) => typeof value === "number" && value >= least && value <= 1e15;
-  return checked(holds, least < 0 ? "a finite number" : `a number from ${least}`);
+  return checked(holds, least < 0 ? "a finite number" : `a number from ${least} to 1e15`);
 }
 
 export const flag: Check<boolean> = checked((value) => typeof value === "boolean", "true or false");
@@ -66,10 +66,15 @@ export function shaped<Shape extends Readonly<Record<string, Check<unknown>>>>(s
     if (typeof value !== "object" || value === null || Array.isArray(value)) refuse(where, value, "an object");
     const fields = Object.entries(shape).map(([name, check]) => [
       name,
-      check(Object.hasOwn(value, name) ? (value as Record<string, unknown>)[name] : undefined, `${where}, ${name},`),
+      check(Object.hasOwn(value, name) ? (value as Record<string, unknown>)[name] : undefined, fieldOf(where, name)),
     ]);
     return Object.fromEntries(fields) as Shaped<Shape>;
   };
+}
+
+/** Where a field is, for messages: `manifest.json: parts[0].file`. */
+export function fieldOf(where: string, name: string): string {
+  return where.includes(": ") ? `${where}.${name}` : `${where}: ${name}`;
 }
 
 /**

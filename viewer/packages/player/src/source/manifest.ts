@@ -4,6 +4,7 @@
 import { SourceError } from "./byteSource.js";
 import {
   type Check,
+  fieldOf,
   flag,
   like,
   list,
@@ -65,7 +66,7 @@ const segment: Check<SegmentEntry> = (value, where) => {
   const { frame_bytes: lengths } = found;
   const sum = lengths.reduce((all, bytes) => all + bytes, 0);
   if (lengths.length !== found.frames || sum !== found.bytes || lengths[0] !== found.key_bytes)
-    refuse(`${where}, frame_bytes,`, lengths, "the lengths of its frames");
+    refuse(fieldOf(where, "frame_bytes"), lengths, "the lengths of its frames");
   return found;
 };
 const manifest = shaped({
