@@ -13,7 +13,7 @@ from stand_ins import job, sha256, workers
 from structgstream.errors import ConfigError, StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
-from structgstream.executors.task import PYTHON
+from structgstream.executors.task import PYTHON, Ending, Task
 from structgstream.parallel.driver import Job, Status, drive
 from structgstream.parallel.parts import Parts, group_name
 
@@ -53,6 +53,23 @@ def test_inline_gives_the_same_bytes(undisturbed: Path, tmp_path: Path) -> None:
     given = job(tmp_path, program=(PYTHON, "-m", "benchmarks.stand_in"))
     run(given, Parts(tmp_path / "parts"), TaskQueue(InlineEngine()))
     assert sha256(tmp_path / "out.sgs") == sha256(undisturbed / "out.sgs")
+
+
+class ElsewhereEngine(InlineEngine):
+    """Logs stay on another machine; what tasks print comes with their endings."""
+
+    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
+        super().start(replace(task, log=None), gpus=gpus, attempt=attempt)
+
+    def ended(self, seconds: float) -> list[Ending]:
+        return [replace(ending, output=f"{ending.name} says: {ending.output}") for ending in super().ended(seconds)]
+
+
+def test_what_tasks_on_other_machines_print_is_kept_here(tmp_path: Path) -> None:
+    given, parts = job(tmp_path, program=(PYTHON, "-m", "benchmarks.stand_in")), Parts(tmp_path / "parts")
+    run(given, parts, TaskQueue(ElsewhereEngine()))
+    for name in ("header", "track", group_name(4, 8)):
+        assert parts.log(name).read_text().startswith(f"{name} says: ")
 
 
 def test_states_go_from_waiting_to_done(tmp_path: Path) -> None:

@@ -203,6 +203,7 @@ class _Drive:
         """What a task on another machine has printed is kept here."""
         log = self._parts.log(ending.name)
         if ending.output and not log.exists():
+            log.parent.mkdir(parents=True, exist_ok=True)
             write_whole(log, ending.output.encode())
 
     def _show_running(self) -> None:

@@ -15,6 +15,7 @@ const ADDRESS = "http://test/manifest.json";
 let open: Playing[] = [];
 
 afterEach(() => {
+  vi.restoreAllMocks();
   for (const { engine, close } of open) {
     engine.destroy();
     close();
@@ -497,11 +498,53 @@ describe("qualities", () => {
     throughput.end();
     expect(throughput.bitsPerSecond).toBe(2e5);
     clock.seconds = 100; // nothing was waited for
-    expect(throughput.bitsPerSecond).toBe(2e5);
+    expect(throughput.bitsPerSecond).toBeCloseTo(2e5);
     throughput.begin();
     clock.seconds = 120; // and now nothing comes
     expect(throughput.bitsPerSecond).toBeLessThan(2e4);
     throughput.end();
+  });
+
+  test("of a small stream throughput is known after a while, and a slow phase is forgotten", () => {
+    const clock = { seconds: 0 };
+    const throughput = new Throughput(() => clock.seconds);
+    const packet = (seconds: number) => {
+      throughput.begin();
+      clock.seconds += seconds;
+      throughput.take(1000);
+      throughput.end();
+      clock.seconds += 5;
+    };
+    packet(0.01);
+    expect(throughput.bitsPerSecond).toBeUndefined();
+    for (let i = 0; i < 2; i++) packet(0.01);
+    expect(throughput.bitsPerSecond).toBeCloseTo(8e5);
+    for (let i = 0; i < 8; i++) packet(0.7);
+    expect(throughput.bitsPerSecond).toBeLessThan(1.3e4);
+    for (let i = 0; i < 8; i++) packet(0.01);
+    expect(throughput.bitsPerSecond).toBeGreaterThan(1e5);
+  });
+
+  test("bit rates that are measured while a live run goes on are learned from the list", async () => {
+    const runs = { high: run(12, { frameSeconds: 1 }), low: run(12, { frameSeconds: 1 }) };
+    const host = new Host(runs);
+    const guess = listed([{ ...ENTRIES[0], bits_per_second: 1e12 }, ENTRIES[1]]);
+    host.instead.set("/qualities.json", guess);
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.shown.at(-1) === 11 && play.engine.stalled, "edge");
+    expect(play.engine.qualities.at).toBe(0);
+    host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second: 3e5 }, ENTRIES[1]]));
+    const now = performance.now.bind(performance);
+    vi.spyOn(performance, "now").mockImplementation(() => now() + 40_000);
+    let count = 0;
+    await play.until(() => {
+      if (++count % 100 === 0) for (const one of [runs.high, runs.low]) one.write(1);
+      return on() && play.engine.qualities.at === 1;
+    }, "higher quality");
+    expect(play.errors).toEqual([]);
   });
 
   test("one that cannot be had is told and left alone", async () => {

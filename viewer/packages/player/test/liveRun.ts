@@ -28,7 +28,6 @@ export interface RunOptions {
   readonly pageSegments?: number;
 }
 
-/** Packets and init record of a stored stream. */
 /** The init record of a period, with the prefix, and the packets of a stream. */
 export function partsOf(stream: Uint8Array, period: number) {
   const [prefix, init, ...rest] = piecesOf(stream);

@@ -15,7 +15,7 @@ const RETRY_SECONDS = 2;
 
 export class Ladder {
   /** By rising bit rate. */
-  readonly steps: readonly Quality[];
+  steps: readonly Quality[];
   /** What the user wants; undefined leaves it to the connection. */
   choice: number | undefined;
   at = 0;
@@ -48,6 +48,14 @@ export class Ladder {
     const higher = at + 1;
     const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
     return higher < steps.length && enough && bears(higher, UP) ? this.granted(higher) : at;
+  }
+
+  /** What is known now of the bit rates, which are measured while the run goes on. */
+  measured(qualities: readonly Quality[]): void {
+    this.steps = this.steps.map((step) => {
+      const found = qualities.find(({ name }) => name === step.name);
+      return { ...step, bits_per_second: found?.bits_per_second ?? step.bits_per_second };
+    });
   }
 
   /** Another step is used from now on. */

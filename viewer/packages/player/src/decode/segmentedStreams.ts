@@ -22,16 +22,21 @@ export interface SegmentedEvents {
   qualities(names: readonly string[], at: number): void;
 }
 
+/** The list of qualities of a live stream is asked for again after so long. */
+const LIST_MILLISECONDS = 30_000;
+
 export class SegmentedStreams {
   private active: SegmentStream;
   private ladder: Ladder | undefined;
+  /** When the list of qualities was asked for last. */
+  private listed = 0;
   /** The quality that is changed to, as soon as it can be. */
   private pending: { readonly stream: SegmentStream; readonly step: number } | undefined;
 
   constructor(
     private readonly client: ByteClient,
     private readonly url: string,
-    name: string,
+    private readonly name: string,
     private readonly budgetBytes: number,
     private readonly events: SegmentedEvents,
   ) {
@@ -51,6 +56,7 @@ export class SegmentedStreams {
   changed(next: number, demand: Demand, seeking: boolean): SegmentStream | undefined {
     const { ladder, active } = this;
     if (!ladder) return undefined;
+    if (active.catalog.live) this.listAgain();
     const step = ladder.wanted(active.loader.throughput.bitsPerSecond);
     if (this.pending && this.pending.step !== step) this.drop();
     if (step === ladder.at) return undefined;
@@ -125,9 +131,22 @@ export class SegmentedStreams {
 
   private begin(qualities: readonly Quality[]): void {
     this.ladder = new Ladder(qualities, () => performance.now() / 1000);
+    this.listed = performance.now();
     this.active.leave();
     this.active = this.qualityOf(this.ladder.steps[0]!);
     this.tellQualities();
+  }
+
+  private listAgain(): void {
+    const now = performance.now();
+    if (now - this.listed < LIST_MILLISECONDS) return;
+    this.listed = now;
+    const id = this.client.manifests(this.url, this.name, {
+      qualities: (qualities) => this.ladder!.measured(qualities),
+      manifest: () => this.client.cancel(id), // It leads to something else by now.
+      end: () => {},
+      failed: () => {}, // An outage is told by the stream that is played.
+    });
   }
 
   private refuse(message: string, temporary = false): void {

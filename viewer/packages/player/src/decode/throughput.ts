@@ -3,8 +3,11 @@
 
 /** What is older than about so many seconds of waiting counts less and less. */
 const REMEMBERED_SECONDS = 6;
-/** Fewer bytes say nothing, unless they took long. */
+/** After so many seconds what came counts half, waiting or not: packets of a small stream hardly have to be waited for. */
+const HALF_LIFE_SECONDS = 10;
+/** Fewer bytes say nothing, unless they took long or it has been going on for a while. */
 const LEAST_BYTES = 30_000;
+const ENOUGH_SECONDS = 10;
 
 export class Throughput {
   private active = 0;
@@ -12,16 +15,21 @@ export class Throughput {
   private seconds = 0;
   private bytes = 0;
   private known = false;
+  private readonly began: number;
 
   /** @param now seconds of any clock */
-  constructor(private readonly now: () => number = () => performance.now() / 1000) {}
+  constructor(private readonly now: () => number = () => performance.now() / 1000) {
+    this.began = this.since = now();
+  }
 
   /** A reading begins; others may be under way. */
   begin(): void {
-    if (!this.active++) this.since = this.now();
+    this.count();
+    this.active++;
   }
 
   take(bytes: number): void {
+    this.count();
     this.bytes += bytes;
   }
 
@@ -33,16 +41,21 @@ export class Throughput {
   /** Undefined while too little has come. */
   get bitsPerSecond(): number | undefined {
     this.count();
-    return this.known ? (8 * this.bytes) / Math.max(this.seconds, 1e-3) : undefined;
+    return this.known && this.seconds > 0 ? (8 * this.bytes) / this.seconds : undefined;
   }
 
   private count(): void {
     const now = this.now();
-    if (this.active) this.seconds += now - this.since;
+    const passed = now - this.since;
     this.since = now;
+    this.scale(0.5 ** (passed / HALF_LIFE_SECONDS));
+    if (this.active) this.seconds += passed;
     this.known ||= this.bytes >= LEAST_BYTES || this.seconds > REMEMBERED_SECONDS / 2;
-    if (this.seconds < REMEMBERED_SECONDS) return;
-    const share = REMEMBERED_SECONDS / 2 / this.seconds;
+    this.known ||= this.bytes > 0 && now - this.began > ENOUGH_SECONDS;
+    if (this.seconds > REMEMBERED_SECONDS) this.scale(REMEMBERED_SECONDS / 2 / this.seconds);
+  }
+
+  private scale(share: number): void {
     this.seconds *= share;
     this.bytes *= share;
   }

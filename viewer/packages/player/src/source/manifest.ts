@@ -118,7 +118,7 @@ export function manifestIn(bytes: Uint8Array, name: string): Manifest | readonly
   const value = parsedJson(bytes, name);
   if ((value as { format?: unknown } | null)?.format === QUALITIES) {
     const found = shaped({ version: only(1), qualities })(value, name).qualities;
-    return found.length ? found : refuse(`${name}, qualities,`, [], "at least one");
+    return found.length ? found : refuse(fieldOf(name, "qualities"), [], "at least one");
   }
   checkHead(value, name);
   const found = manifest(value, name);
