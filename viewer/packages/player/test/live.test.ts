@@ -663,7 +663,7 @@ describe("qualities", () => {
     );
     const at = (seconds: number, bits: number | undefined) => {
       clock.seconds = seconds;
-      const step = ladder.wanted(bits);
+      const step = ladder.wanted(bits, 1);
       if (step !== ladder.at) ladder.change(step);
       return step;
     };
@@ -681,6 +681,53 @@ describe("qualities", () => {
     expect(at(35, 3.3e6)).toBe(1);
     ladder.choice = 0;
     expect(at(36, 9e6)).toBe(0);
+  });
+
+  test("where a connection is hardly used the next one is tried, ever less often if in vain", () => {
+    const clock = { seconds: 0 };
+    const entries = [1e4, 2e5].map((bits_per_second) => ({ manifest: "m.json", bits_per_second, name: "x" }));
+    const ladder = new Ladder(entries, () => clock.seconds);
+    const at = (seconds: number, busyShare: number, bits = 2e4) => {
+      clock.seconds = seconds;
+      return ladder.wanted(bits, busyShare);
+    };
+    expect(at(9, 0.1)).toBe(0);
+    expect(at(11, 0.5)).toBe(0); // it has enough to do
+    expect(at(12, 0.1)).toBe(1);
+    expect(at(13, 0.9)).toBe(1); // by the trial itself
+    ladder.giveUp();
+    expect(at(30, 0.1)).toBe(0);
+    expect(at(34, 0.1)).toBe(1);
+    ladder.change(1);
+    expect(at(35, 0.1, 3e5)).toBe(1);
+    expect(at(37, 0.1)).toBe(0); // it does not bear it
+    ladder.change(0);
+    expect(at(70, 0.1)).toBe(0);
+    expect(at(78, 0.1)).toBe(1);
+  });
+
+  test("at the edge a finer quality is gone up to though its frames are published later", async () => {
+    const runs = { high: run(12, { frameSeconds: 1 }), low: run(13, { frameSeconds: 1 }) };
+    const host = new Host(runs);
+    host.instead.set("/qualities.json", listed(ENTRIES));
+    const play = opened(host, 0, LIST);
+    await play.settled();
+    play.engine.play();
+    const on = goingOn(play);
+    await play.until(() => on() && play.shown.at(-1) === 12 && play.engine.stalled, "edge");
+    play.engine.chooseQuality(1);
+    let count = 0;
+    await play.until(() => {
+      // Low is always a frame ahead.
+      if (++count % 50 === 0) runs.low.write(1);
+      if (count % 50 === 40) runs.high.write(1);
+      return on() && play.engine.qualities.at === 1;
+    }, "higher quality");
+    const before = play.shown.at(-1)!;
+    for (let i = 0; i < 3; i++) runs.high.write(1);
+    await play.until(() => on() && play.shown.at(-1)! > before + 1, "frames of the higher quality");
+    expect(play.shown).toEqual([...play.shown].sort((a, b) => a - b));
+    expect(play.errors).toEqual([]);
   });
 });
 

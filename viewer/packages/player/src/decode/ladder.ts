@@ -10,6 +10,13 @@ const STAY = 1.15;
 const UP_SECONDS = 4;
 const AGAIN_SECONDS = 20;
 const DOWN_SECONDS = 2;
+/**
+ * Small packets say little of what a connection bears. Where it is hardly used the next quality is tried: its next key
+ * frame is fetched beside the packets that are needed. After a failure twice as long passes until it is tried again.
+ */
+const IDLE_SHARE = 0.3;
+const TRIAL_SECONDS = 10;
+const MOST_TRIAL_SECONDS = 320;
 /** One that could not be had for a reason that may go away is tried again. */
 const RETRY_SECONDS = 2;
 
@@ -19,6 +26,10 @@ export class Ladder {
   /** What the user wants; undefined leaves it to the connection. */
   choice: number | undefined;
   at = 0;
+  /** The step above is tried, though it is not known to be borne. */
+  trying = false;
+  private trialSeconds = TRIAL_SECONDS;
+  private tried: number;
   private changed: number;
   private fell = false;
   /** Until when, by step. */
@@ -30,12 +41,13 @@ export class Ladder {
     private readonly now: () => number,
   ) {
     this.steps = [...qualities].sort((a, b) => a.bits_per_second - b.bits_per_second);
-    this.changed = now();
+    this.changed = this.tried = now();
   }
 
   /** The step to be on; `bitsPerSecond` is undefined while nothing is known. */
-  wanted(bitsPerSecond: number | undefined): number {
-    const { at, steps, choice } = this;
+  wanted(bitsPerSecond: number | undefined, busyShare: number): number {
+    const { at, steps, choice, trying } = this;
+    this.trying = false;
     if (choice !== undefined) return this.granted(choice);
     if (bitsPerSecond === undefined) return at;
     const since = this.now() - this.changed;
@@ -47,7 +59,18 @@ export class Ladder {
     }
     const higher = at + 1;
     const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
-    return higher < steps.length && enough && bears(higher, UP) ? this.granted(higher) : at;
+    if (higher >= steps.length) return at;
+    if (enough && bears(higher, UP)) return this.granted(higher);
+    const isDue = busyShare < IDLE_SHARE && this.now() - this.tried >= this.trialSeconds;
+    this.trying = (trying || isDue) && this.granted(higher) === higher;
+    return this.trying ? higher : at;
+  }
+
+  /** What was tried was not there in time. */
+  giveUp(): void {
+    this.trying = false;
+    this.tried = this.now();
+    this.trialSeconds = Math.min(2 * this.trialSeconds, MOST_TRIAL_SECONDS);
   }
 
   /** What is known now of the bit rates, which are measured while the run goes on. */
@@ -61,8 +84,10 @@ export class Ladder {
   /** Another step is used from now on. */
   change(step: number): void {
     this.fell = step < this.at;
+    if (this.fell) this.giveUp();
     this.at = step;
-    this.changed = this.now();
+    this.trying = false;
+    this.changed = this.tried = this.now();
   }
 
   /** A step cannot be had, for now or ever. */

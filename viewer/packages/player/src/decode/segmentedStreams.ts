@@ -24,6 +24,8 @@ export interface SegmentedEvents {
 
 /** The list of qualities of a live stream is asked for again after so long. */
 const LIST_MILLISECONDS = 30_000;
+/** What is tried has to be there by then. */
+const TRIAL_MILLISECONDS = 15_000;
 
 export class SegmentedStreams {
   private active: SegmentStream;
@@ -31,7 +33,7 @@ export class SegmentedStreams {
   /** When the list of qualities was asked for last. */
   private listed = 0;
   /** The quality that is changed to, as soon as it can be. */
-  private pending: { readonly stream: SegmentStream; readonly step: number } | undefined;
+  private pending: { readonly stream: SegmentStream; readonly step: number; readonly since: number } | undefined;
 
   constructor(
     private readonly client: ByteClient,
@@ -57,15 +59,25 @@ export class SegmentedStreams {
     const { ladder, active } = this;
     if (!ladder) return undefined;
     if (active.catalog.live) this.listAgain();
-    const step = ladder.wanted(active.loader.throughput.bitsPerSecond);
+    const { bitsPerSecond, busyShare } = active.loader.throughput;
+    const step = ladder.wanted(bitsPerSecond, busyShare);
     if (this.pending && this.pending.step !== step) this.drop();
     if (step === ladder.at) return undefined;
     this.pending ??= {
       step,
       stream: this.qualityOf(ladder.steps[step]!),
+      since: performance.now(),
     };
-    const { stream } = this.pending;
+    const { stream, since } = this.pending;
+    if (ladder.trying && performance.now() - since > TRIAL_MILLISECONDS) {
+      ladder.giveUp();
+      this.drop();
+      return undefined;
+    }
     const { catalog, store } = stream;
+    if (step > ladder.at && catalog.live && !seeking && next >= catalog.count - 1) {
+      return this.atEdge(stream, next, demand) ? this.change() : undefined;
+    }
     if (next >= catalog.count || !stream.chapter(next, demand.ahead)) return undefined;
     // Without the frame that is needed now there is nothing to go on with.
     const starved = step < ladder.at && !active.store.has(next);
@@ -74,6 +86,20 @@ export class SegmentedStreams {
     if (key >= catalog.count) return undefined;
     stream.loader.want(key, key + 1, Math.max(demand.ahead, key + 1));
     return key === next && store.has(key) ? this.change() : undefined;
+  }
+
+  /**
+   * Whether a finer quality can be gone on with at its edge. Frames are published there after those of a coarser one,
+   * so its key frames always come too late for who waits for one: the newest group is fetched up to the edge instead.
+   */
+  private atEdge(stream: SegmentStream, next: number, demand: Demand): boolean {
+    const { catalog, store, loader } = stream;
+    const last = catalog.count - 1;
+    if (next > last + 1 || last < 0 || !stream.chapter(last, demand.ahead)) return false;
+    const first = catalog.groupStart(last);
+    loader.want(first, last + 1, Math.max(demand.ahead, last + 1));
+    for (let index = first; index <= last; index++) if (!store.has(index)) return false;
+    return true;
   }
 
   private change(): SegmentStream {

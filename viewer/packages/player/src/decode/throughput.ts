@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How many bits a second come while any are waited for, of late. */
+/** How many bits a second come while any are waited for, of late, and how much of the time that is. */
 
 /** What is older than about so many seconds of waiting counts less and less. */
 const REMEMBERED_SECONDS = 6;
@@ -13,6 +13,8 @@ export class Throughput {
   private active = 0;
   private since = 0;
   private seconds = 0;
+  /** Waiting or not. */
+  private wallSeconds = 0;
   private bytes = 0;
   private known = false;
   private readonly began: number;
@@ -44,11 +46,18 @@ export class Throughput {
     return this.known && this.seconds > 0 ? (8 * this.bytes) / this.seconds : undefined;
   }
 
+  /** The share of the time, 0 to 1, in which something is waited for. */
+  get busyShare(): number {
+    this.count();
+    return this.wallSeconds > 0 ? this.seconds / this.wallSeconds : 1;
+  }
+
   private count(): void {
     const now = this.now();
     const passed = now - this.since;
     this.since = now;
     this.scale(0.5 ** (passed / HALF_LIFE_SECONDS));
+    this.wallSeconds += passed;
     if (this.active) this.seconds += passed;
     this.known ||= this.bytes >= LEAST_BYTES || this.seconds > REMEMBERED_SECONDS / 2;
     this.known ||= this.bytes > 0 && now - this.began > ENOUGH_SECONDS;
@@ -57,6 +66,7 @@ export class Throughput {
 
   private scale(share: number): void {
     this.seconds *= share;
+    this.wallSeconds *= share;
     this.bytes *= share;
   }
 }
