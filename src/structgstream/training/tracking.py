@@ -38,7 +38,7 @@ class TrackConfig:
 
     scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
-    cameras: int = 14
+    cameras: int = 30
     """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
