@@ -693,6 +693,7 @@ describe("qualities", () => {
     };
     expect(at(9, 0.1)).toBe(0);
     expect(at(11, 0.5)).toBe(0); // it has enough to do
+    expect(at(11, 0.1, 1e4)).toBe(0); // nor can it be that much better than it seems
     expect(at(12, 0.1)).toBe(1);
     expect(at(13, 0.9)).toBe(1); // by the trial itself
     ladder.giveUp();

@@ -11,10 +11,12 @@ const UP_SECONDS = 4;
 const AGAIN_SECONDS = 20;
 const DOWN_SECONDS = 2;
 /**
- * Small packets say little of what a connection bears. Where it is hardly used the next quality is tried: its next key
- * frame is fetched beside the packets that are needed. After a failure twice as long passes until it is tried again.
+ * Small packets say little of what a connection bears. Where it is hardly used the next quality is tried: what it needs
+ * is fetched beside the packets that are shown. After a failure twice as long passes until it is tried again.
  */
 const IDLE_SHARE = 0.3;
+/** A connection bears at most so many times what small packets say. */
+const UNDERESTIMATED = 16;
 const TRIAL_SECONDS = 10;
 const MOST_TRIAL_SECONDS = 320;
 /** One that could not be had for a reason that may go away is tried again. */
@@ -61,7 +63,8 @@ export class Ladder {
     const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
     if (higher >= steps.length) return at;
     if (enough && bears(higher, UP)) return this.granted(higher);
-    const isDue = busyShare < IDLE_SHARE && this.now() - this.tried >= this.trialSeconds;
+    const maybe = busyShare < IDLE_SHARE && bears(higher, 1 / UNDERESTIMATED);
+    const isDue = maybe && this.now() - this.tried >= this.trialSeconds;
     this.trying = (trying || isDue) && this.granted(higher) === higher;
     return this.trying ? higher : at;
   }
