@@ -527,13 +527,7 @@ describe("qualities", () => {
 
   test("bit rates that are measured while a live run goes on are learned from the list", async () => {
     const runs = { high: run(12, { frameSeconds: 1 }), low: run(12, { frameSeconds: 1 }) };
-    const host = new Host(runs);
-    const guess = listed([{ ...ENTRIES[0], bits_per_second: 1e12 }, ENTRIES[1]]);
-    host.instead.set("/qualities.json", guess);
-    const play = opened(host, 0, LIST);
-    await play.settled();
-    play.engine.play();
-    const on = goingOn(play);
+    const { host, play, on } = await both(runs, 1e12);
     await play.until(() => on() && play.shown.at(-1) === 11 && play.engine.stalled, "edge");
     expect(play.engine.qualities.at).toBe(0);
     host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second: 3e5 }, ENTRIES[1]]));
@@ -562,15 +556,20 @@ describe("qualities", () => {
     expect(play.shown.at(-1)).toBe(29);
   });
 
-  /** Both qualities of a stream that plays, of which the higher one was chosen and is shown. */
-  async function high(runs: Record<"high" | "low", LiveRun>, bits_per_second = 4e6) {
+  /** Both qualities of a stream, which plays. */
+  async function both(runs: Record<"high" | "low", LiveRun>, bits_per_second = 4e6) {
     const host = new Host(runs);
     host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second }, ENTRIES[1]]));
     const play = opened(host, 0, LIST);
     await play.settled();
-    play.engine.chooseQuality(1);
     play.engine.play();
-    const on = goingOn(play);
+    return { host, play, on: goingOn(play) };
+  }
+
+  /** The same, of which the higher one was chosen and is shown. */
+  async function high(runs: Record<"high" | "low", LiveRun>, bits_per_second = 4e6) {
+    const { host, play, on } = await both(runs, bits_per_second);
+    play.engine.chooseQuality(1);
     await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
     return { host, play, on };
   }
@@ -617,12 +616,7 @@ describe("qualities", () => {
   test("what is lost in one quality is not in another", async () => {
     const runs = { high: run(30).finish(), low: run(30).finish() };
     runs.low.files.delete([...runs.low.files.keys()].find((name) => name.startsWith("segment-00000001"))!);
-    const host = new Host(runs);
-    host.instead.set("/qualities.json", listed(ENTRIES));
-    const play = opened(host, 0, LIST);
-    await play.settled();
-    play.engine.play();
-    const on = goingOn(play);
+    const { play, on } = await both(runs);
     await play.until(() => on() && play.engine.frames.lost.length > 0, "lost frames");
     play.engine.chooseQuality(1);
     await play.until(() => on() && play.engine.qualities.at === 1, "higher quality");
@@ -696,25 +690,25 @@ describe("qualities", () => {
     expect(at(11, 0.1, 1e4)).toBe(0); // nor can it be that much better than it seems
     expect(at(12, 0.1)).toBe(1);
     expect(at(13, 0.9)).toBe(1); // by the trial itself
-    ladder.giveUp();
-    expect(at(30, 0.1)).toBe(0);
-    expect(at(34, 0.1)).toBe(1);
+    expect(at(28, 0.1)).toBe(0); // not there in time
+    expect(at(47, 0.1)).toBe(0);
+    expect(at(49, 0.1)).toBe(1);
     ladder.change(1);
-    expect(at(35, 0.1, 3e5)).toBe(1);
-    expect(at(37, 0.1)).toBe(0); // it does not bear it
+    expect(at(50, 0.1, 3e5)).toBe(1);
+    expect(at(52, 0.1)).toBe(0); // it does not bear it
     ladder.change(0);
-    expect(at(70, 0.1)).toBe(0);
-    expect(at(78, 0.1)).toBe(1);
+    expect(at(91, 0.1)).toBe(0);
+    expect(at(93, 0.1)).toBe(1);
+    ladder.change(1);
+    expect(at(500, 0.1)).toBe(0); // having borne it for long
+    ladder.change(0);
+    expect(at(509, 0.1)).toBe(0);
+    expect(at(511, 0.1)).toBe(1);
   });
 
   test("at the edge a finer quality is gone up to though its frames are published later", async () => {
     const runs = { high: run(12, { frameSeconds: 1 }), low: run(13, { frameSeconds: 1 }) };
-    const host = new Host(runs);
-    host.instead.set("/qualities.json", listed(ENTRIES));
-    const play = opened(host, 0, LIST);
-    await play.settled();
-    play.engine.play();
-    const on = goingOn(play);
+    const { play, on } = await both(runs);
     await play.until(() => on() && play.shown.at(-1) === 12 && play.engine.stalled, "edge");
     play.engine.chooseQuality(1);
     let count = 0;

@@ -15,6 +15,8 @@ const DOWN_SECONDS = 2;
  * is fetched beside the packets that are shown. After a failure twice as long passes until it is tried again.
  */
 const IDLE_SHARE = 0.3;
+/** What is tried has to be there by then. */
+const TRIAL_LIMIT_SECONDS = 15;
 /** A connection bears at most so many times what small packets say. */
 const UNDERESTIMATED = 16;
 const TRIAL_SECONDS = 10;
@@ -28,8 +30,9 @@ export class Ladder {
   /** What the user wants; undefined leaves it to the connection. */
   choice: number | undefined;
   at = 0;
-  /** The step above is tried, though it is not known to be borne. */
-  trying = false;
+  /** Since when the step above is tried, though it is not known to be borne. */
+  private tryingSince: number | undefined;
+  /** So long after the last trial or change the next one is due. */
   private trialSeconds = TRIAL_SECONDS;
   private tried: number;
   private changed: number;
@@ -48,11 +51,12 @@ export class Ladder {
 
   /** The step to be on; `bitsPerSecond` is undefined while nothing is known. */
   wanted(bitsPerSecond: number | undefined, busyShare: number): number {
-    const { at, steps, choice, trying } = this;
-    this.trying = false;
+    const { at, steps, choice, tryingSince } = this;
+    this.tryingSince = undefined;
     if (choice !== undefined) return this.granted(choice);
     if (bitsPerSecond === undefined) return at;
-    const since = this.now() - this.changed;
+    const now = this.now();
+    const since = now - this.changed;
     const bears = (step: number, factor: number) => bitsPerSecond >= factor * steps[step]!.bits_per_second;
     if (at > 0 && !bears(at, STAY)) {
       let lower = at - 1;
@@ -63,17 +67,15 @@ export class Ladder {
     const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
     if (higher >= steps.length) return at;
     if (enough && bears(higher, UP)) return this.granted(higher);
+    if (tryingSince !== undefined && now - tryingSince > TRIAL_LIMIT_SECONDS) {
+      this.giveUp();
+      return at;
+    }
     const maybe = busyShare < IDLE_SHARE && bears(higher, 1 / UNDERESTIMATED);
-    const isDue = maybe && this.now() - this.tried >= this.trialSeconds;
-    this.trying = (trying || isDue) && this.granted(higher) === higher;
-    return this.trying ? higher : at;
-  }
-
-  /** What was tried was not there in time. */
-  giveUp(): void {
-    this.trying = false;
-    this.tried = this.now();
-    this.trialSeconds = Math.min(2 * this.trialSeconds, MOST_TRIAL_SECONDS);
+    const isDue = maybe && now - this.tried >= this.trialSeconds;
+    if ((tryingSince === undefined && !isDue) || this.granted(higher) !== higher) return at;
+    this.tryingSince = tryingSince ?? now;
+    return higher;
   }
 
   /** What is known now of the bit rates, which are measured while the run goes on. */
@@ -86,16 +88,24 @@ export class Ladder {
 
   /** Another step is used from now on. */
   change(step: number): void {
+    const now = this.now();
     this.fell = step < this.at;
-    if (this.fell) this.giveUp();
+    // What has been borne for long was no failure.
+    if (this.fell && now - this.changed > MOST_TRIAL_SECONDS) this.trialSeconds = TRIAL_SECONDS;
+    else if (this.fell) this.giveUp();
     this.at = step;
-    this.trying = false;
-    this.changed = this.tried = this.now();
+    this.tryingSince = undefined;
+    this.changed = this.tried = now;
   }
 
   /** A step cannot be had, for now or ever. */
   refuse(step: number, temporary: boolean): void {
     this.refused.set(step, temporary ? this.now() + RETRY_SECONDS : Number.POSITIVE_INFINITY);
+  }
+
+  private giveUp(): void {
+    this.tried = this.now();
+    this.trialSeconds = Math.min(2 * this.trialSeconds, MOST_TRIAL_SECONDS);
   }
 
   private granted(step: number): number {

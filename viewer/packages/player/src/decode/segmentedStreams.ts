@@ -24,8 +24,6 @@ export interface SegmentedEvents {
 
 /** The list of qualities of a live stream is asked for again after so long. */
 const LIST_MILLISECONDS = 30_000;
-/** What is tried has to be there by then. */
-const TRIAL_MILLISECONDS = 15_000;
 
 export class SegmentedStreams {
   private active: SegmentStream;
@@ -33,7 +31,7 @@ export class SegmentedStreams {
   /** When the list of qualities was asked for last. */
   private listed = 0;
   /** The quality that is changed to, as soon as it can be. */
-  private pending: { readonly stream: SegmentStream; readonly step: number; readonly since: number } | undefined;
+  private pending: { readonly stream: SegmentStream; readonly step: number } | undefined;
 
   constructor(
     private readonly client: ByteClient,
@@ -66,14 +64,8 @@ export class SegmentedStreams {
     this.pending ??= {
       step,
       stream: this.qualityOf(ladder.steps[step]!),
-      since: performance.now(),
     };
-    const { stream, since } = this.pending;
-    if (ladder.trying && performance.now() - since > TRIAL_MILLISECONDS) {
-      ladder.giveUp();
-      this.drop();
-      return undefined;
-    }
+    const { stream } = this.pending;
     const { catalog, store } = stream;
     if (step > ladder.at && catalog.live && !seeking && next >= catalog.count - 1) {
       return this.atEdge(stream, next, demand) ? this.change() : undefined;
