@@ -20,7 +20,7 @@ def test_leaving_a_bin_has_a_price() -> None:
     values["anchor_positions"][2, 1] -= 0.5
     values["offset_scales"] = values["offset_scales"].detach().clone()
     values["offset_scales"][7, 0] += 0.75
-    assert bit_price.price(values).item() == pytest.approx(0.5 * (1.0 + 2.0) / 10, rel=1e-4)
+    assert bit_price.price(values).item() == pytest.approx(0.5 * (1.0 + 2.0) / 8000, rel=1e-4)
     price = bit_price.price({**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1})
     (gradient,) = torch.autograd.grad(price, [parameters.values["anchor_positions"]])
     assert (gradient > 0).all(), "it pulls back"
@@ -39,8 +39,8 @@ def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
     values["free_means"] = torch.cat([values["free_means"], old[:3].detach() + 7.0])
     values["free_colors"] = torch.cat([values["free_colors"], values["free_colors"][:3]])
     assert bit_price.price(values).item() == 0.0
-    values["free_means"][2, 1] += 1.5  # Two bits for one of ten anchors.
-    assert bit_price.price(values).item() == pytest.approx(2.0 / 10, rel=1e-4)
+    values["free_means"][2, 1] += 1.5  # Two bits.
+    assert bit_price.price(values).item() == pytest.approx(2.0 / 8000, rel=1e-4)
 
 
 @pytest.mark.parametrize(("steps", "weight"), [({}, 1.0), ({"covariance_mlp": 0.1}, 1.0), ({"base_scales": 0.1}, 0.0)])

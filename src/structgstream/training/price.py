@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -10,22 +11,24 @@ from torch import Tensor
 from structgstream.scene.state import ParameterName
 from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 
+_BITS_PER_KB: Final = 8000
+
 
 @dataclass(frozen=True)
 class BitPrice:
     """An estimate of the bits of changes, as a loss term.
 
+    A bit has the same price in every frame, however much moves: that gives the best pictures for the bytes of all.
+
     Args:
-        weight: weight in the loss of the bits per anchor.
+        weight: what a kilobyte adds to the loss.
         before: the last frame's values by name.
         steps: the quantization steps by name.
-        rows: number of moving anchors, by which the bits are divided.
     """
 
     weight: float
     before: Mapping[ParameterName, Tensor]
     steps: Mapping[ParameterName, float]
-    rows: int
 
     @classmethod
     def of(
@@ -41,8 +44,7 @@ class BitPrice:
         }
         if not paid or weight <= 0.0:
             return None
-        rows = len(parameters.values["anchor_positions"])
-        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid, rows)
+        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid)
 
     def after_pruning(self, keep: Tensor) -> "BitPrice":
         """The price after free Gaussians outside the mask ``keep`` were pruned; ones born since are not priced."""
@@ -52,9 +54,9 @@ class BitPrice:
         return replace(self, before=before)
 
     def price(self, values: Mapping[ParameterName, Tensor]) -> Tensor:
-        """Weighted sum of log2(1 + distance in bins), divided by the number of anchors."""
+        """Weighted sum of log2(1 + distance in bins), in kilobytes."""
         bits = [
             torch.log2(1.0 + (values[name][: len(self.before[name])] - self.before[name]).abs() / step).sum()
             for name, step in self.steps.items()
         ]
-        return self.weight / max(self.rows, 1) * torch.stack(bits).sum()
+        return self.weight / _BITS_PER_KB * torch.stack(bits).sum()
