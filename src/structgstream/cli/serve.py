@@ -65,6 +65,7 @@ def main(arguments: list[str]) -> None:
     if not 0 <= options.port < 65536:
         raise UsageError(f"--port {options.port} is not one of 0 to 65535.")
     try:
+        from structgstream.server.arenas import use_one_arena
         from structgstream.server.listening import checked_address, run
     except ModuleNotFoundError as error:
         raise MissingExtraError(error.name or "starlette", "serve") from None
@@ -81,6 +82,7 @@ def main(arguments: list[str]) -> None:
             lines.append("Everyone who reaches this machine sees all of them.")
         say(Console(), *lines)
 
+    use_one_arena()
     run(settings, address=address, port=options.port, on_start=tell)
 
 
