@@ -50,8 +50,6 @@ class GroupStartConfig:
     coherence_share: float = 0.25
     """Weight of ``online.coherence``, which counts from frame 0 here, relative to that of other frames. All of it suits
     bodies that move, but costs 0.8 dB where looks change in place, as displacements also stand in for them."""
-    price_share: float = 0.5
-    """Price of a bit relative to that of other frames: what it buys all frames of the group have."""
 
 
 def fit_group_start(
@@ -93,7 +91,6 @@ def fit_group_start(
         iterations=-(-iterations // start.rounds),
         births=replace(config.births, most=start.births),
         coherence=replace(config.coherence, weight=start.coherence_share * config.coherence.weight),
-        rounding=replace(config.rounding, rate_weight=start.price_share * config.rounding.rate_weight),
     )
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
