@@ -27,10 +27,8 @@ ELSEWHERE = {
     "data/source.py": "data/test_wrappers.py",
     "exporters/frames.py": "cli/test_export.py",
     "preparation/report/page.py": "preparation/report/test_write.py",
-    # The method and its frames are fitted as a session does.
+    # Pipelines are run as a session does.
     "pipeline.py": "test_session.py",
-    "struct_gstream.py": "test_session.py",
-    "training/next_frame.py": "training/test_online.py",
     "training/result.py": "training/test_optimize.py",
 }
 """Patterns of modules without a test file of their name, and of the files that test them."""

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What happens around each iteration of a later frame."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+
+from rigs import random_scene
+from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.scene.focus import Focus
+from structgstream.scene.scene import Scene
+from structgstream.training.early_stopping import EarlyStopping
+from structgstream.training.last_pass import LastPass
+from structgstream.training.losses import LossWeights
+from structgstream.training.next_frame import NextFrameHooks, StartingPoint
+from structgstream.training.optim import Adam
+from structgstream.training.parameters import Parameters, parameters_of_fields
+from structgstream.training.partition import Partition
+from structgstream.training.patching import PatchingConfig
+from structgstream.training.population import Population
+from structgstream.training.statistics import GradientStatistics
+from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.views import training_views
+from worlds import moving_world
+
+CPU = torch.device("cpu")
+BACKEND = reference_backend()
+WORLD = moving_world(1)
+VIEWS = training_views(WORLD.frames[0], WORLD.rig, CPU)
+CAMERA = VIEWS[0].camera
+
+
+class Decided(EarlyStopping):
+    """Early stopping that has decided already, and knows what was told to it."""
+
+    def __init__(self, stops: bool) -> None:
+        super().__init__(0.0, len(VIEWS))
+        self.added: list[int] = []
+        self.stops, self.resets = stops, 0
+
+    def add(self, view_index: int, loss: torch.Tensor) -> None:
+        self.added.append(view_index)
+
+    def reset(self) -> None:
+        self.resets += 1
+
+    @property
+    def should_stop(self) -> bool:
+        return self.stops
+
+
+def hooks_of(
+    start: StartingPoint, *, stops: bool = False, patch_at: int = 4, patches: bool = True, rest_every: int = 1
+) -> NextFrameHooks:
+    scene = start.scene
+    parameters = Parameters.of(scene, trained=parameters_of_fields({"anchor_positions", "free"}))
+    gaussians = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
+    population = Population(
+        config=PatchingConfig(),
+        template=scene,
+        parameters=parameters,
+        adam=Adam(BACKEND, parameters.values),
+        statistics=GradientStatistics(gaussians, CPU),
+        views=start.views,
+        frame_index=1,
+        room=100,
+        backend=BACKEND,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return NextFrameHooks(
+        start=start,
+        parameters=parameters,
+        losses=LossWeights(),
+        bit_price=None,
+        coherence=None,
+        population=population,
+        early_stopping=Decided(stops),
+        patch_at=patch_at,
+        patches=patches,
+        last_pass=LastPass(),
+        backend=BACKEND,
+        watch=Stopwatch(CPU),
+        rest_every=rest_every,
+    )
+
+
+def started(scene: Scene = WORLD.scene, **options: Any) -> StartingPoint:
+    return StartingPoint(scene, VIEWS, torch.zeros(len(scene.anchors) + len(scene.free), 3), **options)
+
+
+def selection(tiles: int) -> TileSelection:
+    """The first ``tiles`` tiles of a picture."""
+    mask = torch.zeros(tile_grid(CAMERA.width, CAMERA.height), dtype=torch.bool)
+    mask.view(-1)[:tiles] = True
+    return TileSelection(mask, CAMERA.width, CAMERA.height)
+
+
+def focused(changed: TileSelection | None) -> StartingPoint:
+    """A start of which the first two views show what moves, in three tiles."""
+    still = WORLD.scene.gaussians(CAMERA, BACKEND).select(torch.zeros(0, dtype=torch.int64))
+    focuses = {
+        view.index: Focus(selection(3), torch.zeros(CAMERA.height, CAMERA.width, 3), still, changed)
+        for view in VIEWS[:2]
+    }
+    return started(focuses=focuses)
+
+
+def pixels_drawn(hooks: NextFrameHooks, *, view: int, visits: int) -> list[int]:
+    """The number of pixels that each visit of a view in the focus draws."""
+    assert hooks.start.focuses is not None
+    focus, found = hooks.start.focuses[VIEWS[view].index], []
+    for iteration in range(1, visits + 1):
+        assert hooks.loss(iteration, VIEWS[view]).focus is focus  # Tiles that are not drawn hold their last drawing.
+        found.append(int((focus.picture.sum(2) > 0).sum()))
+        focus.picture.zero_()
+    return found
+
+
+def test_views_that_do_not_show_what_moves_are_not_seen() -> None:
+    assert started().seen == VIEWS
+    assert focused(None).seen == VIEWS[:2]
+
+
+def test_changes_are_counted_from_the_scene_unless_another_is_given() -> None:
+    reference = random_scene(60, cameras=4, seed=5)
+    assert started().known is WORLD.scene
+    assert started(reference=reference).known is reference
+
+
+def test_tiles_without_change_are_drawn_in_one_visit_of_three() -> None:
+    """And only visits that draw the same tiles are compared."""
+    hooks = hooks_of(focused(selection(1)), rest_every=3)
+    drawn = pixels_drawn(hooks, view=0, visits=6)
+    assert drawn[0] == drawn[1] == drawn[3] == drawn[4] > 0
+    assert drawn[2] == drawn[5] > drawn[0]
+    assert cast(Decided, hooks.early_stopping).added == [VIEWS[0].index] * 4
+    pixels_drawn(hooks, view=1, visits=1)  # Visits are counted by view.
+    assert hooks.visits == {VIEWS[0].index: 6, VIEWS[1].index: 1}
+
+
+def test_all_tiles_are_drawn_where_changes_are_not_known_or_every_visit_rests() -> None:
+    whole = pixels_drawn(hooks_of(focused(None), rest_every=3), view=0, visits=4)
+    assert len(set(whole)) == 1
+    assert pixels_drawn(hooks_of(focused(selection(1)), rest_every=1), view=0, visits=4) == whole
+
+
+def test_a_frame_is_patched_once_at_its_iteration() -> None:
+    hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3)
+    faint = hooks.parameters.values["free_logit_opacities"]
+    faint.data[2] = -9.0
+    for iteration in (1, 2, 3, 4):
+        loss = hooks.loss(iteration, VIEWS[0])
+        hooks.after_step(iteration, VIEWS[0], loss, None)
+        assert hooks.population.pruned == (iteration >= 3)
+        assert cast(Decided, hooks.early_stopping).resets == (iteration >= 3)
+
+
+def test_a_frame_whose_free_gaussians_stay_is_not_patched() -> None:
+    hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=1, patches=False)
+    hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
+    hooks.after_step(1, VIEWS[0], hooks.loss(1, VIEWS[0]), None)
+    assert hooks.population.pruned == 0
+    assert len(hooks.population) == 5
+
+
+def test_a_frame_that_stops_gaining_is_patched_at_once_and_then_ends() -> None:
+    hooks = hooks_of(started(), stops=True, patch_at=50)
+    hooks.loss(2, VIEWS[0])
+    assert hooks.patch_at == 2
+    assert not hooks.finished(2)  # Iterations follow for what was born.
+    assert hooks.finished(3)
+    hooks.loss(3, VIEWS[1])
+    assert hooks.patch_at == 2
+
+
+def test_a_frame_that_gains_goes_on() -> None:
+    hooks = hooks_of(started(), stops=False, patch_at=2)
+    assert not any(hooks.finished(iteration) for iteration in range(1, 9))
+
+
+def test_counts_are_those_of_the_moving_anchors_and_of_all_free_gaussians() -> None:
+    scene = random_scene(60, free=5, cameras=4, seed=4)
+    assert hooks_of(started(scene)).counts() == (60, 5)
+    anchors = torch.arange(60) < 20
+    parted = SimpleNamespace(anchors=anchors, free=torch.arange(5) < 2, unseen=torch.tensor([False] * 4 + [True]))
+    partition = Partition.of(scene, cast(Any, parted))
+    start = StartingPoint(partition.moving, VIEWS, torch.zeros(22, 3), partition)
+    assert hooks_of(start).counts() == (20, 4)  # One is seen by nobody.
+
+
+def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
+    hooks = hooks_of(started())
+    loss = hooks.loss(1, VIEWS[0])
+    assert hooks.last_pass.psnr > 30.0  # The pictures are the scene's own.
+    with torch.no_grad():
+        hooks.parameters.values["anchor_positions"] += 0.1
+    worse = hooks.loss(2, VIEWS[0])
+    assert worse.total > loss.total
+    assert hooks.last_pass.psnr < 30.0
+
+
+def test_prices_are_added_to_the_loss() -> None:
+    plain = hooks_of(started())
+    priced = replace(plain, bit_price=cast(Any, SimpleNamespace(price=lambda values: torch.tensor(0.5))))
+    torch.testing.assert_close(priced.loss(1, VIEWS[0]).total, plain.loss(1, VIEWS[0]).total + 0.5)
