@@ -129,13 +129,14 @@ def test_another_major_version_is_refused_and_a_newer_minor_is_not() -> None:
         ([packed(RecordType.KEY, b"short")], "too short"),
         (
             [packed(RecordType.INIT, b"")],
-            "init record of period 0, at byte 984, where one of period 1, or a packet, belongs",
+            "init record of period 0, at byte {end}, where one of period 1, or a packet, belongs",
         ),
-        ([packed(RecordType.INIT, b"", period=1)], "init record of period 1, at byte 984, where a packet belongs"),
+        ([packed(RecordType.INIT, b"", period=1)], "init record of period 1, at byte {end}, where a packet belongs"),
     ],
 )
 def test_records_that_contradict_each_other(records: list[bytes], message: str) -> None:
-    with pytest.raises(StreamError, match=message):
+    end = len(with_records())  # How many digits the rig's numbers have depends on the processor.
+    with pytest.raises(StreamError, match=message.format(end=end)):
         StreamReader(with_records(*records))
 
 
