@@ -32,7 +32,8 @@ class FrameReport:
     ``peak_device_bytes`` are the GPU's, if any. ``cpu_seconds`` is the CPU time of all threads of the process.
     ``losses`` are the means of the loss terms, without their weights, over the fit's last pass through the cameras.
     ``absent`` are the cameras without a picture of this frame, held-out ones among them. ``begins`` says why the frame
-    begins another period, and is None if it does not.
+    begins another period, and is None if it does not. ``mean_of`` is the number of pictures that a training pixel is
+    the mean of, on average (``data/denoising.py``).
     """
 
     index: int
@@ -57,6 +58,7 @@ class FrameReport:
     losses: Mapping[str, float] = field(default_factory=dict)
     absent: tuple[str, ...] = ()
     begins: str | None = None
+    mean_of: float = 1.0
 
 
 class FrameMeter:
@@ -83,8 +85,9 @@ class FrameMeter:
         *,
         absent: tuple[str, ...] = (),
         begins: str | None = None,
+        mean_of: float = 1.0,
     ) -> FrameReport:
-        """The report of the frame whose packet takes ``size`` bytes; for ``absent`` and ``begins`` see there."""
+        """The report of the frame whose packet takes ``size`` bytes; for the last three arguments see there."""
         packet, state = encoded.packet, encoded.reconstruction
         read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
         return FrameReport(
@@ -109,6 +112,7 @@ class FrameMeter:
             cpu_seconds=time.process_time() - self._cpu_started,
             absent=absent,
             begins=begins,
+            mean_of=mean_of,
         )
 
 

@@ -21,6 +21,7 @@ class MultiViewFrame:
         masks: camera name to ``[H, W]`` bool, True where the picture counts. A camera that is missing here counts
             everywhere.
         captured_unix_seconds: when it was filmed, Unix time, if the cameras are live.
+        mean_of: number of pictures that a training pixel is the mean of, on average (``data/denoising.py``).
     """
 
     index: int
@@ -28,6 +29,7 @@ class MultiViewFrame:
     images: Mapping[str, NDArray[np.uint8]]
     masks: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     captured_unix_seconds: float | None = None
+    mean_of: float = 1.0
 
     def present(self, names: Iterable[str]) -> tuple[str, ...]:
         """Those of the cameras ``names`` whose picture counts somewhere, in their order."""

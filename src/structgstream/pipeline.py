@@ -18,6 +18,7 @@ from structgstream.codec.container.periods import Period
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
@@ -221,6 +222,8 @@ class Pipeline(Generic[State, Memory]):
         metadata: plain JSON values for every header.
         period: when another period begins.
         residual: how much a decoded frame differs from its pictures, which ``period.residual`` needs.
+        denoising: of the frames ``denoised``.
+        denoised: numbers of the frames whose pictures are averaged with those after them.
     """
 
     method: Method[State, Memory]
@@ -233,3 +236,5 @@ class Pipeline(Generic[State, Memory]):
     metadata: Mapping[str, Any] = field(default_factory=dict)
     period: PeriodConfig = field(default_factory=PeriodConfig)
     residual: Callable[[State, FrameTask], float] | None = None
+    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
+    denoised: tuple[int, ...] = (0,)

@@ -8,6 +8,7 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from structgstream.cameras import CameraRig
+from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
 from structgstream.periods import PeriodConfig
@@ -39,6 +40,8 @@ class StreamConfig:
     online: OnlineConfig = field(default_factory=OnlineConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
     """Initial points from frame 0, for captures without points."""
+    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
+    """Means over frames of what stands still in frame 0."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     """Background of unobserved directions."""
     normalised_radius: float = 1.0
@@ -278,6 +281,7 @@ COMPACT = replace(
         solidity=SolidityConfig(weight=0.05, every=4),
         random_background=True,
     ),
+    denoising=DenoisingConfig(frames=8),
     environment=EnvironmentConfig(enabled=True),
     codec="compact",
     online=replace(
@@ -310,7 +314,7 @@ COMPACT = replace(
 )
 """As MOTION, with small packets: dynamic fields are quantized and predicted from the previous frame, and appearance is
 dynamic. Frame 0 starts from few seeds and grows where gradients are large, with dropout and perturbation against
-overfitting, the depth regulariser, and an environment."""
+overfitting, the depth regulariser, an environment, and means of eight frames where they stand still."""
 
 FAST = replace(
     COMPACT,

@@ -16,6 +16,7 @@ from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport, metered
@@ -61,7 +62,7 @@ class Session(Generic[State, Memory]):
         metadata: Mapping[str, object] | None = None,
         on_step: StepListener | None = None,
     ) -> None:
-        self._source = source
+        self._source = denoised(source, pipeline.denoising, at=pipeline.denoised)
         self._sink = sink
         self._pipeline = pipeline
         self._backend = backend
@@ -119,7 +120,9 @@ class Session(Generic[State, Memory]):
                 meter.end("write", peak="store")
                 past = self._advance(past, encoded.reconstruction, task)
                 meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
-                yield meter.report(fit, encoded, size, absent=task.absent, begins=task.begins)
+                yield meter.report(
+                    fit, encoded, size, absent=task.absent, begins=task.begins, mean_of=task.frame.mean_of
+                )
 
     def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
         """Each frame from ``start`` on with its preprocessed pictures."""

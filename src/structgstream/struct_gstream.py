@@ -170,4 +170,5 @@ def stream_pipeline(
         rate=config.rate,
         period=config.period,
         residual=method.residual,
+        denoising=config.denoising,
     )

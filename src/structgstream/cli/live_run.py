@@ -18,6 +18,7 @@ from structgstream.cli.options import CaptureOptions
 from structgstream.cli.progress import Display, display
 
 if TYPE_CHECKING:
+    from structgstream.data.denoising import DenoisingConfig
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import FrameStream
     from structgstream.run_metrics import RunMetrics
@@ -64,7 +65,15 @@ class LiveChoice:
             raise UsageError(f"{scene} is a rig file of live cameras: give --live, too.")
 
 
-def open_live(scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream: Path, resume: bool) -> "LiveSource":
+def open_live(
+    scene: Path,
+    capture: CaptureOptions,
+    live: LiveChoice,
+    *,
+    stream: Path,
+    resume: bool,
+    denoising: "DenoisingConfig",
+) -> "LiveSource":
     """The cameras of a rig file; they are not opened yet.
 
     Raises:
@@ -85,6 +94,7 @@ def open_live(scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream:
         queue_gigabytes=live.queue_gigabytes,
         record=live.record,
         resume=resume,
+        denoising=denoising,
     )
     with usage_errors():
         return LiveSource(scene, stream, options)

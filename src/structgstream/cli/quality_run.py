@@ -55,7 +55,7 @@ def reconstruct(options: Reconstruct, config: "StreamConfig", *, preset: str) ->
     folders = options.segments.quality_folders(
         options.output, names, resume=options.resume, overwrite=options.overwrite
     )
-    opened = open_scene(options, preset=preset, console=console)
+    opened = open_scene(options, config, preset=preset, console=console)
     storages = {name: storage(opened.captured) for name, storage in folders.items()}
     _run(options, config, qualities, opened=opened, storages=storages)
     say(console, f"Wrote {options.output}: {', '.join(names)}")

@@ -132,7 +132,7 @@ def _reconstruct(
     storage: "SegmentsStorage | None",
     console: Console,
 ) -> None:
-    opened = open_scene(options, preset=preset, console=console)
+    opened = open_scene(options, config, preset=preset, console=console)
     peaks = run_reconstruction(
         opened.source,
         config,
@@ -165,7 +165,7 @@ class OpenedScene:
     metadata: Mapping[str, object]
 
 
-def open_scene(options: Reconstruct, *, preset: str, console: Console) -> OpenedScene:
+def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is.
 
     Raises:
@@ -176,7 +176,14 @@ def open_scene(options: Reconstruct, *, preset: str, console: Console) -> Opened
     from structgstream.presets import departures
 
     if options.live.live:
-        source = open_live(options.scene, options.capture, options.live, stream=options.output, resume=options.resume)
+        source = open_live(
+            options.scene,
+            options.capture,
+            options.live,
+            stream=options.output,
+            resume=options.resume,
+            denoising=config.denoising,
+        )
         length, captured = "live", source.captured
     else:
         options.live.check(options.scene)

@@ -65,6 +65,9 @@ class Prefetch(SourceWrapper):
             room.release()
             thread.join()
 
+    def frames_behind(self) -> Iterator[MultiViewFrame]:
+        return self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())
+
 
 def read_ahead(source: FrameStream) -> FrameStream:
     """A recording decoded ahead; a live source, which has threads and queues of its own, as it is."""

@@ -53,6 +53,10 @@ class SourceWrapper(SourceFacts[FrameSource]):
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         return self.source.frames(start)
 
+    def frames_behind(self) -> Iterator[MultiViewFrame]:
+        """What follows the last frame of a section, with the capture's own numbers; nothing of other sources."""
+        return iter(())
+
 
 @dataclass(frozen=True)
 class WithRig(SourceWrapper):
@@ -127,6 +131,10 @@ class Section(SourceWrapper):
         for frame in islice(self.source.frames(self.first + start), max(self.length - start, 0)):
             index = frame.index - self.first
             yield replace(frame, index=index, pts_seconds=index / self.fps)
+
+    def frames_behind(self) -> Iterator[MultiViewFrame]:
+        end = self.first + self.length
+        return self.source.frames(end) if end < len(self.source) else iter(())
 
 
 def resized(source: FrameSource, scale: float) -> FrameSource:

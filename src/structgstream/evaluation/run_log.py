@@ -57,6 +57,8 @@ def log_entry(report: "FrameReport") -> dict[str, Any]:
         del entry["absent"]
     if report.begins is None:
         del entry["begins"]
+    if report.mean_of == 1:
+        del entry["mean_of"]
     return entry | {
         "kind": report.kind.name.lower(),
         "train_psnr": report.train_psnr if math.isfinite(report.train_psnr) else None,

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
+from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
@@ -135,7 +136,7 @@ def _run(
     return record(
         path,
         source,
-        _pipeline(base, method),
+        _pipeline(base, method, identity.first),
         backend,
         storage=lambda _: (sink, so_far),
         metadata=base.header.metadata,
@@ -152,14 +153,14 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
 
     @cache
     def first_pictures() -> MultiViewFrame:
-        return next(source.frames(0))
+        return next(denoised(source, base.config.denoising).frames(0))
 
     return GroupEntry(start.frame, displacements, velocities, first_pictures)
 
 
-def _pipeline(base: GroupBase, method: GroupMethod) -> Pipeline[Scene, FirstFrame]:
-    """The pipeline of the stream with the group's method."""
-    return replace(stream_pipeline(base.config), method=method)
+def _pipeline(base: GroupBase, method: GroupMethod, first: int) -> Pipeline[Scene, FirstFrame]:
+    """The pipeline of the stream with the group's method; the group's first frame is denoised as frame 0 is."""
+    return replace(stream_pipeline(base.config), method=method, denoised=(0, first))
 
 
 def _remove(path: Path) -> None:

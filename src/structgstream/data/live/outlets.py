@@ -51,6 +51,13 @@ class Outlet(Protocol):
         """The next frame; None if none came in time."""
         ...
 
+    def ahead(self, number: int, timeout_seconds: float) -> MultiViewFrame | None:
+        """One of the frames to come, the next being number 0; None if it did not come in time, or is damaged.
+
+        Where sets wait, it is taken later as well; where only the newest counts, the one that comes next is given.
+        """
+        ...
+
     @property
     def taken(self) -> SetTimes | None:
         """Times of the set that was taken last; None before the first, and for those of an earlier run."""
@@ -91,6 +98,12 @@ class Latest:
             return None
         self.taken = found.times
         return self._convert(found)
+
+    def ahead(self, number: int, timeout_seconds: float) -> MultiViewFrame | None:
+        times = self.taken
+        found = self.take(timeout_seconds)
+        self.taken = times
+        return found
 
     @property
     def status(self) -> QueueStatus:
@@ -182,6 +195,18 @@ class DiskQueue:
             self._bytes -= size
             self._skipped += frame is None
         return frame
+
+    def ahead(self, number: int, timeout_seconds: float) -> MultiViewFrame | None:
+        with self._changed:
+            if len(self._files) <= number and self._failed is None:
+                self._changed.wait(timeout_seconds)
+            if len(self._files) <= number:
+                return None
+            path = self._files[number][0]
+        try:
+            return read_pictures(path)[0]
+        except CaptureError:
+            return None
 
     @property
     def status(self) -> QueueStatus:

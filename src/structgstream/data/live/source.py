@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
+from structgstream.data.denoising import DenoisingConfig, mean_of_still
 from structgstream.data.live.arrivals import Arrivals
 from structgstream.data.live.calibration import (
     Arriving,
@@ -45,6 +46,7 @@ Policy = Literal["latest", "every"]
 POLL_SECONDS = 0.2
 QUEUE_GIGABYTES = 10.0
 HEARTBEAT_SECONDS = 5.0
+AHEAD_SECONDS = 5.0  # for the sets that frame 0 is averaged with
 LATEST_KNOWN = 16  # frames of which it is remembered when they were filmed
 
 
@@ -61,6 +63,7 @@ class LiveOptions:
         queue_gigabytes: room of the queue of ``every``.
         record: folder for the cameras' own packets; None for none.
         resume: whether the stream is continued.
+        denoising: over how many sets frame 0 is averaged.
     """
 
     policy: Policy = "latest"
@@ -71,6 +74,7 @@ class LiveOptions:
     queue_gigabytes: float = QUEUE_GIGABYTES
     record: Path | None = None
     resume: bool = False
+    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
 
 
 class LiveSource:
@@ -191,6 +195,8 @@ class LiveSource:
                 origin = self._origin(origin, seconds, pts)
                 pts = seconds - origin
                 frame = replace(frame, index=index, pts_seconds=pts)
+                if index == 0:
+                    frame = self._denoised(frame, arrivals, outlet)
                 self._kept.keep(frame, origin_seconds=origin)
                 if recording is not None:
                     self._note(recording, frame, seconds)
@@ -198,6 +204,23 @@ class LiveSource:
                 yield frame
                 if self._options.frames is not None and index + 1 >= self._options.frames:
                     return
+
+    def _denoised(self, frame: MultiViewFrame, arrivals: Arrivals, outlet: Outlet) -> MultiViewFrame:
+        """Frame 0, averaged with the sets after it (``data/denoising.py``)."""
+        config, until = self._options.denoising, self._now() + AHEAD_SECONDS
+
+        def following() -> Iterator[MultiViewFrame]:
+            number = 0
+            while number < config.frames - 1 and not self.stopped and self._now() < until:
+                ended = arrivals.ended
+                if (found := outlet.ahead(number, POLL_SECONDS)) is not None:
+                    number += 1
+                    yield found
+                elif ended:
+                    return
+
+        later = self._calibrated(following()).frames()
+        return mean_of_still(frame, later, names=self.rig.training, config=config)
 
     def _note(self, recording: Recording, frame: MultiViewFrame, seconds: float) -> None:
         try:

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame 0 with less of the sensors' noise: where its pictures stand still, they are means over the frames after it.
+
+Note [Means of still pixels]
+~~~~~~~~~~~~~~~~~~~~~~~~~~~~
+Every camera has noise of its own in every picture, and a fit of thousands of iterations learns that of frame 0 by
+heart: it is wrong between the cameras, and in all later frames, which inherit frame 0. The mean of n pictures has
+noise of 1 / sqrt(n). A pixel is averaged over consecutive frames as long as its surroundings stay as they are in frame
+0; what moves keeps its one picture, sharp. Only the frames that everything else is built on are averaged: frame 0, and
+the first frame of a group that is fitted apart. For later frames it gained nothing (docs/compact.md).
+"""
+
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.images import opencv
+from structgstream.data.source import FrameStream, is_recording
+from structgstream.data.wrappers import SourceWrapper
+from structgstream.errors import ConfigError
+from structgstream.frames import MultiViewFrame
+
+SMOOTHING_PIXELS = 3
+MOST_FRAMES = 256  # sums of 8-bit pictures are 16-bit numbers
+
+
+@dataclass(frozen=True)
+class DenoisingConfig:
+    """Means over frames of pixels that stand still (Note [Means of still pixels])."""
+
+    frames: int = 1
+    """The training pictures of frame 0 are means over as many frames, itself and those after it (paper: 1)."""
+    threshold: float = 0.024
+    """A pixel stands still while the smoothed difference to frame 0, in 0 ... 1, in the channel that differs most, is
+    below this everywhere around it."""
+    reach_pixels: int = 3
+    """Distance up to which the surroundings of a pixel have to stand still, too."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= MOST_FRAMES or self.reach_pixels < 0 or not self.threshold > 0:
+            raise ConfigError(
+                f"Denoising takes 1 to {MOST_FRAMES} frames, a threshold above 0 and a reach from 0 on; got "
+                f"{self.frames}, {self.threshold:g} and {self.reach_pixels}."
+            )
+
+
+@dataclass(frozen=True)
+class Denoised(SourceWrapper):
+    """The same frames; the training pictures of some of them are means over the frames after them.
+
+    Args:
+        source: the recording.
+        config: what is averaged.
+        at: numbers of the frames that are.
+    """
+
+    config: DenoisingConfig
+    at: tuple[int, ...]
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        with ExitStack() as stack:
+            for frame in _closed(stack, self.source.frames(start)):
+                yield self._mean(frame) if frame.index in self.at else frame
+
+    def _mean(self, frame: MultiViewFrame) -> MultiViewFrame:
+        # These frames are read again later: holding all of them would take their pictures' memory.
+        with ExitStack() as stack:
+            following = frame.index + 1
+            own = self.source.frames(following) if following < len(self.source) else iter(())
+            behind = self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())
+            later = chain(_closed(stack, own), _closed(stack, behind))
+            return mean_of_still(frame, later, names=self.rig.training, config=self.config)
+
+
+def denoised(source: FrameStream, config: DenoisingConfig, *, at: tuple[int, ...] = (0,)) -> FrameStream:
+    """A recording with means in the frames ``at``; live cameras, which average before they hand out, as they are."""
+    return Denoised(source, config, at) if config.frames > 1 and is_recording(source) else source
+
+
+def mean_of_still(
+    frame: MultiViewFrame, later: Iterable[MultiViewFrame], *, names: Iterable[str], config: DenoisingConfig
+) -> MultiViewFrame:
+    """``frame`` with the means of its pixels over the frames ``later``, as long as they stand still, rounded to 8 bits.
+
+    Args:
+        frame: its pictures.
+        later: the frames after it, of which as many are read as ``config`` says.
+        names: cameras whose pictures are averaged; the others' stay.
+        config: what is averaged.
+
+    Returns:
+        the frame; ``mean_of`` says over how many pictures a pixel was averaged, on average.
+    """
+    sums = {name: _Sum(frame.images[name], frame.masks.get(name), config) for name in names if name in frame.images}
+    for other in islice(later, config.frames - 1):
+        for name, found in sums.items():
+            found.add(other.images.get(name), other.masks.get(name))
+    if not sums:
+        return frame
+    mean_of = float(np.mean([found.count.mean() for found in sums.values()]))
+    images = {name: sums[name].mean() if name in sums else image for name, image in frame.images.items()}
+    return replace(frame, images=images, mean_of=mean_of)
+
+
+class _Sum:
+    """The sum of one camera's pictures, pixel by pixel until it changes. Integers, so that it repeats bit for bit."""
+
+    def __init__(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, config: DenoisingConfig) -> None:
+        self._config, self._image = config, image
+        self._total = image.astype(np.uint16)
+        self.count = np.ones(image.shape[:2], np.uint16)
+        self._still = np.ones(image.shape[:2], bool) if mask is None else mask.copy()
+
+    def add(self, image: NDArray[np.uint8] | None, mask: NDArray[np.bool_] | None) -> None:
+        """Adds the next frame's picture; where it lacks, nothing is added from here on."""
+        if image is None or image.shape != self._image.shape:
+            self._still[:] = False
+            return
+        self._still &= _unchanged(self._image, image, self._config)
+        if mask is not None:
+            self._still &= mask
+        self._total += image * self._still[..., None].view(np.uint8)
+        self.count += self._still
+
+    def mean(self) -> NDArray[np.uint8]:
+        """The mean, rounded to the nearest."""
+        count = self.count[..., None]
+        return ((self._total + count // 2) // count).astype(np.uint8)
+
+
+def _unchanged(first: NDArray[np.uint8], other: NDArray[np.uint8], config: DenoisingConfig) -> NDArray[np.bool_]:
+    """Where two pictures of a camera stand still. Sums of integers, which float32 holds exactly."""
+    cv2 = opencv()
+    difference = cv2.absdiff(_box_sums(first), _box_sums(other))
+    around = _box_sums(cv2.max(cv2.max(difference[..., 0], difference[..., 1]), difference[..., 2]))
+    reach = 2 * config.reach_pixels + 1
+    most = cv2.dilate(around, np.ones((reach, reach), np.uint8))
+    return most < config.threshold * 255.0 * SMOOTHING_PIXELS**4
+
+
+def _box_sums(values: Any) -> Any:
+    """Sums over the squares of SMOOTHING_PIXELS around each pixel, float32."""
+    cv2 = opencv()
+    return cv2.boxFilter(values, cv2.CV_32F, (SMOOTHING_PIXELS, SMOOTHING_PIXELS), normalize=False)
+
+
+def _closed(stack: ExitStack, frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
+    """``frames``, which may hold a thread or a decoder, closed with ``stack``."""
+    if hasattr(frames, "close"):
+        stack.enter_context(closing(frames))  # type: ignore[type-var]
+    return frames
