@@ -12,6 +12,7 @@ import torch
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import PacketKind
 from structgstream.memory import PeakKind, PeakMeter
+from structgstream.pipeline import FrameRemarks
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene
 from structgstream.training.result import FitResult
@@ -83,11 +84,9 @@ class FrameMeter:
         encoded: Encoded[StateT],
         size: int,
         *,
-        absent: tuple[str, ...] = (),
-        begins: str | None = None,
-        mean_of: float = 1.0,
+        remarks: FrameRemarks | None = None,
     ) -> FrameReport:
-        """The report of the frame whose packet takes ``size`` bytes; for the last three arguments see there."""
+        """The report of the frame whose packet takes ``size`` bytes, with what its task says of it."""
         packet, state = encoded.packet, encoded.reconstruction
         read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
         return FrameReport(
@@ -110,9 +109,7 @@ class FrameMeter:
             peak_device_bytes=self._peaks.device_bytes,
             peak_memory_kind=self._peaks.kind,
             cpu_seconds=time.process_time() - self._cpu_started,
-            absent=absent,
-            begins=begins,
-            mean_of=mean_of,
+            **({} if remarks is None else vars(remarks)),
         )
 
 

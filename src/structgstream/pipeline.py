@@ -65,9 +65,25 @@ class FrameTask:
     on_step: StepListener | None = None
 
     @property
-    def absent(self) -> tuple[str, ...]:
-        """The cameras of the rig without a picture that counts, in its order."""
-        return tuple(name for name in self.rig if name not in self.frame.present(self.rig))
+    def remarks(self) -> "FrameRemarks":
+        """What is told of the frame beside its fit."""
+        absent = tuple(name for name in self.rig if name not in self.frame.present(self.rig))
+        return FrameRemarks(absent, self.begins, self.frame.mean_of)
+
+
+@dataclass(frozen=True)
+class FrameRemarks:
+    """What a frame's report tells of its pictures.
+
+    Args:
+        absent: the cameras of the rig without a picture that counts, in its order.
+        begins: see :class:`FrameTask`.
+        mean_of: see ``MultiViewFrame``.
+    """
+
+    absent: tuple[str, ...]
+    begins: str | None
+    mean_of: float
 
 
 @dataclass(frozen=True)

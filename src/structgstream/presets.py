@@ -41,7 +41,7 @@ class StreamConfig:
     points: PointsConfig = field(default_factory=PointsConfig)
     """Initial points from frame 0, for captures without points."""
     denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
-    """Means over frames of what stands still in frame 0."""
+    """Means over frames of what stands still in frame 0; while off, it is left out of headers."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     """Background of unobserved directions."""
     normalised_radius: float = 1.0
@@ -76,8 +76,9 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
         return value
 
     found = plain(asdict(config))
-    if found.get("period") == asdict(PeriodConfig()):
-        del found["period"]
+    for name, off in (("period", PeriodConfig()), ("denoising", DenoisingConfig())):
+        if found.get(name) == asdict(off):
+            del found[name]
     return found
 
 

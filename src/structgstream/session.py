@@ -120,9 +120,7 @@ class Session(Generic[State, Memory]):
                 meter.end("write", peak="store")
                 past = self._advance(past, encoded.reconstruction, task)
                 meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
-                yield meter.report(
-                    fit, encoded, size, absent=task.absent, begins=task.begins, mean_of=task.frame.mean_of
-                )
+                yield meter.report(fit, encoded, size, remarks=task.remarks)
 
     def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
         """Each frame from ``start`` on with its preprocessed pictures."""

@@ -132,6 +132,31 @@ def test_other_frames_are_untouched_and_do_not_depend_on_where_reading_begins() 
     assert len(source) == FRAMES
 
 
+def test_what_flickers_behind_a_mask_does_not_keep_its_surroundings_from_being_averaged() -> None:
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    mask[10:30, 20:40] = False
+    found = []
+    for seed in (None, 1, 2):
+        frames = film()
+        if seed is not None:
+            rng = np.random.default_rng(seed)
+            frames = [
+                replace(
+                    frame,
+                    images={
+                        name: np.where(mask[..., None], image, rng.integers(0, 256, image.shape)).astype(np.uint8)
+                        for name, image in frame.images.items()
+                    },
+                )
+                for frame in frames
+            ]
+        masks = {name: mask for name in RIG}
+        found.append(next(denoised(capture([replace(f, masks=masks) for f in frames]), EIGHT).frames()))
+    for name in RIG.training:
+        assert all(np.array_equal(one.images[name][mask], found[0].images[name][mask]) for one in found)
+        assert error(found[0].images[name], name, columns=slice(41, None)) < NOISE / 2
+
+
 @pytest.mark.parametrize("ahead", [False, True])
 def test_the_first_frame_alone_is_that_of_the_whole_capture(ahead: bool) -> None:
     """So that groups share the header of a sequential run (docs/groups.md)."""

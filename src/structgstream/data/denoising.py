@@ -111,7 +111,7 @@ class _Sum:
     """The sum of one camera's pictures, pixel by pixel until it changes. Integers, so that it repeats bit for bit."""
 
     def __init__(self, image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, config: DenoisingConfig) -> None:
-        self._config, self._image = config, image
+        self._config, self._image, self._mask = config, image, mask
         self._total = image.astype(np.uint16)
         self.count = np.ones(image.shape[:2], np.uint16)
         self._still = np.ones(image.shape[:2], bool) if mask is None else mask.copy()
@@ -121,7 +121,11 @@ class _Sum:
         if image is None or image.shape != self._image.shape:
             self._still[:] = False
             return
-        self._still &= _unchanged(self._image, image, self._config)
+        first, other = self._image, image
+        for counting in (self._mask, mask):
+            if counting is not None:  # What a mask leaves out says nothing of its surroundings.
+                first, other = first * counting[..., None], other * counting[..., None]
+        self._still &= _unchanged(first, other, self._config)
         if mask is not None:
             self._still &= mask
         self._total += image * self._still[..., None].view(np.uint8)

@@ -54,8 +54,9 @@ class SourceWrapper(SourceFacts[FrameSource]):
         return self.source.frames(start)
 
     def frames_behind(self) -> Iterator[MultiViewFrame]:
-        """What follows the last frame of a section, with the capture's own numbers; nothing of other sources."""
-        return iter(())
+        """What follows the last frame of a section, numbered otherwise; nothing if this wrapper changes frames."""
+        unchanged = type(self).frames is SourceWrapper.frames
+        return self.source.frames_behind() if unchanged and isinstance(self.source, SourceWrapper) else iter(())
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,10 @@ class Section(SourceWrapper):
 
     def frames_behind(self) -> Iterator[MultiViewFrame]:
         end = self.first + self.length
-        return self.source.frames(end) if end < len(self.source) else iter(())
+        if end < len(self.source):
+            yield from self.source.frames(end)
+        if isinstance(self.source, SourceWrapper):
+            yield from self.source.frames_behind()
 
 
 def resized(source: FrameSource, scale: float) -> FrameSource:

@@ -35,6 +35,9 @@ class Taken:
     def take(self, timeout_seconds: float) -> None:
         return None
 
+    def ahead(self, number: int, timeout_seconds: float) -> None:
+        return None
+
     @property
     def taken(self) -> None:
         return None

@@ -15,12 +15,13 @@ import pytest
 
 from rigs import arc_rig
 from senders import moving_pictures, sender, sent_loops, sent_stream
+from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live import recording
 from structgstream.data.live import source as source_module
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.live.matching import LivePicture, PictureSet
-from structgstream.data.live.source import LiveOptions, LiveSource
+from structgstream.data.live.source import LiveOptions, LiveSource, Policy
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.source import frame_count, may_read_ahead
@@ -192,6 +193,25 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
     assert len(frames) == 30 - skipped, "every set, or it is counted"
     assert "have come to their end" in caplog.text
     assert not (tmp_path / "x.queue").exists()
+
+
+@pytest.mark.parametrize("policy", ["every", "latest"])
+def test_frame_0_is_averaged_and_no_set_that_waits_is_lost(tmp_path: Path, policy: Policy) -> None:
+    """The film moves everywhere but at its rims; with ``every`` the averaged sets are frames of their own, too."""
+    denoising = DenoisingConfig(frames=3, threshold=0.1, reach_pixels=0)
+    path = files(tmp_path)
+    source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy=policy, denoising=denoising))
+    frames = list(source.frames())
+    assert frames[0].mean_of > 1.2
+    assert all(frame.mean_of == 1.0 for frame in frames[1:])
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    if policy == "every":
+        assert len(frames) == 30 - source.status().skipped_sets
+        raw = list(LiveSource(path, tmp_path / "y.sgs", LiveOptions(policy=policy)).frames())
+        assert frames[0].images["b"].shape == raw[0].images["b"].shape
+        assert (frames[0].images["b"] != raw[0].images["b"]).any()
+    (again,) = islice(LiveSource(path, tmp_path / "x.sgs", LiveOptions(resume=True)).frames(0), 1)
+    assert (again.images["b"] == frames[0].images["b"]).all(), "what was fitted is kept"
 
 
 def test_a_resumed_stream_gets_the_pictures_that_no_camera_sends_again(tmp_path: Path) -> None:

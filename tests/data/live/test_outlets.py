@@ -66,6 +66,41 @@ def test_every_set_comes_in_order_from_the_disk(tmp_path: Path) -> None:
     assert not (tmp_path / "q").exists()
 
 
+def test_sets_that_are_looked_at_ahead_are_taken_later_as_well(tmp_path: Path) -> None:
+    outlet = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert)
+    for number in range(4):
+        outlet.put(one_set(number))
+    seen = [outlet.ahead(number, WAIT) for number in (0, 1, 3)]
+    assert [None if frame is None else frame.pts_seconds for frame in seen] == [0.0, 1.0, 3.0]
+    assert outlet.ahead(4, 0.0) is None
+    assert [taken(outlet) for _ in range(4)] == [0.0, 1.0, 2.0, 3.0]
+    assert outlet.status.skipped == 0
+    outlet.close()
+
+
+def test_a_damaged_set_is_none_to_look_at(tmp_path: Path) -> None:
+    outlet = DiskQueue(tmp_path / "q", most_bytes=10**6, convert=convert)
+    outlet.put(one_set(0))
+    assert outlet.ahead(0, WAIT) is not None
+    (file,) = (tmp_path / "q").glob("set-*")
+    file.write_bytes(file.read_bytes()[:100])
+    assert outlet.ahead(0, WAIT) is None
+    outlet.close()
+
+
+def test_the_newest_is_looked_at_ahead_without_a_word_of_its_times() -> None:
+    outlet = Latest(convert)
+    outlet.put(one_set(1))
+    assert outlet.take(0.0) is not None
+    times = outlet.taken
+    outlet.put(one_set(2))
+    frame = outlet.ahead(0, 0.0)
+    assert frame is not None
+    assert frame.pts_seconds == 2.0
+    assert outlet.taken is times
+    assert outlet.ahead(1, 0.0) is None
+
+
 def test_a_full_queue_is_told_once_and_takes_sets_again_when_half_is_done(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

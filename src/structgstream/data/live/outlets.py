@@ -198,8 +198,7 @@ class DiskQueue:
 
     def ahead(self, number: int, timeout_seconds: float) -> MultiViewFrame | None:
         with self._changed:
-            if len(self._files) <= number and self._failed is None:
-                self._changed.wait(timeout_seconds)
+            self._changed.wait_for(lambda: len(self._files) > number or self._failed is not None, timeout_seconds)
             if len(self._files) <= number:
                 return None
             path = self._files[number][0]
