@@ -150,7 +150,7 @@ def test_what_flickers_behind_a_mask_does_not_keep_its_surroundings_from_being_a
                 )
                 for frame in frames
             ]
-        masks = {name: mask for name in RIG}
+        masks = dict.fromkeys(RIG, mask)
         found.append(next(denoised(capture([replace(f, masks=masks) for f in frames]), EIGHT).frames()))
     for name in RIG.training:
         assert all(np.array_equal(one.images[name][mask], found[0].images[name][mask]) for one in found)

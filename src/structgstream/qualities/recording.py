@@ -11,11 +11,12 @@ goes on.
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from structgstream.codec.packets import PacketSink
+from structgstream.data.denoising import DenoisingConfig, denoised
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.shared_frames import SharedFrames
 from structgstream.data.source import FrameStream
@@ -127,9 +128,12 @@ def record_qualities(
     opened = []
     for quality in qualities:
         sink, stored = storages[quality.name](resume)
-        opened.append(_Opened(quality.name, shared_pipeline(configured(config, quality), work), sink, stored))
+        # Frames are denoised once for all, below.
+        pipeline = replace(shared_pipeline(configured(config, quality), work), denoising=DenoisingConfig())
+        opened.append(_Opened(quality.name, pipeline, sink, stored))
     starts, firsts = [one.start for one in opened], [one.first for one in opened]
-    frames = SharedFrames(read_ahead(source), starts=starts, first=firsts)
+    shown = read_ahead(denoised(source, config.denoising))
+    frames = SharedFrames(shown, starts=starts, first=firsts)
     reports = {}
     for one, reader in zip(opened, frames.readers, strict=True):
         session = Session(
