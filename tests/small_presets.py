@@ -17,6 +17,7 @@ TINY_RIG = replace(
         seed_voxels=1,
         disturbance=RIG.initial.disturbance,
         solidity=RIG.initial.solidity,
+        free_space=RIG.initial.free_space,
         random_background=False,
     ),
     online=replace(RIG.online, iterations=10, patching=replace(RIG.online.patching, iteration=5)),

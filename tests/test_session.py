@@ -248,6 +248,7 @@ def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[in
     header = StreamReader(uninterrupted()).header
     assert header.metadata.keys() == {"capture"}
     assert header.config.keys() == {
+        "denoising",
         "environment",
         "initial",
         "online",

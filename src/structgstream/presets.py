@@ -16,6 +16,7 @@ from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig, ThinBirthConfig
 from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.environment import EnvironmentConfig
+from structgstream.training.free_space import FreeSpaceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
 from structgstream.training.light import LightConfig
@@ -41,7 +42,7 @@ class StreamConfig:
     points: PointsConfig = field(default_factory=PointsConfig)
     """Initial points from frame 0, for captures without points."""
     denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
-    """Means over frames of what stands still in frame 0; while off, it is left out of headers."""
+    """Means over frames of what stands still in frame 0."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     """Background of unobserved directions."""
     normalised_radius: float = 1.0
@@ -76,9 +77,8 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
         return value
 
     found = plain(asdict(config))
-    for name, off in (("period", PeriodConfig()), ("denoising", DenoisingConfig())):
-        if found.get(name) == asdict(off):
-            del found[name]
+    if found.get("period") == asdict(PeriodConfig()):
+        del found["period"]
     return found
 
 
@@ -280,6 +280,7 @@ COMPACT = replace(
         ),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
         solidity=SolidityConfig(weight=0.05, every=4),
+        free_space=FreeSpaceConfig(at_shares=(0.85, 1.0)),
         random_background=True,
     ),
     denoising=DenoisingConfig(frames=8),

@@ -13,6 +13,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.contribution import contributions
 from structgstream.training.densify import Densifier
+from structgstream.training.free_space import FreeSpaceConfig, in_free_space
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
@@ -89,6 +90,7 @@ class InitialConfig:
     Scaffold-GS: no, about half are)."""
     disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
     solidity: SolidityConfig = field(default_factory=SolidityConfig)
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
@@ -132,6 +134,7 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     generator: torch.Generator
     watch: Stopwatch
     last_pass: LastPass
+    floating: int = 0
 
     @property
     def scene(self) -> Scene:
@@ -183,6 +186,12 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                 cameras = [view.camera for view in self.views]
                 shares = contributions(self.scene, cameras, scale=_CONTRIBUTION_SCALE, backend=self.backend)
                 densifier.prune_by_contribution(shares, self.adam)
+        free_space = self.config.free_space
+        if free_space.is_due(iteration, self.config.iterations):
+            with self.watch.stage("densify"), torch.no_grad():
+                cameras = [view.camera for view in self.views]
+                floating = in_free_space(self.scene, cameras, config=free_space, backend=self.backend)
+                self.floating += densifier.remove(floating, self.adam)
 
     def counts(self) -> tuple[int, int]:
         return len(self.adam.values["anchor_positions"]), 0
@@ -276,6 +285,7 @@ def _fit(
         train_psnr=last_pass.psnr,
         grown=densifier.grown,
         removed=densifier.pruned,
+        counts={"in free space": hooks.floating} if config.free_space.at_shares else {},
         seconds=watch.seconds,
         losses=last_pass.terms,
     )

@@ -24,4 +24,5 @@ def compact(*, seed: int = 0) -> StreamConfig:
     few = quick(seed=seed)
     patching = replace(COMPACT.online.patching, iteration=few.online.patching.iteration)
     online = replace(COMPACT.online, iterations=few.online.iterations, patching=patching)
-    return replace(COMPACT, seed=seed, points=few.points, initial=few.initial, online=online)
+    first = {"points": few.points, "initial": few.initial, "denoising": few.denoising}
+    return replace(COMPACT, seed=seed, online=online, **first)

@@ -38,7 +38,7 @@ def test_what_the_switches_are() -> None:
     whole = online[WHOLE]
     assert ROWS[WHOLE].config == COMPACT
     assert ROWS[FULL].config == RIG
-    assert ROWS[BETTER_FIRST].config == replace(RIG, initial=COMPACT.initial)
+    assert ROWS[BETTER_FIRST].config == replace(RIG, initial=COMPACT.initial, denoising=COMPACT.denoising)
     calm = ROWS["compact-without-disturbance"].config
     assert calm.initial == replace(COMPACT.initial, disturbance=RIG.initial.disturbance)
     many = ROWS["compact-offsets"].config.initial

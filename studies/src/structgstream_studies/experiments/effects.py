@@ -56,7 +56,7 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     rows = _Rows(full)
     rows.add(Variant(FULL, "paper mode", paper))
     rows.add(Variant(WHOLE, "compact, with everything", full))
-    rows.add(Variant(BETTER_FIRST, "paper mode on compact's frame 0", replace(paper, initial=full.initial)))
+    rows.add(Variant(BETTER_FIRST, "paper mode on compact's frame 0", _with_first_of(paper, full)))
     _of_frame_0(rows)
     _of_the_gate(rows)
     _of_coding(rows)
@@ -111,6 +111,16 @@ def _of_frame_0(rows: _Rows) -> None:
     lively = replace(full, initial=replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False))
     title = f"{PAPER_OFFSETS} Gaussians an anchor, of which about half are never drawn"
     rows.row("offsets", title, lively, *OFFSET_FIELDS)
+    noisy = replace(full, denoising=replace(full.denoising, frames=1))
+    rows.row("without-denoising", "frame 0 of one picture a camera", noisy, "denoising.frames")
+    floating = replace(full.initial.free_space, at_shares=())
+    hazy = replace(full, initial=replace(full.initial, free_space=floating))
+    rows.row("with-floaters", "anchors in free space are kept", hazy, "initial.free_space.at_shares")
+
+
+def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:
+    """``config`` with the frame 0 of ``full``."""
+    return replace(config, initial=full.initial, denoising=full.denoising)
 
 
 def _of_the_gate(rows: _Rows) -> None:

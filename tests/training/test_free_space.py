@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Anchors that float in front of surfaces and that hardly any camera draws."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from backends import quickest_backend
+from rigs import arc_rig
+from structgstream.cameras import Camera
+from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.scene.anchors import AnchorCloud
+from structgstream.scene.color import CameraColor
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.training.free_space import FreeSpaceConfig, in_free_space
+
+CONFIG = FreeSpaceConfig(at_shares=(1.0,), least_views=4, scale=1.0)
+RIG = arc_rig(9, width=64, height=48)
+CAMERAS = [RIG[name] for name in RIG.training]
+WIDTH = 8
+DIRECTION = slice(WIDTH, WIDTH + 3)
+
+
+def wall_and(floating: list[tuple[float, float, float]], *, opacity: float, view_dependent: bool = False) -> Scene:
+    """An opaque wall behind the origin, and anchors of ``opacity``, with ``view_dependent`` for cam01 alone.
+
+    Feature 0 tells them apart: it is 1 for what floats.
+    """
+    y, x = torch.meshgrid(torch.linspace(-1.2, 1.2, 25), torch.linspace(-1.6, 1.6, 33), indexing="ij")
+    wall = torch.stack([x.flatten(), y.flatten(), torch.full_like(x.flatten(), 0.8)], dim=1)
+    positions = torch.cat([wall, torch.tensor(floating).reshape(-1, 3)])
+    features = torch.zeros(len(positions), WIDTH)
+    features[len(wall) :, 0] = 1.0
+    visible = torch.atanh(torch.tensor(0.9))
+    w1, w2 = torch.zeros(32, WIDTH + 4), torch.zeros(1, 32)
+    w1[0, 0], w2[0, 0] = 1.0, torch.atanh(torch.tensor(opacity)) - visible
+    if view_dependent:  # 1 - cos of the angle to the direction from cam01
+        towards = torch.tensor(floating[0]) - CAMERAS[0].center.float()
+        w1[1, 0], w1[1, DIRECTION], w2[0, 1] = 1.0, -torch.nn.functional.normalize(towards, dim=0), -2000.0
+    colors, covariances = torch.zeros(3), torch.tensor([6.0, 6.0, 6.0, 1.0, 0.0, 0.0, 0.0])
+    still = (torch.zeros(32, WIDTH + 4), torch.zeros(32))
+    return Scene(
+        anchors=AnchorCloud(
+            positions=positions,
+            log_offset_scales=torch.zeros(len(positions), 3),
+            log_base_scales=torch.full((len(positions), 3), 0.09).log(),
+            offsets=torch.zeros(len(positions), 1, 3),
+            features=features,
+        ),
+        mlps=MLPWeights(
+            opacity=HeadWeights(w1, torch.zeros(32), w2, visible[None]),
+            color=HeadWeights(*still, torch.zeros(3, 32), colors),
+            covariance=HeadWeights(*still, torch.zeros(7, 32), covariances),
+        ),
+        free=FreeGaussians.empty(positions),
+        camera_color=CameraColor.identity(len(CAMERAS)),
+    )
+
+
+def found(
+    scene: Scene,
+    *,
+    config: FreeSpaceConfig = CONFIG,
+    cameras: list[Camera] = CAMERAS,
+    backend: Backend | None = None,
+) -> list[bool]:
+    mask = in_free_space(scene, cameras, config=config, backend=backend or quickest_backend())
+    wall = 25 * 33
+    assert not mask[:wall].any(), "no surface is in free space"
+    return mask[wall:].tolist()
+
+
+FLOATING = [(0.0, 0.0, -0.6), (0.2, 0.1, -0.2)]
+
+
+def test_what_no_camera_draws_in_front_of_a_wall_goes() -> None:
+    assert found(wall_and(FLOATING, opacity=-0.5)) == [True, True]
+
+
+def test_what_all_cameras_draw_stays() -> None:
+    assert found(wall_and(FLOATING, opacity=0.3)) == [False, False]
+
+
+def test_what_one_camera_draws_goes() -> None:
+    scene = wall_and(FLOATING[:1], opacity=0.4, view_dependent=True)
+    drawn = [
+        int((scene.structured(camera, quickest_backend()).raw_opacities[-1] > CONFIG.drawn_opacity).sum())
+        for camera in CAMERAS
+    ]
+    assert drawn == [1] + [0] * (len(CAMERAS) - 1)
+    assert found(scene) == [True]
+
+
+def test_what_lies_on_or_behind_a_surface_stays() -> None:
+    assert found(wall_and([(0.0, 0.0, 0.78), (0.0, 0.0, 1.2)], opacity=-0.5)) == [False, False]
+
+
+def test_too_few_cameras_judge_nothing() -> None:
+    scene = wall_and(FLOATING, opacity=-0.5)
+    assert found(scene, cameras=CAMERAS[:3]) == [False, False]
+    assert found(scene, config=replace(CONFIG, least_views=len(CAMERAS) + 1)) == [False, False]
+    assert found(scene, cameras=[]) == [False, False]
+
+
+def test_where_nothing_is_drawn_nothing_is_in_front_of_it() -> None:
+    scene = wall_and(FLOATING, opacity=-0.5)
+    rows = torch.arange(25 * 33, len(scene.anchors))
+    anchors = scene.anchors
+    alone = AnchorCloud(
+        anchors.positions[rows],
+        anchors.log_offset_scales[rows],
+        anchors.log_base_scales[rows],
+        anchors.offsets[rows],
+        anchors.features[rows],
+    )
+    mask = in_free_space(replace(scene, anchors=alone), CAMERAS, config=CONFIG, backend=quickest_backend())
+    assert not mask.any()
+
+
+def test_smaller_pictures_tell_the_same() -> None:
+    assert found(wall_and(FLOATING, opacity=-0.5), config=replace(CONFIG, scale=0.5)) == [True, True]
+
+
+def test_back_ends_agree() -> None:
+    scene = wall_and(FLOATING, opacity=-0.5)
+    assert found(scene, backend=reference_backend()) == found(scene)
+
+
+@pytest.mark.parametrize(("iteration", "due"), [(0, False), (85, True), (84, False), (100, True)])
+def test_it_is_due_after_shares_of_the_iterations(iteration: int, due: bool) -> None:
+    config = FreeSpaceConfig(at_shares=(0.85, 1.0))
+    assert config.is_due(iteration, 100) is due
+    assert not FreeSpaceConfig().is_due(iteration, 100)
