@@ -280,7 +280,7 @@ COMPACT = replace(
         ),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
         solidity=SolidityConfig(weight=0.05, every=4),
-        free_space=FreeSpaceConfig(at_shares=(0.85, 1.0)),
+        free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
     ),
     denoising=DenoisingConfig(frames=8),

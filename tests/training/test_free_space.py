@@ -3,7 +3,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from backends import quickest_backend
@@ -17,7 +16,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.free_space import FreeSpaceConfig, in_free_space
 
-CONFIG = FreeSpaceConfig(at_shares=(1.0,), least_views=4, scale=1.0)
+CONFIG = FreeSpaceConfig(least_views=4, scale=1.0)
 RIG = arc_rig(9, width=64, height=48)
 CAMERAS = [RIG[name] for name in RIG.training]
 WIDTH = 8
@@ -127,10 +126,3 @@ def test_smaller_pictures_tell_the_same() -> None:
 def test_back_ends_agree() -> None:
     scene = wall_and(FLOATING, opacity=-0.5)
     assert found(scene, backend=reference_backend()) == found(scene)
-
-
-@pytest.mark.parametrize(("iteration", "due"), [(0, False), (85, True), (84, False), (100, True)])
-def test_it_is_due_after_shares_of_the_iterations(iteration: int, due: bool) -> None:
-    config = FreeSpaceConfig(at_shares=(0.85, 1.0))
-    assert config.is_due(iteration, 100) is due
-    assert not FreeSpaceConfig().is_due(iteration, 100)

@@ -12,6 +12,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.presets import PRESETS
 from structgstream.scene.state import state_of
+from structgstream.training.free_space import FreeSpaceConfig, in_free_space
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
 from structgstream.training.perturbation import PerturbationConfig
@@ -106,6 +107,25 @@ def test_solid_surfaces_and_few_anchors() -> None:
     assert len(result.scene.anchors) == len(voxel_centers(world.scene.anchors.positions, 0.05)) + (
         result.grown - result.removed
     )
+
+
+def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_changes() -> None:
+    world = moving_world(1)
+    surface = world.scene.anchors.positions
+    centers = torch.stack([world.rig[name].center for name in world.rig.training]).float()
+    between = 0.6 * centers.mean(0) + 0.4 * surface.mean(0) + 0.02 * torch.randn(20, 3, generator=torch.manual_seed(1))
+    points = torch.cat([surface, between])
+    removing = replace(QUICK, free_space=FreeSpaceConfig(enabled=True, least_views=2, drawn_opacity=2.0))
+    kept, found = fit(world, points=points), fit(world, points=points, config=removing)
+    cameras = [world.rig[name] for name in world.rig.training]
+    floating = in_free_space(kept.scene, cameras, config=removing.free_space, backend=quickest_backend())
+    assert floating.any()
+    assert found.counts == {"in free space": int(floating.sum())}
+    assert found.removed == kept.removed + int(floating.sum())
+    assert not kept.counts
+    for name, value in vars(kept.scene.anchors.select(~floating)).items():
+        assert value is None or torch.equal(getattr(found.scene.anchors, name), value)
+    assert found.train_psnr == kept.train_psnr
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:

@@ -86,12 +86,9 @@ class Densifier:
 
     def prune_by_contribution(self, contributions: Tensor, adam: Adam[ParameterName]) -> int:
         """Remove the anchors whose ``contributions`` ``[M]`` (relative to the mean) are too small; returns how many."""
-        return self.remove(contributions < self.config.least_contribution, adam)
-
-    def remove(self, anchors: Tensor, adam: Adam[ParameterName]) -> int:
-        """Remove the anchors of a mask ``[M]``; returns how many."""
-        self._replace(adam, keep=~anchors, added={}, count=0)
-        return int(anchors.sum())
+        keep = contributions >= self.config.least_contribution
+        self._replace(adam, keep=keep, added={}, count=0)
+        return int((~keep).sum())
 
     def _replace(
         self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor], count: int

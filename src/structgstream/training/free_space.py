@@ -27,8 +27,8 @@ COVERED = 0.5
 class FreeSpaceConfig:
     """Removal of anchors in free space (Note [Free space]); not in the paper."""
 
-    at_shares: tuple[float, ...] = ()
-    """Shares of the iterations after which they are removed; 1 is after the last one (paper: never)."""
+    enabled: bool = False
+    """Remove them after the last iteration (paper: no)."""
     depth_share: float = 0.9
     """An anchor is in front of what a camera draws if its depth is below this share of the drawn depth."""
     least_views: int = 6
@@ -39,10 +39,6 @@ class FreeSpaceConfig:
     """Opacity above which a Gaussian counts as drawn."""
     scale: float = 0.5
     """Scale of width and height of the pictures in which depth is drawn."""
-
-    def is_due(self, iteration: int, iterations: int) -> bool:
-        """Whether anchors are removed after ``iteration`` of ``iterations``."""
-        return iteration in {round(share * iterations) for share in self.at_shares}
 
 
 def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceConfig, backend: Backend) -> Tensor:

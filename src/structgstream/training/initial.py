@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame 0: a static reconstruction with anchors (paper, section Structured 3DGs)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -134,7 +134,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     generator: torch.Generator
     watch: Stopwatch
     last_pass: LastPass
-    floating: int = 0
 
     @property
     def scene(self) -> Scene:
@@ -186,12 +185,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                 cameras = [view.camera for view in self.views]
                 shares = contributions(self.scene, cameras, scale=_CONTRIBUTION_SCALE, backend=self.backend)
                 densifier.prune_by_contribution(shares, self.adam)
-        free_space = self.config.free_space
-        if free_space.is_due(iteration, self.config.iterations):
-            with self.watch.stage("densify"), torch.no_grad():
-                cameras = [view.camera for view in self.views]
-                floating = in_free_space(self.scene, cameras, config=free_space, backend=self.backend)
-                self.floating += densifier.remove(floating, self.adam)
 
     def counts(self) -> tuple[int, int]:
         return len(self.adam.values["anchor_positions"]), 0
@@ -279,13 +272,20 @@ def _fit(
     samples = coarse_to_fine(views, config.stages(done=done), generator=generator)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
     iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
+    scene, counts = detached(hooks.scene), {}
+    if config.free_space.enabled:
+        with watch.stage("densify"):
+            cameras = [view.camera for view in views]
+            floating = in_free_space(scene, cameras, config=config.free_space, backend=backend)
+            scene = replace(scene, anchors=scene.anchors.select(~floating))
+            counts["in free space"] = int(floating.sum())
     return FitResult(
-        scene=detached(hooks.scene),
+        scene=scene,
         iterations=iterations,
         train_psnr=last_pass.psnr,
         grown=densifier.grown,
-        removed=densifier.pruned,
-        counts={"in free space": hooks.floating} if config.free_space.at_shares else {},
+        removed=densifier.pruned + sum(counts.values()),
+        counts=counts,
         seconds=watch.seconds,
         losses=last_pass.terms,
     )

@@ -113,9 +113,9 @@ def _of_frame_0(rows: _Rows) -> None:
     rows.row("offsets", title, lively, *OFFSET_FIELDS)
     noisy = replace(full, denoising=replace(full.denoising, frames=1))
     rows.row("without-denoising", "frame 0 of one picture a camera", noisy, "denoising.frames")
-    floating = replace(full.initial.free_space, at_shares=())
+    floating = replace(full.initial.free_space, enabled=False)
     hazy = replace(full, initial=replace(full.initial, free_space=floating))
-    rows.row("with-floaters", "anchors in free space are kept", hazy, "initial.free_space.at_shares")
+    rows.row("with-floaters", "anchors in free space are kept", hazy, "initial.free_space.enabled")
 
 
 def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:
