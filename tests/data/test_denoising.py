@@ -13,7 +13,7 @@ from structgstream.data.denoising import MOST_FRAMES, Denoised, DenoisingConfig,
 from structgstream.data.prefetch import Prefetch
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import section
-from structgstream.errors import ConfigError
+from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 12
@@ -166,6 +166,23 @@ def test_the_first_frame_alone_is_that_of_the_whole_capture(ahead: bool) -> None
     expected = next(denoised(section(whole, start=2), EIGHT).frames())
     assert found.mean_of == expected.mean_of == 8.0
     assert all(np.array_equal(found.images[name], expected.images[name]) for name in RIG)
+
+
+def test_a_frame_that_cannot_be_read_ends_the_mean_and_is_told_when_it_is_its_turn() -> None:
+    class Broken(MemoryCapture):
+        def frames(self, start: int = 0):
+            for frame in super().frames(start):
+                if frame.index == 4:
+                    raise CaptureError("frame 4 cannot be read")
+                yield frame
+
+    frames = denoised(Broken(RIG, film()), EIGHT).frames()
+    assert next(frames).mean_of == 4.0
+    assert [next(frames).index for _ in range(3)] == [1, 2, 3]
+    with pytest.raises(CaptureError, match="frame 4"):
+        next(frames)
+    (alone,) = denoised(section(Broken(RIG, film()), frames=1), EIGHT).frames()
+    assert alone.mean_of == 4.0
 
 
 def test_a_capture_that_ends_early_is_averaged_to_its_end() -> None:

@@ -11,7 +11,7 @@ the first frame of a group that is fitted apart. For later frames it gained noth
 """
 
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from typing import Any
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from structgstream.data.images import opencv
 from structgstream.data.source import FrameStream, is_recording
 from structgstream.data.wrappers import SourceWrapper
-from structgstream.errors import ConfigError
+from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 
 SMOOTHING_PIXELS = 3
@@ -74,7 +74,7 @@ class Denoised(SourceWrapper):
             own = self.source.frames(following) if following < len(self.source) else iter(())
             behind = self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())
             later = chain(_closed(stack, own), _closed(stack, behind))
-            return mean_of_still(frame, later, names=self.rig.training, config=self.config)
+            return mean_of_still(frame, _readable(later), names=self.rig.training, config=self.config)
 
 
 def denoised(source: FrameStream, config: DenoisingConfig, *, at: tuple[int, ...] = (0,)) -> FrameStream:
@@ -151,6 +151,12 @@ def _box_sums(values: Any) -> Any:
     """Sums over the squares of SMOOTHING_PIXELS around each pixel, float32."""
     cv2 = opencv()
     return cv2.boxFilter(values, cv2.CV_32F, (SMOOTHING_PIXELS, SMOOTHING_PIXELS), normalize=False)
+
+
+def _readable(frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
+    """``frames`` up to one that cannot be read, which is told when it is that one's turn."""
+    with suppress(CaptureError):
+        yield from frames
 
 
 def _closed(stack: ExitStack, frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
