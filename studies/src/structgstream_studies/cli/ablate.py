@@ -14,13 +14,14 @@ from structgstream_studies.cli.experiment import ExperimentOptions, capture_part
 if TYPE_CHECKING:
     from structgstream_studies.experiments.tasks import VariantRun
 
-TableName = Literal["structured", "free", "patching", "distance", "readings", "effects", "rates"]
+TableName = Literal["structured", "free", "patching", "distance", "readings", "effects", "parts", "rates"]
 
 
 @dataclass(frozen=True)
 class Ablate(ExperimentOptions):
     """Runs the paper's ablations on a capture, and prints our results beside the paper's figures; or the effect of each
-    part of the compact stream (effects), and its rate-distortion curve (rates).
+    switch of the compact stream (effects), of its parts alone and together (parts), and its rate-distortion curve
+    (rates).
 
     Variants of one seed share frame 0. FOLDER gets TABLE.md, TABLE-curves.png and TABLE-detail.png for each table (and
     rates.png), results/ with all results as JSON, and streams/. After Ctrl-C or a crash the same command continues
@@ -43,9 +44,10 @@ class Ablate(ExperimentOptions):
     )
     """structured (fields trained online), free (generation and pruning), patching (inherited or independent),
     distance (the regularisation of frame 0); readings (points that the paper leaves open); effects (of the switches of
-    the compact stream); rates (the compact stream at five qualities). Default: the first four."""
+    the compact stream); parts (what it does about motion, each alone and each left out); rates (the compact stream at
+    five qualities). Default: the first four."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """The full method that the variants edit. Default: rig, and compact for effects and rates."""
+    """The full method that the variants edit. Default: rig, and compact for effects, parts and rates."""
 
 
 def main(arguments: list[str]) -> None:

@@ -213,18 +213,19 @@ def require_compact(config: StreamConfig) -> None:
         )
 
 
-def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str]) -> Sheet:
+def effects_sheet(results: Iterable[Result], *, titles: Mapping[str, str], title: str = "Effects") -> Sheet:
     """Every row with its difference to the whole, seed by seed; rows without a result have dashes.
 
     Args:
         results: of one capture.
         titles: of the rows, in their order.
+        title: of the table.
     """
     found = summaries(result for result in results if result.key in titles)
     whole = found.get(WHOLE)
     heads = ["variant", "seeds", SCORES["psnr"].title, SCORES["psnr_camera_color"].title, "to compact, dB"]
     columns = [*heads, *(SCORES[name].title for _, name in _COLUMNS)]
-    return Sheet("Effects", columns, [[title, *_cells(found.get(key), whole)] for key, title in titles.items()])
+    return Sheet(title, columns, [[row, *_cells(found.get(key), whole)] for key, row in titles.items()])
 
 
 def _cells(summary: Summary | None, whole: Summary | None) -> list[str]:

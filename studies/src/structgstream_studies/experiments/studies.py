@@ -11,6 +11,7 @@ from structgstream.presets import PAPER_DATA, PAPER_METHOD_PRESET, PRESETS, Stre
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.effects import EFFECTS_TABLE, effects, effects_sheet
 from structgstream_studies.experiments.figures import Picture, write_comparison, write_curves, write_details
+from structgstream_studies.experiments.parts import PARTS_TABLE, parts
 from structgstream_studies.experiments.peer_runs import PEER_TITLES, PeerRun
 from structgstream_studies.experiments.rate_distortion import (
     QUALITIES,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
 
 READINGS_TABLE = "readings"
-COMPACT_TABLES = (EFFECTS_TABLE, RATES_TABLE)
+COMPACT_TABLES = (EFFECTS_TABLE, PARTS_TABLE, RATES_TABLE)
 """Tables of the compact stream."""
 COMPACT_PRESET = "compact"
 COMPARED = (
@@ -87,6 +88,8 @@ def _configs(tables: Sequence[str], full: StreamConfig, paper: StreamConfig) -> 
     found = variants(full)
     if EFFECTS_TABLE in tables:
         found |= effects(full, paper=paper)
+    if PARTS_TABLE in tables:
+        found |= parts(full)
     if RATES_TABLE in tables:
         found |= qualities(full)
     return configs | {key: variant.config for key, variant in found.items()}
@@ -96,6 +99,8 @@ def rows_of(table: str) -> list[str]:
     """Keys of the runs of a table."""
     if table == EFFECTS_TABLE:
         return list(effect_titles())
+    if table == PARTS_TABLE:
+        return list(part_titles())
     if table == RATES_TABLE:
         return [quality_key(quality) for quality in QUALITIES]
     return list(READINGS if table == READINGS_TABLE else TABLES[table].rows)
@@ -204,7 +209,7 @@ def write_ablation(folder: Path, table: str, runs: Sequence[VariantRun], *, back
 def _titles(table: str) -> dict[str, str]:
     if table == READINGS_TABLE:
         return {key: f"{one.question}: {one.answer}" for key, one in READINGS.items()}
-    of_compact = {EFFECTS_TABLE: effect_titles, RATES_TABLE: curve_titles}
+    of_compact = {EFFECTS_TABLE: effect_titles, PARTS_TABLE: part_titles, RATES_TABLE: curve_titles}
     return of_compact.get(table, variant_titles)()
 
 
@@ -213,6 +218,8 @@ def _ablation_sheet(table: str, results: Sequence[Result]) -> Sheet:
         return readings_sheet(results)
     if table == EFFECTS_TABLE:
         return effects_sheet(results, titles=effect_titles())
+    if table == PARTS_TABLE:
+        return effects_sheet(results, titles=part_titles(), title="Parts")
     return ablation_sheet(TABLES[table], results, titles=variant_titles())
 
 
@@ -237,6 +244,11 @@ def effect_titles() -> dict[str, str]:
     """The rows of the table of effects, in its order."""
     found = effects(PRESETS[COMPACT_PRESET], paper=PRESETS[PAPER_METHOD_PRESET])
     return {key: variant.title for key, variant in found.items()}
+
+
+def part_titles() -> dict[str, str]:
+    """The rows of the table of parts, in its order."""
+    return {key: variant.title for key, variant in parts(PRESETS[COMPACT_PRESET]).items()}
 
 
 def _write_sheets(path: Path, sheets: Sequence[Sheet], remarks: Sequence[str] = ()) -> None:
