@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from structgstream.frames import MultiViewFrame
 
@@ -7,3 +10,35 @@ from structgstream.frames import MultiViewFrame
 def test_its_text_tells_shapes_and_not_pixels() -> None:
     images = {name: np.zeros((4, 6, 3), dtype=np.uint8) for name in ("a", "b")}
     assert repr(MultiViewFrame(3, 0.1, images)) == "MultiViewFrame(index=3, pts_seconds=0.1000, 2 x [(4, 6, 3)])"
+
+
+def frame_of(*blank: str, cameras: int = 5, level: int = 0, noise: int = 3) -> MultiViewFrame:
+    """Cameras c0, c1, ... with noise as their pictures; those in ``blank`` show ``level`` and a little noise."""
+    generator = np.random.default_rng(0)
+    images = {f"c{n}": generator.integers(0, 256, (48, 64, 3), dtype=np.uint8) for n in range(cameras)}
+    for name in blank:
+        images[name] = (level + generator.integers(0, noise, (48, 64, 3))).astype(np.uint8)
+    return MultiViewFrame(0, 0.0, images)
+
+
+@pytest.mark.parametrize("level", [0, 128, 250])
+def test_a_blank_picture_is_there_but_shows_nothing(level: int) -> None:
+    frame = frame_of("c1", level=level)
+    assert frame.present(["c0", "c1", "c2", "c9"]) == ("c0", "c1", "c2")
+    assert frame.showing(frame.images) == ("c0", "c2", "c3", "c4")
+
+
+def test_pictures_of_a_dark_or_plain_scene_count() -> None:
+    assert frame_of("c0", "c1").showing(["c0", "c1", "c2", "c3", "c4"]) == ("c0", "c1", "c2", "c3", "c4")
+    faint = frame_of("c1", noise=12)
+    assert faint.showing(faint.images) == tuple(faint.images), "a standard deviation of 3.5 levels is a picture"
+
+
+def test_what_a_mask_leaves_out_does_not_make_a_picture() -> None:
+    frame = frame_of("c1")
+    frame.images["c1"][:, :8] = 200
+    assert "c1" in frame.showing(frame.images)
+    mask = np.ones((48, 64), bool)
+    mask[:, :8] = False
+    masked = replace(frame, masks={"c1": mask, "c2": np.zeros((48, 64), bool)})
+    assert masked.showing(frame.images) == ("c0", "c3", "c4")

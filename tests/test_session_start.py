@@ -77,23 +77,29 @@ def spoiled(change, *, frame: int, cameras: int) -> list[MultiViewFrame]:
     return [replace(f, images=images) if f.index == frame else f for f in WORLD.frames]
 
 
-@pytest.mark.parametrize("kind", ["white", "light"])
+@pytest.mark.parametrize("kind", ["white", "noise", "light"])
 def test_bad_pictures_bring_no_flood(kind: str) -> None:
     def change(image: np.ndarray) -> np.ndarray:
         if kind == "white":
             return np.full_like(image, 255)
+        if kind == "noise":
+            return np.random.default_rng(0).integers(0, 256, image.shape, dtype=np.uint8)
         return np.minimum(image.astype(int) + 80, 255).astype(np.uint8)
 
-    cameras = 1 if kind == "white" else len(WORLD.rig.training)
+    cameras = len(WORLD.rig.training) if kind == "light" else 1
     reports = run(sink := MemorySink(), pictures=spoiled(change, frame=1, cameras=cameras))
     usual = whole()[1]
     assert len(StreamReader(bytes(sink.data))) == FRAMES, "nothing is lost"
     assert reports[1].free - reports[0].free <= CONFIG.online.births.most
-    if kind == "white":
-        assert [r.counts["views left out"] for r in reports[1:3]] == [1, 1], "blinded, and back again"
-        assert reports[1].bytes < 2 * usual[1].bytes
-    else:
+    if kind == "light":
         assert [r.counts["jumps"] for r in reports[1:]] == [1, 1, 0], "on, and off again"
         assert reports[1].counts["born"] == 0
         everything = 40 * (len(WORLD.scene.anchors) + CONFIG.online.births.most)
         assert all(r.bytes < everything for r in reports[1:])
+        return
+    assert reports[1].bytes < 2 * usual[1].bytes
+    left_out, absent = [r.counts["views left out"] for r in reports[1:3]], [r.absent for r in reports[1:3]]
+    if kind == "white":
+        assert (left_out, absent) == ([0, 0], [WORLD.rig.training[:1], ()]), "a blank picture is none"
+    else:
+        assert (left_out, absent) == ([1, 1], [(), ()]), "blinded, and back again"

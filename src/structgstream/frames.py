@@ -7,6 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+BLANK_LEVELS = 2.0
+"""Standard deviation, in levels of 255, below which a picture shows nothing: a covered lens, a camera that starts."""
+MOST_BLANK_SHARE = 0.25
+"""Share of the pictures that may be blank while the others are not; if more are, the scene is dark or plain."""
+_EVERY_PIXELS = 8  # A picture that shows something does so in every eighth row and column.
+
 
 @dataclass(frozen=True)
 class MultiViewFrame:
@@ -36,6 +42,19 @@ class MultiViewFrame:
         return tuple(
             name for name in names if name in self.images and (name not in self.masks or self.masks[name].any())
         )
+
+    def showing(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Those of :meth:`present` whose picture shows something, while most of the others do, too."""
+        present = self.present(names)
+        blank = [name for name in present if self._is_blank(name)]
+        return present if len(blank) > MOST_BLANK_SHARE * len(present) else tuple(n for n in present if n not in blank)
+
+    def _is_blank(self, name: str) -> bool:
+        sample = (slice(None, None, _EVERY_PIXELS), slice(None, None, _EVERY_PIXELS))
+        pixels = self.images[name][sample]
+        if name in self.masks:
+            pixels = pixels[self.masks[name][sample]]
+        return pixels.size > 0 and float(pixels.reshape(-1, 3).std(0).max()) < BLANK_LEVELS
 
     def __repr__(self) -> str:
         shapes = sorted({image.shape for image in self.images.values()})

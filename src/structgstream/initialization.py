@@ -23,7 +23,7 @@ def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -
     Raises:
         CaptureError: naming them.
     """
-    present = frame.present(rig.training)
+    present = frame.showing(rig.training)
     if len(present) < LEAST_CAMERAS:
         raise CaptureError(
             f"Frame {frame.index} of {capture} has pictures of {', '.join(present) or 'none'} of its "

@@ -67,7 +67,8 @@ class FrameTask:
     @property
     def remarks(self) -> "FrameRemarks":
         """What is told of the frame beside its fit."""
-        absent = tuple(name for name in self.rig if name not in self.frame.present(self.rig))
+        there = {*self.frame.showing(self.rig.training), *self.frame.present(self.rig.testing)}
+        absent = tuple(name for name in self.rig if name not in there)
         return FrameRemarks(absent, self.begins, self.frame.mean_of)
 
 
@@ -76,7 +77,7 @@ class FrameRemarks:
     """What a frame's report tells of its pictures.
 
     Args:
-        absent: the cameras of the rig without a picture that counts, in its order.
+        absent: the cameras of the rig without a picture that counts, in its order, and blank training ones.
         begins: see :class:`FrameTask`.
         mean_of: see ``MultiViewFrame``.
     """

@@ -26,6 +26,24 @@ def test_a_picture_that_changed_or_is_wrong_everywhere_is_not() -> None:
         assert trusted_views([USUAL, odd, USUAL, USUAL]) == [True, False, True, True]
 
 
+def test_a_bumped_camera_is_wrong_where_it_shows_something() -> None:
+    """The shares of a camera of counter that was moved by 14 and 9 pixels, and of the others."""
+    others = [ViewChange(changed_share=0.05, wrong_share=share, identical=False) for share in (0.005, 0.008, 0.016)]
+    bumped = ViewChange(changed_share=0.05, wrong_share=0.43, identical=False)
+    assert trusted_views([*others, bumped]) == [True, True, True, False]
+
+
+def test_a_camera_near_to_what_moves_is_believed() -> None:
+    """The shares of basketball's throw, and of someone who comes near one camera while others are wrong, too."""
+    throw = [
+        ViewChange(changed_share=0.1, wrong_share=share, identical=False) for share in (0.016, 0.034, 0.034, 0.088)
+    ]
+    assert all(trusted_views(throw))
+    assert all(trusted_views([*throw, replace(USUAL, wrong_share=0.25)]))
+    few_wrong = [replace(USUAL, wrong_share=share) for share in (0.001, 0.001, 0.001, 0.19)]
+    assert all(trusted_views(few_wrong))
+
+
 def test_a_frozen_picture_is_not_while_others_change() -> None:
     frozen = ViewChange(changed_share=0.0, wrong_share=0.0, identical=True)
     assert trusted_views([USUAL, USUAL, USUAL, frozen]) == [True, True, True, False]

@@ -105,7 +105,7 @@ def initial_points(
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cameras = {name: rig[name] for name in frame.present(rig.training)}
+    cameras = {name: rig[name] for name in frame.showing(rig.training)}
     images, masks = {name: frame.images[name] for name in cameras}, frame.masks
     distance = viewing_distance(cameras)
     neighbours = neighbor_views(cameras, count=config.neighbours, distance=distance)

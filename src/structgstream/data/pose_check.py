@@ -82,7 +82,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
         CalibrationError: most good matches violate the epipolar geometry of the poses.
         MissingExtraError: cv2 is not installed.
     """
-    given = {name: rig[name] for name in frame.present(rig.training)}
+    given = {name: rig[name] for name in frame.showing(rig.training)}
     matcher = PairMatcher(frame.images, config.matches, masks=frame.masks)
     check = _judge(given, matcher.matches(_pairs(given, config)), config)
     if check.conclusive and check.share_violating <= config.max_share:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detection of outlier views: failing or moved cameras, and global changes of light.
 
-A view is an outlier if its picture changed, or has large residuals, nearly everywhere while the median view did not, or
-if it is identical to the last one while others changed (a frozen camera). If most views changed everywhere, motion
-between the frames cannot be segmented.
+A view is an outlier in three cases. Its picture changed, or has large residuals, nearly everywhere while the median
+view did not. Or it has many times the large residuals of the median view, as of a camera that was bumped, whose picture
+stays right where it shows plain surfaces. Or it is identical to the last one while others changed: the camera is
+frozen. If most views changed everywhere, motion between the frames cannot be segmented.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,8 @@ WHOLE_PICTURE_SHARE = 0.5
 """Share of changed, or wrong, pixels above which a picture counts as changed, or wrong, everywhere."""
 MEDIAN_SHARE = 0.25
 """An outlier requires that the median view's share is below this."""
+BUMPED_SHARE, BUMPED_TIMES = 0.2, 8.0
+"""Least share of wrong pixels of a bumped camera, and least multiple of the median view's."""
 FROZEN_SHARE = 0.005
 """Least share of changed pixels in the median view for an identical picture to count as frozen; at most one view in
 four may be."""
@@ -42,6 +45,7 @@ def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
         not (
             ((c.changed_share or 0.0) > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
             or (c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE)
+            or c.wrong_share > max(BUMPED_SHARE, BUMPED_TIMES * usual_wrong)
             or (c.identical and few_same and usual_change > FROZEN_SHARE)
         )
         for c in changes

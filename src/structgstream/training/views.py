@@ -56,7 +56,7 @@ class View:
 def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) -> list[View]:
     """The frame's training views in rig order, without absent cameras; held-out pictures are not read."""
     rows = {name: i for i, name in enumerate(rig.training)}
-    return [_view(rows[name], name, frame, rig[name], device) for name in frame.present(rig.training)]
+    return [_view(rows[name], name, frame, rig[name], device) for name in frame.showing(rig.training)]
 
 
 def _view(index: int, name: str, frame: MultiViewFrame, camera: Camera, device: torch.device) -> View:

@@ -282,7 +282,7 @@ class LiveSource:
                 absent = ", ".join(name for name in self._filmed if name not in frame.images)
                 log.warning("%s: frame 0 has no picture of %s, so what only they see is missing", self.name, absent)
             complete = False
-            if len(frame.present(self.rig.training)) < LEAST_CAMERAS:
+            if len(frame.showing(self.rig.training)) < LEAST_CAMERAS:
                 arrivals.count_small()
                 continue
             yield frame
