@@ -3,12 +3,13 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
 from streams import STEPS, small_scene
 from structgstream.codec.scene.bins import dequantize, quantize
-from structgstream.groups.hand_over import NEIGHBOURS, HandOver
+from structgstream.groups.hand_over import FADE_FRAMES, NEIGHBOURS, HandOver
 from structgstream.scene.scene import Scene
 from structgstream.training.patching import BIRTHS_PER_FRAME
 
@@ -45,14 +46,30 @@ def born_in(scene: Scene, frame: int) -> Scene:
     return replace(scene, free=replace(scene.free, births=births))
 
 
+def bins_from(shown: Scene, own: Scene) -> Tensor:
+    """By how many bins positions of ``shown`` differ from the group's own, ``[M, 3]``."""
+    return ((shown.anchors.positions - own.anchors.positions) / STEP).round()
+
+
 def test_what_stands_still_has_the_bits_of_the_frame_before() -> None:
     own = two_heaps()
     before = shifted(own, ~NONE, 5)
-    hand_over = HandOver(before, own, NONE, steps=STEPS)
-    for index in (8, 9):
-        shown = hand_over.scene(own, index=index)
-        assert torch.equal(shown.anchors.positions, before.anchors.positions)
-        assert torch.equal(shown.anchors.log_offset_scales, before.anchors.log_offset_scales)
+    shown = HandOver(before, own, NONE, steps=STEPS).scene(own, index=8)
+    assert torch.equal(shown.anchors.positions, before.anchors.positions)
+    assert torch.equal(shown.anchors.log_offset_scales, before.anchors.log_offset_scales)
+
+
+@pytest.mark.parametrize("bins", [1, -1, 60])
+def test_differences_fade_in_equal_steps(bins: int) -> None:
+    """Of differences of one bin a like number goes in each frame."""
+    own = two_heaps()
+    hand_over = HandOver(shifted(own, ~NONE, bins), own, NONE, steps=STEPS)
+    for left in range(FADE_FRAMES + 1, -1, -1):
+        differences = bins_from(hand_over.scene(own, index=8), own)
+        expected = bins * left / (FADE_FRAMES + 1)
+        assert torch.all((differences - expected).abs() < 1.0)
+        assert abs(float(differences.mean()) - expected) < 0.05 * abs(bins)
+    assert torch.equal(hand_over.scene(own, index=9).anchors.positions, own.anchors.positions)
 
 
 def test_what_moves_at_the_border_is_the_groups_own() -> None:
@@ -63,29 +80,38 @@ def test_what_moves_at_the_border_is_the_groups_own() -> None:
     assert torch.equal(shown.anchors.positions[~LEFT], before.anchors.positions[~LEFT])
 
 
-def test_differences_halve_towards_zero_where_the_group_moves() -> None:
+def test_differences_halve_besides_where_the_group_moves() -> None:
     own = two_heaps()
-    hand_over = HandOver(shifted(own, ~NONE, -5), own, NONE, steps=STEPS)
+    hand_over = HandOver(shifted(own, ~NONE, -48), own, NONE, steps=STEPS)
     hand_over.scene(own, index=8)
-    left = []
-    for index in range(9, 13):
+    for halved, left in ((24, 5), (12, 4), (6, 3)):
         own = shifted(own, LEFT, 1)
-        shown = hand_over.scene(own, index=index)
-        differences = ((shown.anchors.positions - own.anchors.positions) / STEP).round()
-        assert (differences[~LEFT] == -5).all()
-        left.append(differences[LEFT].unique().tolist())
-    assert left == [[-2.0], [-1.0], [0.0], [0.0]]
+        differences = bins_from(hand_over.scene(own, index=9), own)
+        share = left / (FADE_FRAMES + 1)
+        assert ((differences[LEFT] + halved * share).abs() < 1.0).all()
+        assert torch.equal(differences[~LEFT], torch.full_like(differences[~LEFT], -48 * share))
 
 
 def test_a_few_movers_keep_their_neighbourhood_and_fade_themselves() -> None:
     own = two_heaps()
-    hand_over = HandOver(shifted(own, ~NONE, 4), own, NONE, steps=STEPS)
+    hand_over = HandOver(shifted(own, ~NONE, 24), own, NONE, steps=STEPS)
     hand_over.scene(own, index=8)
     one = torch.arange(2 * SIDE) == 3
-    shown = hand_over.scene(shifted(own, one, 1), index=9)
-    differences = ((shown.anchors.positions - own.anchors.positions) / STEP).round()[:, 0]
-    assert differences[one].tolist() == [3.0]  # one of its own, and half of four
-    assert (differences[~one] == 4).all()
+    moved = shifted(own, one, 1)
+    differences = bins_from(hand_over.scene(moved, index=9), moved)
+    share = FADE_FRAMES / (FADE_FRAMES + 1)
+    assert (differences[one] == 12 * share).all()
+    assert (differences[~one] == 24 * share).all()
+
+
+def test_free_gaussians_change_places_when_differences_have_faded() -> None:
+    before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
+    hand_over = HandOver(before, own, NONE, steps=STEPS)
+    for index in range(8, 8 + FADE_FRAMES + 1):
+        assert torch.equal(hand_over.scene(own, index=index).free.births, before.free.births)
+    shown = hand_over.scene(own, index=20)
+    assert shown.free.births.tolist() == [20 * BIRTHS_PER_FRAME + number for number in range(6)]
+    assert torch.equal(shown.free.means, own.free.means)
 
 
 def test_free_gaussians_change_places_when_their_surroundings_move() -> None:

@@ -18,19 +18,27 @@ CAMERAS = 9
 
 
 def moving_at_border(
-    before: Scene, first: Scene, second: Scene | None, rig: CameraRig, backend: Backend
+    before: Scene,
+    first: Scene,
+    rig: CameraRig,
+    backend: Backend,
+    *,
+    earlier: Scene | None = None,
+    second: Scene | None = None,
 ) -> Tensor | None:
     """Mask ``[M]`` of the anchors of ``first`` that move; None where everything changes, as at a cut.
 
     An anchor moves if the change gate of an online frame finds it between the renderings of ``before`` and ``first``,
-    or if ``second`` has changed it: what moves slowly changes the pictures by less than the two fits differ.
+    or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``: what moves slowly, and the plain
+    inside of what moves fast, changes the pictures by less than the two fits differ.
 
     Args:
         before: the last frame of the group before.
         first: the first frame of the group.
-        second: its second frame; None if it has no other.
         rig: in the units of the scene.
         backend: the compute back-end.
+        earlier: the last but one frame of the group before; None if it has no other.
+        second: the second frame of the group; None if it has no other.
     """
     names = rig.training[:: max(1, len(rig.training) // CAMERAS)]
     config = MotionConfig(enabled=True, picture_scale=0.5)
@@ -39,9 +47,11 @@ def moving_at_border(
     found = segment_motion(first, views, changes, config=config, backend=backend)
     if found.scene_cut:
         return None
-    if second is None:
-        return found.anchors
-    return found.anchors | changed_movers(first, second)[: len(found.anchors)]
+    moving = found.anchors
+    for older, newer in ((earlier, before), (first, second)):
+        if older is not None and newer is not None:
+            moving = moving | changed_movers(older, newer)[: len(moving)]
+    return moving
 
 
 def _drawn(scene: Scene, names: Sequence[str], rig: CameraRig, backend: Backend) -> list[View]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The packets of groups one after the other, each coded again after what stands still was handed over to it."""
 
+from collections import deque
 from collections.abc import Iterator
 from itertools import chain
 
@@ -21,7 +22,7 @@ _KINDS = {record: kind for kind, record in _TYPES.items()}
 
 
 class Handing:
-    """The records of a stream's groups, which are given in order; of the scenes of a group two are in memory.
+    """The records of a stream's groups, which are given in order; four scenes are in memory at most.
 
     Args:
         header: of the stream.
@@ -32,7 +33,7 @@ class Handing:
         self._header = header
         self._backend = backend
         self._rig = header.similarity.rig(header.rig)
-        self._last: Scene | None = None
+        self._shown: deque[Scene] = deque(maxlen=2)
 
     def records(self, segment: Segment) -> Iterator[bytes]:
         """The records of the packets of ``segment``; those of the first group are its own.
@@ -40,27 +41,37 @@ class Handing:
         Raises:
             StreamError: a packet is damaged.
         """
-        if self._last is None:
+        if not self._shown:
             for number, (_, scene) in enumerate(self._decoded(segment)):
-                self._last = scene
+                self._shown.append(scene)
                 yield segment.record(number)
             return
         frames = self._decoded(segment)
         begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
-        hand_over = self._begin(self._last, [scene for _, scene in begun])
+        hand_over = self._begin([scene for _, scene in begun])
         encoder = SceneEncoder(self._header)
         for packet, scene in chain(begun, frames):
             shown = scene if hand_over is None else hand_over.scene(scene, index=packet.index)
             made = encoder.encode(shown, index=packet.index, pts_seconds=packet.pts_seconds, kind=packet.kind)
-            self._last = made.reconstruction
+            self._shown.append(made.reconstruction)
             yield packed(_TYPES[packet.kind], made.packet.payload)
 
-    def _begin(self, before: Scene, begun: list[Scene]) -> HandOver | None:
+    def _begin(self, begun: list[Scene]) -> HandOver | None:
         """The hand-over to a group from its first one or two frames; None where everything changes."""
-        there = [on_device(scene, self._backend.device) for scene in (before, *begun)]
-        second = there[2] if len(there) > 2 else None
-        moving = moving_at_border(there[0], there[1], second, self._rig, self._backend)
-        return None if moving is None else HandOver(before, begun[0], moving.cpu(), steps=self._header.steps)
+        device = self._backend.device
+        *earlier, before = (on_device(scene, device) for scene in self._shown)
+        first, *second = (on_device(scene, device) for scene in begun)
+        moving = moving_at_border(
+            before,
+            first,
+            self._rig,
+            self._backend,
+            earlier=earlier[0] if earlier else None,
+            second=second[0] if second else None,
+        )
+        if moving is None:
+            return None
+        return HandOver(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps)
 
     def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
         decoder = SceneDecoder(self._header)
