@@ -2,6 +2,7 @@
 """Plain lines for files, bars for terminals, the same numbers in both."""
 
 import io
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,7 +10,7 @@ from rich.console import Console
 
 from reports import frame_report
 from structgstream.cli import progress
-from structgstream.cli.progress import Bars, Lines, display, human_bytes
+from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
 from structgstream.training.result import Step
 
 REPORT = frame_report(
@@ -45,6 +46,10 @@ def test_a_line_for_each_frame() -> None:
         shown.step(Step(1, 100, 0.5, 34_512, 0))
         shown.frame(REPORT)
     assert text(out) == "frame  2/20  train 31.20 dB   812.3 kB     5.1 s  34,512 anchors  2,301 free (+5 -1)\n"
+
+
+def test_a_frame_in_which_nothing_was_trained_has_no_score() -> None:
+    assert summary(replace(REPORT, train_psnr=math.nan), 20).startswith("frame  2/20  train     - dB ")
 
 
 def test_a_line_tells_which_pictures_were_not_believed() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the user sees while frames are fitted: bars on a terminal, a line for each frame elsewhere."""
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -50,8 +51,10 @@ def summary(report: "FrameReport", frames: int | None, *, quality: str | None = 
     """One frame in one line, of ``frames`` where that is known, and its quality where there are several."""
     number = str(report.index + 1) if frames is None else f"{report.index + 1:>{len(str(frames))}}/{frames}"
     moving = f" ({report.moving:,} moving)" if report.index and report.moving < report.anchors else ""
+    # Where nothing moves, nothing is trained.
+    psnr = f"{report.train_psnr:5.2f}" if math.isfinite(report.train_psnr) else "    -"
     return (
-        f"frame {number}{'' if quality is None else f'  {quality}'}  train {report.train_psnr:5.2f} dB  "
+        f"frame {number}{'' if quality is None else f'  {quality}'}  train {psnr} dB  "
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
         f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}{absences(report.absent)}"
