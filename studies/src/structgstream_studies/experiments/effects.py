@@ -111,11 +111,6 @@ def _of_frame_0(rows: _Rows) -> None:
     lively = replace(full, initial=replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False))
     title = f"{PAPER_OFFSETS} Gaussians an anchor, of which about half are never drawn"
     rows.row("offsets", title, lively, *OFFSET_FIELDS)
-    noisy = replace(full, denoising=replace(full.denoising, frames=1))
-    rows.row("without-denoising", "frame 0 of one picture a camera", noisy, "denoising.frames")
-    floating = replace(full.initial.free_space, enabled=False)
-    hazy = replace(full, initial=replace(full.initial, free_space=floating))
-    rows.row("with-floaters", "anchors in free space are kept", hazy, "initial.free_space.enabled")
 
 
 def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:

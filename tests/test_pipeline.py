@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a frame's task tells of its pictures."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from backends import quickest_backend
+from structgstream.pipeline import FrameTask
+from structgstream.training.pictures import FramePictures
+from worlds import moving_world
+
+WORLD = moving_world(1, speed=0.0, movers=4, cameras=6)
+TRAINING, (HELD_OUT, *_) = WORLD.rig.training, WORLD.rig.testing
+
+
+def absent(images: Mapping[str, NDArray[np.uint8]]) -> tuple[str, ...]:
+    frame = replace(WORLD.frames[0], images=images)
+    none = torch.zeros(0, 3)
+    return FrameTask(frame, FramePictures([], None), WORLD.rig, lambda: none, quickest_backend(), seed=0).remarks.absent
+
+
+def test_cameras_without_a_picture_are_absent() -> None:
+    images = dict(WORLD.frames[0].images)
+    assert absent(images) == ()
+    gone = (TRAINING[1], HELD_OUT)
+    assert set(absent({name: image for name, image in images.items() if name not in gone})) == set(gone)
+
+
+def test_a_blank_training_camera_is_absent_and_a_blank_held_out_one_is_scored() -> None:
+    images = dict(WORLD.frames[0].images)
+    for name in (TRAINING[1], HELD_OUT):
+        images[name] = np.zeros_like(images[name])
+    assert absent(images) == (TRAINING[1],)
