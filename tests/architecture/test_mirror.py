@@ -27,8 +27,6 @@ ELSEWHERE = {
     "data/source.py": "data/test_wrappers.py",
     "exporters/frames.py": "cli/test_export.py",
     "preparation/report/page.py": "preparation/report/test_write.py",
-    # Pipelines are run as a session does.
-    "pipeline.py": "test_session.py",
     "training/result.py": "training/test_optimize.py",
 }
 """Patterns of modules without a test file of their name, and of the files that test them."""
