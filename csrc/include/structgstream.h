@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 1
+#define SGS_ABI_VERSION 2
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -109,6 +109,12 @@ double sgs_excess(const float* offsets, const float* scales, int64_t anchors, in
 void sgs_excess_backward(
     const float* offsets, const float* scales, int64_t anchors, int64_t each, float limit, float factor,
     float* offset_gradient, float* log_scale_gradient);
+
+/* Sum over pairs of shares [M,each] * (sqrt(|values[j] - values[i]|^2 + slack^2) - slack), where row i of `neighbours`
+ * [M,each] holds each j, returned; its gradient by `values` [M,3] is added to `gradient`. */
+double sgs_neighbour_difference(
+    const float* values, const int64_t* neighbours, const float* shares, int64_t count, int64_t each, float slack,
+    float* gradient);
 
 /* Adam, in place. rows: null, or `count` row numbers (int64) of `width` numbers each. */
 void sgs_adam_step(

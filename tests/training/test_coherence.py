@@ -9,10 +9,12 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.cameras import Camera
 from structgstream.errors import ConfigError
+from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.training.coherence import CoherenceConfig, MotionCoherence
 from structgstream.training.rounding import pixel_size
 
+BACKEND = reference_backend()
 CONFIG = CoherenceConfig(weight=1.0, neighbours=4, feature_bandwidth=0.0)
 
 
@@ -39,7 +41,7 @@ def _price(scene: Scene, config: CoherenceConfig = CONFIG) -> MotionCoherence:
 def test_what_moves_as_one_is_free() -> None:
     scene = _grid()
     moved = scene.anchors.positions + torch.tensor([0.3, -0.2, 0.1])
-    assert _price(scene).difference(moved).item() == pytest.approx(0.0, abs=1e-4)
+    assert _price(scene).difference(moved, BACKEND).item() == pytest.approx(0.0, abs=1e-4)
 
 
 def test_one_that_moves_alone_pays_its_way_in_pixels() -> None:
@@ -52,7 +54,7 @@ def test_one_that_moves_alone_pays_its_way_in_pixels() -> None:
     length = (64.0 + 0.25**2) ** 0.5 - 0.25
     # Its own difference counts whole, and as a share of those whose neighbour it is.
     share = float(price.shares[price.neighbours == 12].sum())
-    assert price.difference(moved).item() == pytest.approx((1.0 + share) * length / 25, rel=1e-4)
+    assert price.difference(moved, BACKEND).item() == pytest.approx((1.0 + share) * length / 25, rel=1e-4)
 
 
 def test_it_pulls_an_outlier_to_its_neighbours() -> None:
@@ -60,7 +62,7 @@ def test_it_pulls_an_outlier_to_its_neighbours() -> None:
     moved = scene.anchors.positions.clone()
     moved[12, 0] += 0.2
     moved.requires_grad_()
-    (gradient,) = torch.autograd.grad(_price(scene).difference(moved), [moved])
+    (gradient,) = torch.autograd.grad(_price(scene).difference(moved, BACKEND), [moved])
     assert gradient[12, 0] > 0.0
     assert gradient.sum(0).abs().max() < 1e-3 * gradient.abs().max(), "the whole is not pulled anywhere"
 
@@ -75,7 +77,10 @@ def test_what_looks_different_does_not_count() -> None:
     moved = scene.anchors.positions.clone()
     moved[right, 1] += 0.2
     by_features = replace(CONFIG, feature_bandwidth=0.1)
-    assert _price(scene, by_features).difference(moved).item() < 0.05 * _price(scene).difference(moved).item()
+    assert (
+        _price(scene, by_features).difference(moved, BACKEND).item()
+        < 0.05 * _price(scene).difference(moved, BACKEND).item()
+    )
 
 
 def test_there_is_no_price_without_weight_company_or_view() -> None:

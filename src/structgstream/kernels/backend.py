@@ -22,6 +22,7 @@ from structgstream.kernels.operations import (
     Excess,
     GenerateStructured,
     Lift,
+    NeighbourDifference,
     Rasterize,
     Sweep,
     Volume,
@@ -48,6 +49,7 @@ class Backend:
     l1_ssim: L1SSIM
     volume: Volume
     excess: Excess
+    neighbour_difference: NeighbourDifference
     changed_pixels: ChangedPixels
     lift: Lift
     sweep: Sweep
@@ -63,6 +65,7 @@ def reference_backend() -> Backend:
         reference_change,
         reference_excess,
         reference_lift,
+        reference_neighbours,
         reference_raster,
         reference_ssim,
         reference_sweep,
@@ -77,6 +80,7 @@ def reference_backend() -> Backend:
         l1_ssim=reference_ssim.l1_ssim,
         volume=reference_volume.volume,
         excess=reference_excess.excess,
+        neighbour_difference=reference_neighbours.neighbour_difference,
         changed_pixels=reference_change.changed_pixels,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
@@ -97,6 +101,7 @@ def cpu_backend() -> Backend:
         cpu_change,
         cpu_excess,
         cpu_lift,
+        cpu_neighbours,
         cpu_raster,
         cpu_ssim,
         cpu_sweep,
@@ -113,6 +118,7 @@ def cpu_backend() -> Backend:
         l1_ssim=cpu_ssim.l1_ssim,
         volume=cpu_volume.volume,
         excess=cpu_excess.excess,
+        neighbour_difference=cpu_neighbours.neighbour_difference,
         changed_pixels=cpu_change.changed_pixels,
         lift=cpu_lift.lift,
         sweep=cpu_sweep.sweep,
@@ -134,6 +140,7 @@ def cuda_backend() -> Backend:
         reference_change,
         reference_excess,
         reference_lift,
+        reference_neighbours,
         reference_raster,
         reference_ssim,
         reference_sweep,
@@ -155,6 +162,7 @@ def cuda_backend() -> Backend:
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         volume=reference_volume.volume,
         excess=reference_excess.excess,
+        neighbour_difference=reference_neighbours.neighbour_difference,
         changed_pixels=reference_change.changed_pixels,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,

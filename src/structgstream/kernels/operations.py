@@ -109,6 +109,21 @@ class Excess(Protocol):
     def __call__(self, offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor: ...
 
 
+class NeighbourDifference(Protocol):
+    """How much rows differ from their neighbours: the sum ``[]`` of shares times smoothed distances.
+
+    The distance of two rows is ``sqrt(|difference|^2 + slack^2) - slack``. Gradients flow to ``values``.
+
+    Args:
+        values: ``[M, 3]``.
+        neighbours: ``[M, N]`` int64, rows that each is compared with.
+        shares: ``[M, N]`` weights of these pairs.
+        slack: positive; far below it distances count in proportion to their square.
+    """
+
+    def __call__(self, values: Tensor, neighbours: Tensor, shares: Tensor, *, slack: float) -> Tensor: ...
+
+
 class ChangedPixels(Protocol):
     """Dilated mask ``[H, W]`` of the pixels that changed between two pictures ``[H, W, 3]`` uint8.
 

@@ -124,7 +124,7 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
     def _with_prices(self, loss: SceneLoss) -> SceneLoss:
         values = self.parameters.values
         if self.coherence is not None:
-            difference = self.coherence.difference(values["anchor_positions"])
+            difference = self.coherence.difference(values["anchor_positions"], self.backend)
             loss = with_term(loss, "coherence", difference, weight=self.coherence.weight)
         if self.bit_price is None:
             return loss

@@ -93,9 +93,18 @@ def reduced(view: View, scale: float) -> View:
 def area_mean(planes: Tensor, size: tuple[int, int]) -> Tensor:
     """``planes`` ``[1, C, H, W]`` averaged down to ``size``, h and w."""
     by = planes.shape[2] // size[0]
-    if (by * size[0], by * size[1]) == tuple(planes.shape[2:]):  # Integer factors take a fifth of the time.
-        return torch.nn.functional.avg_pool2d(planes, by)
+    if (by * size[0], by * size[1]) == tuple(planes.shape[2:]):
+        return _block_mean(planes, by)
     return torch.nn.functional.interpolate(planes, size=size, mode="area")
+
+
+def _block_mean(planes: Tensor, by: int) -> Tensor:
+    """Means of blocks of ``by`` x ``by`` pixels, by adding rows and columns: an eighth to a third of ``avg_pool2d``'s
+    time."""
+    if by == 1:
+        return planes
+    rows = sum((planes[:, :, start::by] for start in range(1, by)), start=planes[:, :, ::by])
+    return sum((rows[..., start::by] for start in range(1, by)), start=rows[..., ::by]) / by**2
 
 
 def shuffled_views(views: list[View], generator: torch.Generator) -> Iterator[View]:
