@@ -17,6 +17,7 @@ in trouble. A row that the JSON file has is not made again.
 import argparse
 import json
 import logging
+import os
 import sys
 import tempfile
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from benchmarks.fault_cameras import FILMED, camera_faults
 from benchmarks.fault_fits import killed_fits
 from benchmarks.fault_report import table
 from benchmarks.fault_viewers import killed_servers, killed_trainers
+from benchmarks.kills import started
 from benchmarks.machine import load_average, machine
 from benchmarks.stream_writers import Sent, real_writer, repeated
 from structgstream.codec.reader import open_stream
@@ -53,9 +55,11 @@ class Prepared:
 
     @classmethod
     def made(cls) -> "Prepared":
-        """Fits."""
+        """Fits, in a process of its own: one that has used OpenMP's threads cannot fork another that fits."""
         with tempfile.TemporaryDirectory(prefix="faults-") as name:
-            real_writer(8)(Path(name) / "clip", lambda frame: None)
+            child, reading = started(real_writer(8), Path(name) / "clip")
+            os.waitpid(child, 0)
+            os.close(reading)
             reader = open_stream(Path(name) / "clip")
             return cls(repeated(reader, frames=FRAMES), repeated(reader, frames=PERIOD_FRAMES, each_a_period=True))
 
