@@ -54,7 +54,7 @@ def bins_from(shown: Scene, own: Scene) -> Tensor:
 def test_what_stands_still_has_the_bits_of_the_frame_before() -> None:
     own = two_heaps()
     before = shifted(own, ~NONE, 5)
-    shown = HandOver(before, own, NONE, steps=STEPS).scene(own, index=8)
+    shown = HandOver(before, own, NONE, steps=STEPS).scene(own)
     assert torch.equal(shown.anchors.positions, before.anchors.positions)
     assert torch.equal(shown.anchors.log_offset_scales, before.anchors.log_offset_scales)
 
@@ -65,17 +65,17 @@ def test_differences_fade_in_equal_steps(bins: int) -> None:
     own = two_heaps()
     hand_over = HandOver(shifted(own, ~NONE, bins), own, NONE, steps=STEPS)
     for left in range(FADE_FRAMES + 1, -1, -1):
-        differences = bins_from(hand_over.scene(own, index=8), own)
+        differences = bins_from(hand_over.scene(own), own)
         expected = bins * left / (FADE_FRAMES + 1)
         assert torch.all((differences - expected).abs() < 1.0)
         assert abs(float(differences.mean()) - expected) < 0.05 * abs(bins)
-    assert torch.equal(hand_over.scene(own, index=9).anchors.positions, own.anchors.positions)
+    assert torch.equal(hand_over.scene(own).anchors.positions, own.anchors.positions)
 
 
 def test_what_moves_at_the_border_is_the_groups_own() -> None:
     own = two_heaps()
     before = shifted(own, ~NONE, 5)
-    shown = HandOver(before, own, LEFT, steps=STEPS).scene(own, index=8)
+    shown = HandOver(before, own, LEFT, steps=STEPS).scene(own)
     assert torch.equal(shown.anchors.positions[LEFT], own.anchors.positions[LEFT])
     assert torch.equal(shown.anchors.positions[~LEFT], before.anchors.positions[~LEFT])
 
@@ -83,10 +83,10 @@ def test_what_moves_at_the_border_is_the_groups_own() -> None:
 def test_differences_halve_besides_where_the_group_moves() -> None:
     own = two_heaps()
     hand_over = HandOver(shifted(own, ~NONE, -48), own, NONE, steps=STEPS)
-    hand_over.scene(own, index=8)
+    hand_over.scene(own)
     for halved, left in ((24, 5), (12, 4), (6, 3)):
         own = shifted(own, LEFT, 1)
-        differences = bins_from(hand_over.scene(own, index=9), own)
+        differences = bins_from(hand_over.scene(own), own)
         share = left / (FADE_FRAMES + 1)
         assert ((differences[LEFT] + halved * share).abs() < 1.0).all()
         assert torch.equal(differences[~LEFT], torch.full_like(differences[~LEFT], -48 * share))
@@ -95,46 +95,18 @@ def test_differences_halve_besides_where_the_group_moves() -> None:
 def test_a_few_movers_keep_their_neighbourhood_and_fade_themselves() -> None:
     own = two_heaps()
     hand_over = HandOver(shifted(own, ~NONE, 24), own, NONE, steps=STEPS)
-    hand_over.scene(own, index=8)
+    hand_over.scene(own)
     one = torch.arange(2 * SIDE) == 3
     moved = shifted(own, one, 1)
-    differences = bins_from(hand_over.scene(moved, index=9), moved)
+    differences = bins_from(hand_over.scene(moved), moved)
     share = FADE_FRAMES / (FADE_FRAMES + 1)
     assert (differences[one] == 12 * share).all()
     assert (differences[~one] == 24 * share).all()
 
 
-def test_free_gaussians_change_places_when_differences_have_faded() -> None:
+@pytest.mark.parametrize("moving", [NONE, ~NONE], ids=["still", "moving"])
+def test_free_gaussians_are_the_groups_own_at_once(moving: Tensor) -> None:
     before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
-    hand_over = HandOver(before, own, NONE, steps=STEPS)
-    for index in range(8, 8 + FADE_FRAMES + 1):
-        assert torch.equal(hand_over.scene(own, index=index).free.births, before.free.births)
-    shown = hand_over.scene(own, index=20)
-    assert shown.free.births.tolist() == [20 * BIRTHS_PER_FRAME + number for number in range(6)]
-    assert torch.equal(shown.free.means, own.free.means)
-
-
-def test_free_gaussians_change_places_when_their_surroundings_move() -> None:
-    before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
-    hand_over = HandOver(before, own, NONE, steps=STEPS)
-    shown = hand_over.scene(own, index=8)
-    assert torch.equal(shown.free.births, before.free.births)
-    later = shifted(own, LEFT, 1)
-    fresh = replace(own.free.select(torch.tensor([1])), births=torch.tensor([9 * BIRTHS_PER_FRAME]))
-    later = replace(later, free=later.free.append(fresh))
-    shown = hand_over.scene(later, index=9)
-    # On the right those of before stay; on the left the group's three get identities after the birth of this frame.
-    number = 9 * BIRTHS_PER_FRAME
-    assert shown.free.births.tolist() == [*before.free.births[1::2].tolist(), *range(number, number + 4)]
-    assert torch.equal(shown.free.means[2], fresh.means[0])
-    assert torch.equal(shown.free.means[3:], own.free.means[0::2])
-    dead = replace(later, free=later.free.select(torch.tensor([0, 1, 3, 5, 6])))
-    again = hand_over.scene(dead, index=10)
-    assert again.free.births.tolist() == [*before.free.births[1::2].tolist(), number, number + 1]
-
-
-def test_moving_free_gaussians_are_the_groups_own_at_once() -> None:
-    before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
-    shown = HandOver(before, own, ~NONE, steps=STEPS).scene(own, index=8)
+    shown = HandOver(before, own, moving, steps=STEPS).scene(own)
     assert torch.equal(shown.free.births, own.free.births)
-    assert torch.equal(shown.anchors.positions, own.anchors.positions)
+    assert torch.equal(shown.free.means, own.free.means)

@@ -51,7 +51,7 @@ class Handing:
         hand_over = self._begin([scene for _, scene in begun])
         encoder = SceneEncoder(self._header)
         for packet, scene in chain(begun, frames):
-            shown = scene if hand_over is None else hand_over.scene(scene, index=packet.index)
+            shown = scene if hand_over is None else hand_over.scene(scene)
             made = encoder.encode(shown, index=packet.index, pts_seconds=packet.pts_seconds, kind=packet.kind)
             self._shown.append(made.reconstruction)
             yield packed(_TYPES[packet.kind], made.packet.payload)
