@@ -7,10 +7,6 @@
 
 #include "vec.h"
 
-#if defined(__AVX512F__) || defined(__AVX__) || defined(__SSE2__)
-#include <immintrin.h>
-#endif
-
 namespace structgstream {
 namespace SGS_ISA {
 
@@ -22,6 +18,7 @@ inline mask above(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, 
 inline mask both(mask a, mask b) { return a & b; }
 inline mask without(mask a, mask b) { return a & static_cast<mask>(~b); }
 inline bool any(mask m) { return m != 0; }
+inline uint32_t bits(mask m) { return m; }
 inline vf choose(mask m, vf a, vf b) { return (vf)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
 inline vf keep(mask m, vf a) { return (vf)_mm512_maskz_mov_ps(m, (__m512)a); }
 
@@ -35,17 +32,20 @@ inline mask without(mask a, mask b) { return a & ~b; }
 inline vf choose(mask m, vf a, vf b) { return (vf)(((vi)a & m) | ((vi)b & ~m)); }
 inline vf keep(mask m, vf a) { return (vf)((vi)a & m); }
 
-inline bool any(mask m) {
+// A bit for each lane.
+inline uint32_t bits(mask m) {
 #if defined(__AVX__)
-    return _mm256_movemask_ps((__m256)m) != 0;
+    return _mm256_movemask_ps((__m256)m);
 #elif defined(__SSE2__)
-    return _mm_movemask_ps((__m128)m) != 0;
+    return _mm_movemask_ps((__m128)m);
 #else
-    int32_t found = 0;
-    for (int i = 0; i < kLanes; ++i) found |= m[i];
-    return found != 0;
+    uint32_t found = 0;
+    for (int i = 0; i < kLanes; ++i) found |= uint32_t(m[i] != 0) << i;
+    return found;
 #endif
 }
+
+inline bool any(mask m) { return bits(m) != 0; }
 
 #endif
 

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "block.h"
 #include "mask.h"
 #include "splat.h"
 #include "vec.h"
@@ -180,9 +181,10 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
     alignas(kAlignment) float out[9][kLanes];
     const vf scale = (0.5f * kLog2E) / determinant;
     const vf to_x = yy * scale, to_xy = -2.0f * xy * scale, to_y = xx * scale;
-    // From a block's centre no pixel's centre is farther than 1.5 pixels along x and y: the triangle inequality.
+    // How far a pixel's centre is from its block's: the triangle inequality.
+    constexpr float kAside = 0.5f * (kBlockX - 1), kBelow = 0.5f * (kBlockY - 1);
     const vf within = square_root(largest(splat(0.0f), log2_opacity - kLog2MinAlpha)) +
-                      1.5f * square_root(to_x + to_y + absolute(to_xy));
+                      square_root(kAside * kAside * to_x + kBelow * kBelow * to_y + kAside * kBelow * absolute(to_xy));
     const vf results[9] = {x, y, to_x, to_xy, to_y, log2_opacity, f.point[2], keep(seen, largest(half_x, half_y)),
                            within * within * (1.0f + kBlockSlack) + kBlockSlack};
     for (int j = 0; j < 9; ++j) store(out[j], results[j]);

@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <cstring>
 
+#include "block.h"
 #include "mask.h"
 #include "splat.h"
 #include "vec.h"
@@ -16,11 +17,6 @@ namespace structgstream {
 namespace SGS_ISA {
 namespace {
 
-constexpr int kBlockX = kLanes == 4 ? 2 : 4;
-constexpr int kBlockY = kLanes / kBlockX;
-constexpr int kBlocksX = kTile / kBlockX;
-constexpr int kBlocksY = kTile / kBlockY;
-constexpr int kBlocks = kBlocksX * kBlocksY;
 constexpr int kAhead = 4;  // splats
 constexpr int kMapsAtOnce = 8;
 
@@ -61,8 +57,9 @@ struct Lanes {
     }
 };
 
-// The centres of a tile's blocks, where there are as many blocks as lanes.
+// The centres of a tile's blocks, lane by lane.
 struct BlockCentres {
+    static constexpr int kVectors = kBlocks / kLanes, kRows = kLanes / kBlocksX;
     vf x, y;
     BlockCentres() {
         for (int i = 0; i < kLanes; ++i)
@@ -70,42 +67,51 @@ struct BlockCentres {
     }
 };
 
-// A bit for each block of a tile that a splat may cover: by its ellipse where one vector holds all blocks, by its box
+// A bit for each block of a tile that a splat may cover: by its ellipse where few vectors hold all blocks, by its box
 // elsewhere. The quadratic form is rounded in proportion to its two squares, which a part of them allows for.
 inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int left, int top) {
-#if defined(__AVX512F__)
-    static_assert(kBlocks == kLanes);
-    const vf dx = centres.x + (left - s.x), dy = centres.y + (top - s.y);
-    const vf squares = dx * dx * s.xx + dy * dy * s.yy;
-    return at_least(splat(s.near_block), squares * (1.0f - 1e-5f) + dx * dy * s.xy);
+    uint64_t found = 0;
+#if SGS_LANES > 4
+    const vf dx = centres.x + (left - s.x), first_dy = centres.y + (top - s.y);
+    const vf along_x = dx * dx * (s.xx * (1.0f - 1e-5f)), mixed = dx * s.xy;
+    const float yy = s.yy * (1.0f - 1e-5f);
+#pragma GCC unroll 4
+    for (int v = 0; v < BlockCentres::kVectors; ++v) {
+        const vf dy = first_dy + static_cast<float>(v * BlockCentres::kRows * kBlockY);
+        const mask near = at_least(splat(s.near_block), along_x + dy * (dy * yy + mixed));
+        found |= uint64_t{bits(near)} << (v * kLanes);
+    }
 #else
     const int x0 = std::max(0, s.box[0] - left) / kBlockX;
     const int x1 = (std::min(kTile, s.box[2] - left) + kBlockX - 1) / kBlockX;
     const int y0 = std::max(0, s.box[1] - top) / kBlockY;
     const int y1 = (std::min(kTile, s.box[3] - top) + kBlockY - 1) / kBlockY;
     const uint64_t row = ((uint64_t{1} << (x1 - x0)) - 1) << x0;
-    uint64_t found = 0;
     for (int y = y0; y < y1; ++y) found |= row << (y * kBlocksX);
-    return found;
 #endif
+    return found;
 }
 
 // One splat over one block of pixels whose transmittance is T. Positive T is live; a pixel that has stopped keeps its
 // transmittance with a minus sign.
 struct Coverage {
-    vf dx, dy, alpha;
-    mask used, clamped, stopped;
+    vf dx, dy, alpha, after;  // after: the transmittance behind the splat, stored where none has stopped
+    mask used, stopped;
+    bool any_stopped;
 
-    bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T) {
+    [[gnu::always_inline]] bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T) {
         dx = lanes.x + (left - s.x), dy = lanes.y + (top - s.y);
         const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
         used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(0.0f)));
         if (!any(used)) return false;
-        const vf raw = power_of_two(power);
-        clamped = at_least(raw, splat(kMaxAlpha));
-        alpha = keep(used, choose(clamped, splat(kMaxAlpha), raw));
-        stopped = both(used, at_least(splat(kMinTransmittance), T * (1.0f - alpha)));
-        alpha = keep(without(used, stopped), alpha);
+        alpha = keep(used, smallest(power_of_two(power), splat(kMaxAlpha)));
+        after = T * (1.0f - alpha);
+        stopped = both(used, at_least(splat(kMinTransmittance), after));
+        any_stopped = any(stopped);
+        if (any_stopped) {
+            alpha = keep(without(used, stopped), alpha);
+            after = choose(stopped, -T, after);
+        }
         return true;
     }
 };
@@ -117,24 +123,22 @@ struct Front {
     Front() {
         for (float& t : T) t = 1.0f;
     }
-    // Transmittance behind a splat, from that in front of it, `before`.
-    [[gnu::always_inline]] void pass(int block, vf before, const Coverage& c) {
-        float* t = T + block * kLanes;
-        const vf after = before * (1.0f - c.alpha);
-        store(t, after);
-        if (!any(c.stopped)) return;
-        store(t, choose(c.stopped, -before, after));
-        if (!any(above(load(t), splat(0.0f)))) live &= ~(uint64_t{1} << block);
+    [[gnu::always_inline]] void pass(int block, const Coverage& c) {
+        store(T + block * kLanes, c.after);
+        if (c.any_stopped && !any(above(c.after, splat(0.0f)))) live &= ~(uint64_t{1} << block);
     }
 };
 
 struct Tile {
     int left, top, right, bottom;
+    float lefts[kBlocks], tops[kBlocks];  // of its blocks
     Tile(const Raster& r, int index)
         : left(index % r.tiles_x * kTile),
           top(index / r.tiles_x * kTile),
           right(std::min(left + kTile, r.camera.width)),
-          bottom(std::min(top + kTile, r.camera.height)) {}
+          bottom(std::min(top + kTile, r.camera.height)) {
+        for (int b = 0; b < kBlocks; ++b) lefts[b] = left + b % kBlocksX * kBlockX, tops[b] = top + b / kBlocksX * kBlockY;
+    }
 };
 
 // Visits the pixels of a tile: their place in the picture, and in the tile's order of blocks. Rows of a block together, so
@@ -187,10 +191,9 @@ template <typename Visit>
         const int block = __builtin_ctzll(rest), at = block * kLanes;
         const vf before = load(front.T + at);
         Coverage c;
-        const float left = tile.left + block % kBlocksX * kBlockX, top = tile.top + block / kBlocksX * kBlockY;
-        if (!c.of(s, lanes, left, top, before)) continue;
+        if (!c.of(s, lanes, tile.lefts[block], tile.tops[block], before)) continue;
         visit(at, before, c);
-        front.pass(block, before, c);
+        front.pass(block, c);
     }
 }
 
@@ -261,7 +264,7 @@ void blend_backward(
             store(rest + at, to_come);
             if (!trained) return;
             const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
-            const vf d = keep(without(c.used, c.clamped), slope * c.alpha);  // a clamped alpha does not react
+            const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);  // a clamped alpha does not react
             const vf dx = d * c.dx, dy = d * c.dy;
             m[0] += d, m[1] += dx, m[2] += dy;
             m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;

@@ -31,7 +31,7 @@ struct alignas(64) Splat {
     float log2_opacity;
     float color[3];
     float depth;
-    float near_block;          // the quadratic form at the centre of 4 x 4 pixels that reach alpha = 1/255 is at most this
+    float near_block;          // the quadratic form at the centre of a block of pixels that reach alpha = 1/255 is at most this
     int32_t box[4];            // pixels x0, y0, x1, y1 (half open) that can reach alpha = 1/255
 };
 

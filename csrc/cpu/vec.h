@@ -8,6 +8,10 @@
 #include <new>
 #include <utility>
 
+#if defined(__AVX512F__) || defined(__AVX__) || defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
 #ifndef SGS_ISA
 #define SGS_ISA native
 #endif
@@ -37,8 +41,21 @@ inline void store(float* p, vf v) { *reinterpret_cast<unaligned_vf*>(p) = v; }
 inline void store(int32_t* p, vi v) { *reinterpret_cast<unaligned_vi*>(p) = v; }
 inline vf splat(float x) { return x - vf{}; }
 inline vf absolute(vf x) { return (vf)((vi)x & 0x7fffffff); }
+
+// The second one if they are equal or not ordered, on every instruction set.
+#if defined(__AVX512F__)
+inline vf largest(vf a, vf b) { return (vf)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b); }
+inline vf smallest(vf a, vf b) { return (vf)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b); }
+#elif defined(__AVX__)
+inline vf largest(vf a, vf b) { return (vf)_mm256_max_ps((__m256)a, (__m256)b); }
+inline vf smallest(vf a, vf b) { return (vf)_mm256_min_ps((__m256)a, (__m256)b); }
+#elif defined(__SSE2__)
+inline vf largest(vf a, vf b) { return (vf)_mm_max_ps((__m128)a, (__m128)b); }
+inline vf smallest(vf a, vf b) { return (vf)_mm_min_ps((__m128)a, (__m128)b); }
+#else
 inline vf largest(vf a, vf b) { return a > b ? a : b; }
 inline vf smallest(vf a, vf b) { return a < b ? a : b; }
+#endif
 
 // e^x to about one unit in the last place; saturates instead of overflowing or giving denormal numbers.
 inline vf exponential(vf x) {

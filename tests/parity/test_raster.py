@@ -118,6 +118,22 @@ def test_cpu(isa: int, background: Tensor | None) -> None:
     check_against_reference(cpu_raster.rasterize, background=background)
 
 
+@native
+@pytest.mark.parametrize("faint", [False, True])
+def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
+    """Blocks of pixels are chosen by a splat's ellipse: needles at every angle touch the corners of most."""
+    means, quats, scales, opacities, colors, _ = gaussians(400)
+    scales[:, 0], scales[:, 1:] = 0.5, 0.004
+    inputs = (means, quats, scales, opacities * (0.05 if faint else 1.0), colors)
+    image = reference(splats_of(*inputs), camera()).image
+    drawn = cpu_raster.rasterize(splats_of(*(value.float() for value in inputs)), camera(torch.float32)).image
+    away = safe_pixels((*inputs, torch.zeros(400, 2))).bool()
+    assert away.float().mean() > 0.3
+    assert image[away].max() > (0.02 if faint else 0.5)
+    # Conics of needles are large, and so are their roundings.
+    assert (drawn - image).abs()[away].max() < 1e-3
+
+
 @pytest.mark.needs_cuda
 def test_cuda() -> None:
     check_against_reference(cuda.rasterize, background=None, device="cuda")

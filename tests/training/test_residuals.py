@@ -3,7 +3,9 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
@@ -28,6 +30,13 @@ def test_a_mean_over_a_box_counts_pixels_that_exist() -> None:
     assert found[1, 1] == 1.0
     assert found[0, 1] == 9.0 / 6
     assert not found[2:].any()
+
+
+@pytest.mark.parametrize(("size", "pixels"), [((9, 14), 3), ((9, 14), 5), ((2, 14), 7), ((1, 1), 5)])
+def test_a_mean_over_a_box_is_torchs(size: tuple[int, int], pixels: int) -> None:
+    values = torch.rand(size, generator=torch.Generator().manual_seed(1))
+    expected = avg_pool2d(values[None, None], pixels, stride=1, padding=pixels // 2, count_include_pad=False)[0, 0]
+    torch.testing.assert_close(box_mean(values, pixels), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_equal_pictures_have_no_residual() -> None:

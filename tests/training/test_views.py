@@ -3,11 +3,12 @@ from collections.abc import Iterator, Mapping
 from itertools import islice
 
 import numpy as np
+import pytest
 import torch
 
 from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
-from structgstream.training.views import View, coarse_to_fine, reduced, shuffled_views, training_views
+from structgstream.training.views import View, area_mean, coarse_to_fine, reduced, shuffled_views, training_views
 
 RIG = arc_rig()
 
@@ -71,6 +72,13 @@ def test_reduction_averages_areas_and_keeps_the_camera() -> None:
     assert small.image.shape == (16, 24, 3)
     assert (small.image == 100).all()
     assert torch.allclose(small.camera.K[:2], camera.K[:2] * 0.5)
+
+
+@pytest.mark.parametrize("size", [(36, 64), (27, 48), (18, 32), (12, 64), (11, 47), (35, 63), (36, 7), (1, 1)])
+def test_areas_are_averaged_as_torch_does(size: tuple[int, int]) -> None:
+    planes = torch.rand(1, 3, 36, 64, generator=torch.Generator().manual_seed(1))
+    expected = torch.nn.functional.interpolate(planes, size=size, mode="area")
+    torch.testing.assert_close(area_mean(planes, size), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_absent_cameras_have_no_view_and_shift_no_index() -> None:

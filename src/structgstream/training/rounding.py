@@ -22,7 +22,7 @@ from structgstream.scene.state import PARAMETERS, ParameterName
 class _RoundStraightThrough(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, value: Tensor, step: float) -> Tensor:
-        return (value / step).round() * step
+        return (value / step).round_().mul_(step)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:

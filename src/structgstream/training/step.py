@@ -66,15 +66,20 @@ class ViewLoss(Loss):
 
     def squared_error(self, view: View) -> Tensor:
         """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels that count."""
+        rendered, picture = self.rendering.image, view.image
+        masks = [] if self.focus is None else [self.focus.tiles.pixels()]
+        masks += [] if view.mask is None else [view.mask]
+        inside = None if not masks else masks[0] if len(masks) == 1 else masks[0] & masks[1]
         with torch.no_grad():
-            squares = (self.image.clamp(0.0, 1.0) - view.image.to(self.image) / 255.0).square()
-            drawn = None if self.focus is None else self.focus.tiles.pixels()
-            if drawn is None and view.mask is None:
-                return squares.mean()
-            masks = [mask for mask in (drawn, view.mask) if mask is not None]
-            inside = torch.stack(masks).all(0) if len(masks) > 1 else masks[0]
-            inside = inside[..., None].to(squares)
-            return (squares * inside).sum() / (3.0 * inside.sum().clamp(min=1.0))
+            if (
+                inside is not None and rendered.device.type == "cpu"
+            ):  # A GPU's host would wait for the number of pixels.
+                rendered, picture, inside = rendered[inside], picture[inside], None
+            corrected = (rendered * self.gains + self.biases).clamp_(0.0, 1.0)
+            squares = (corrected - picture.to(corrected) / 255.0).square()
+            if inside is None:
+                return squares.sum() / max(squares.numel(), 1)
+            return (squares.sum(-1) * inside).sum() / (3.0 * inside.sum().clamp(min=1.0))
 
 
 @dataclass(frozen=True)
