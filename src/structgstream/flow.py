@@ -70,7 +70,8 @@ def _squared_lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 def inside(offsets: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mask ``[H, W]`` of the pixels that their offset moves to a position inside the outermost pixel centres."""
     height, width, _ = offsets.shape
-    x, y = offsets[..., 0] + np.arange(width), offsets[..., 1] + np.arange(height)[:, None]
+    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+    x, y = offsets[..., 0] + columns, offsets[..., 1] + rows[:, None]
     return (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
 
 

@@ -288,7 +288,7 @@ COMPACT = replace(
     codec="compact",
     online=replace(
         MOTION.online,
-        iterations=150,
+        iterations=125,
         mean_of_last=0.25,
         rates=replace(
             MOTION.online.rates,

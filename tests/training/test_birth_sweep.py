@@ -2,10 +2,12 @@
 """What a rendering lacks in each view, and the depth in front of which it is looked for."""
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.raster_types import RasterOutput
 from structgstream.training.birth_sweep import Sweep, missing_share
 from structgstream.training.births import BirthConfig
 from structgstream.training.motion import MotionConfig
@@ -54,6 +56,24 @@ def test_drawn_again_the_same_is_missing() -> None:
     for before, after in zip(found, swept.drawn(found), strict=True):
         if before.any:
             assert torch.equal(before.residual.missing_share, after.residual.missing_share)
+
+
+def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
+    swept, drawings = sweep(), []
+    found = swept.missing()
+    assert any(entry.drawn is not None for entry in found)
+
+    def rasterize(*args: Any, **options: Any) -> RasterOutput:
+        drawings.append(options["tiles"])
+        return swept.backend.rasterize(*args, **options)
+
+    counted = replace(swept, backend=replace(swept.backend, rasterize=rasterize))
+    known = {entry.view.index: entry for entry in found}
+    for first, second in zip(found, replace(counted, known=known).missing(), strict=True):
+        assert torch.equal(first.residual.missing_share, second.residual.missing_share)
+    assert not drawings
+    counted.missing()
+    assert drawings, "without what is known"
 
 
 def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> None:

@@ -2,7 +2,7 @@
 """What a rendering lacks, and the free Gaussians that fill it: one sweep of ``training/births.py`` over a frame."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -35,11 +35,15 @@ class Missing:
         view: in full size.
         residual: of the rendering.
         tiles: those in which something is missing or wrong, or all; None for a view without a focus.
+        picture: ``[H, W, 3]`` the rendering.
+        drawn: mask ``[rows, columns]`` of the tiles in which it is not the focus's; None for none.
     """
 
     view: View
     residual: ViewResidual
     tiles: TileSelection | None
+    picture: Tensor | None = None
+    drawn: Tensor | None = None
 
     @property
     def any(self) -> bool:
@@ -65,6 +69,7 @@ class Sweep:
         floor: residuals of frame 0; None for none.
         config: the rules.
         backend: the compute back-end.
+        known: by view index, what a sweep of the same Gaussians by other rules has drawn.
     """
 
     moving: Scene
@@ -74,6 +79,7 @@ class Sweep:
     floor: ResidualFloor | None
     config: BirthConfig
     backend: Backend
+    known: Mapping[int, Missing] = field(default_factory=dict)
 
     def missing(self, *, blames: bool = True) -> list[Missing]:
         """Missing pixels of every view, none outside its focus.
@@ -90,7 +96,7 @@ class Sweep:
 
     def drawn(self, missing: Sequence[Missing]) -> list[Missing]:
         """The same views, drawn again."""
-        return [self._drawn(entry) for entry in missing]
+        return [self._drawn(entry, again=True) for entry in missing]
 
     def births(self, missing: Sequence[Missing], *, first_birth: int, room: int) -> Births:
         """New free Gaussians where several views miss the same; at most ``room``."""
@@ -111,25 +117,32 @@ class Sweep:
         return sum(entry.any for entry in missing) > self.config.least_supports
 
     def _before(self, view: View, *, wrong: bool) -> Missing:
-        """By the picture of the focus, which is drawn already; ``wrong`` pixels make their tiles suspect, too."""
-        focus = self.focuses.get(view.index)
-        residual = self._residual(view, None if focus is None else focus.picture)
+        """By the picture that is drawn already; ``wrong`` pixels make their tiles suspect, too."""
+        focus, known = self.focuses.get(view.index), self.known.get(view.index)
         if focus is None:
-            return Missing(view, residual, None)
+            return Missing(view, self._residual(view, None), None)
+        picture = focus.picture if known is None or known.picture is None else known.picture
+        residual = self._residual(view, picture)
         suspect = residual.missing_share > 0.5
-        return Missing(view, residual, changed_tiles(focus.tiles, suspect | residual.wrong if wrong else suspect))
+        tiles = changed_tiles(focus.tiles, suspect | residual.wrong if wrong else suspect)
+        return Missing(view, residual, tiles, picture, None if known is None else known.drawn)
 
-    def _drawn(self, entry: Missing) -> Missing:
-        """By a rendering, in the suspect tiles."""
+    def _drawn(self, entry: Missing, *, again: bool = False) -> Missing:
+        """By a rendering, in the suspect tiles; in those drawn before only ``again``."""
         view, focus = entry.view, self.focuses.get(entry.view.index)
-        if focus is None:
+        if focus is None or entry.picture is None:
             return entry
         tiles = entry.tiles or focus.tiles
-        onto = replace(focus, picture=focus.picture.clone(), tiles=tiles)
+        if entry.drawn is not None and not again:
+            tiles = replace(tiles, mask=tiles.mask & ~entry.drawn)
+            if not tiles.mask.any():
+                return entry
+        onto = replace(focus, picture=entry.picture.clone(), tiles=tiles)
         gaussians = self.moving.with_free_gaussians(self.moving.structured(view.camera, self.backend, tiles=tiles))
         behind = self.moving.background(view.camera)
         image = draw(gaussians, view.camera, self.backend, focus=onto, background=behind).image
-        return replace(entry, residual=self._residual(view, image))
+        drawn = tiles.mask if entry.drawn is None else tiles.mask | entry.drawn
+        return replace(entry, residual=self._residual(view, image), picture=image, drawn=drawn)
 
     def _residual(self, view: View, image: Tensor | None) -> ViewResidual:
         """Of a rendering ``[H, W, 3]`` within the focus; None for a view without one."""

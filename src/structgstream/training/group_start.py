@@ -30,7 +30,7 @@ from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.views import View
 
-USUAL_FRAMES = 6
+USUAL_FRAMES = 7
 """A group's first frame has the iterations of so many online frames. With 1.5 of them births stand in for what
 iterations would have mended, which costs bytes, and late groups fall behind (docs/groups.md)."""
 

@@ -97,7 +97,8 @@ def renew_free_gaussians(
         large = sweep.births(missing, first_birth=first_birth, room=room)
         if len(large.free) or not config.thin.enabled:
             return Renewal(kept, large.free, missing_share=share)
-        thin = _thin_births(replace(sweep, config=config.for_thin), first_birth=first_birth, room=room)
+        known = {entry.view.index: entry for entry in missing}
+        thin = _thin_births(replace(sweep, config=config.for_thin, known=known), first_birth=first_birth, room=room)
     return Renewal(kept, thin.free, len(thin.free), thin.refused_count, share)
 
 
