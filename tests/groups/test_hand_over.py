@@ -2,6 +2,7 @@
 """What stands still is handed over from group to group: exactly, and only for as long as it stands still."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -10,12 +11,13 @@ from torch import Tensor
 from streams import STEPS, small_scene
 from structgstream.codec.scene.bins import dequantize, quantize
 from structgstream.groups.hand_over import FADE_FRAMES, NEIGHBOURS, HandOver
+from structgstream.kernels.anchor_types import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.patching import BIRTHS_PER_FRAME
 
 SIDE = 2 * NEIGHBOURS
 """Anchors of each of two heaps far apart, so that each is a neighbourhood of its own."""
-STEP = STEPS["anchor_positions"]
+STEP, LIGHT_STEP = STEPS["anchor_positions"], STEPS["color_mlp"]
 LEFT = torch.arange(2 * SIDE) < SIDE
 NONE = torch.zeros(2 * SIDE, dtype=torch.bool)
 
@@ -70,6 +72,30 @@ def test_differences_fade_in_equal_steps(bins: int) -> None:
         assert torch.all((differences - expected).abs() < 1.0)
         assert abs(float(differences.mean()) - expected) < 0.05 * abs(bins)
     assert torch.equal(hand_over.scene(own).anchors.positions, own.anchors.positions)
+
+
+def in_light(scene: Scene, bins: int) -> Scene:
+    """On the bins, with the output biases of F_c brighter by as many."""
+    head = HeadWeights(*(dequantize(quantize(weight, LIGHT_STEP), LIGHT_STEP) for weight in scene.mlps.color))
+    biases = dequantize(quantize(head.b2, LIGHT_STEP) + bins, LIGHT_STEP)
+    return replace(scene, mlps=scene.mlps._replace(color=head._replace(b2=biases)))
+
+
+@pytest.mark.parametrize("bins", [4, -3])
+def test_light_goes_over_in_equal_steps_where_things_move_too(bins: int) -> None:
+    own = in_light(two_heaps(), 0)
+    before = in_light(two_heaps(), bins)
+    hand_over = HandOver(before, own, ~NONE, steps=STEPS)
+    brighter = []
+    for _ in range(FADE_FRAMES + 2):
+        shown = hand_over.scene(own)
+        brighter.append(((shown.mlps.color.b2 - own.mlps.color.b2) / LIGHT_STEP).round().unique().tolist())
+        assert torch.equal(shown.mlps.color.w2, own.mlps.color.w2)
+        assert torch.equal(shown.anchors.positions, own.anchors.positions)
+    assert brighter[0] == [bins], "the light of the frame before"
+    steps = [float(later[0] - earlier[0]) for earlier, later in pairwise(brighter)]
+    assert all(abs(step) <= 1.0 and step * bins <= 0.0 for step in steps)
+    assert torch.equal(shown.mlps.color.b2, own.mlps.color.b2)
 
 
 def test_what_moves_at_the_border_is_the_groups_own() -> None:

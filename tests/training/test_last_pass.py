@@ -32,7 +32,8 @@ def loss_of(grey: int, index: int = 0) -> tuple[ViewLoss, View]:
 
 
 def psnr(loss: ViewLoss, view: View) -> float:
-    return -10 * math.log10((loss.image.clamp(0, 1) - view.image / 255.0).square().mean().item())
+    corrected = (loss.rendering.image * loss.gains + loss.biases).clamp(0, 1)
+    return -10 * math.log10((corrected - view.image / 255.0).square().mean().item())
 
 
 def test_the_last_pass_reports_psnr_in_decibels_and_terms() -> None:

@@ -39,7 +39,7 @@ def test_the_total_is_the_weighted_sum_of_the_papers_terms() -> None:
     scene = random_scene(free=3)
     parameters = Parameters.of(scene, trained=frozenset())
     loss, view = loss_of(parameters, scene, offset_distance=0.005)
-    image, target = loss.image, view.image / 255.0
+    image, target = loss.rendering.image * loss.gains + loss.biases, view.image / 255.0
     scales = loss.rendering.gaussians.scales
     expected = (
         (image - target).abs().mean()

@@ -10,7 +10,9 @@ fade: to zero in the frames after the border, in equal steps, so that no step is
 in which the anchor or most of its neighbours change, where motion hides that. They are bins (Note [Bins]), hence exact;
 most are of one or two, so each value is rounded by a threshold of its own, else all of these would go in one frame.
 
-Free Gaussians cannot be paired, and are the group's own: what is new is there at once.
+Free Gaussians cannot be paired, and are the group's own: what is new is there at once. The light
+(``training/light.py``), which each group follows by itself, is that of the frame before and goes over in equal steps: a
+jump of it would show everywhere.
 """
 
 from collections.abc import Mapping
@@ -55,6 +57,9 @@ class HandOver:
             for name, step in self._steps.items()
         }
         self._thresholds = {name: _thresholds(difference) for name, difference in self._differences.items()}
+        light = {name: _bins(then[name] - now[name], steps[name]) for name in fields_of("shared") if name in steps}
+        self._light = {name: difference for name, difference in light.items() if difference.any()}
+        self._steps |= {name: steps[name] for name in self._light}
 
     def scene(self, found: Scene) -> Scene:
         """A frame of the stream instead of the group's own, ``found``; frames are given in order."""
@@ -78,6 +83,8 @@ class HandOver:
     def _faded(self, name: FieldName) -> Tensor:
         """What is left in this frame of a field's differences, in bins."""
         share = self._left_frames / (FADE_FRAMES + 1)
+        if name in self._light:
+            return (self._light[name].double() * share).round().long()
         return (self._differences[name].double() * share + self._thresholds[name]).floor().long()
 
 

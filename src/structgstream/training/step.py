@@ -59,11 +59,6 @@ class ViewLoss(Loss):
         """``[N, 2]`` of the drawn Gaussians, pixels; None if they were not tracked."""
         return self.rendering.screen_offsets
 
-    @property
-    def image(self) -> Tensor:
-        """The rendering with the camera's colour correction, as compared with the picture, ``[H, W, 3]``."""
-        return self.rendering.image * self.gains + self.biases
-
     def squared_error(self, view: View) -> Tensor:
         """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels that count."""
         rendered, picture = self.rendering.image, view.image
@@ -71,9 +66,8 @@ class ViewLoss(Loss):
         masks += [] if view.mask is None else [view.mask]
         inside = None if not masks else masks[0] if len(masks) == 1 else masks[0] & masks[1]
         with torch.no_grad():
-            if (
-                inside is not None and rendered.device.type == "cpu"
-            ):  # A GPU's host would wait for the number of pixels.
+            # On a GPU the host would have to wait for the number of pixels.
+            if inside is not None and rendered.device.type == "cpu":
                 rendered, picture, inside = rendered[inside], picture[inside], None
             corrected = (rendered * self.gains + self.biases).clamp_(0.0, 1.0)
             squares = (corrected - picture.to(corrected) / 255.0).square()
