@@ -6,8 +6,9 @@
     python -m benchmarks.parallel_faults --real 6 --kills 0 --driver-kills 0 --damages 0 --drivers 0 --stores 0
 
 Every run must end with the bytes of one that nothing happened to. The commands are those of ``benchmarks/stand_in.py``,
-which write, lock and go on as the real ones do; ``--real`` takes the real ones, on the bundled clip with the preset
-tiny at a quarter of its size in groups of 4. Moments are drawn with a seed; where in a write they fall is not.
+which write, lock and go on as the real ones do; ``--real`` takes the real ones, too, on the bundled clip with the
+preset tiny at a quarter of its size in groups of 4, and once a store that refuses. Moments are drawn with a seed; where
+in a write they fall is not.
 """
 
 import argparse
@@ -225,7 +226,9 @@ def parsed() -> argparse.Namespace:
     parser.add_argument(
         "--stores", type=int, default=3, help="runs by an object store that refuses every tenth request"
     )
-    parser.add_argument("--real", type=int, default=0, help="kills of real workers and of real drivers, and damages")
+    parser.add_argument(
+        "--real", type=int, default=0, help="kills of real workers, of real drivers, damages; and a store"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--drive", type=Path, metavar="FOLDER", help="drive one run to its end, and no more")
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -262,11 +265,14 @@ def measured(options: argparse.Namespace, folder: Path) -> list[Row]:
             f"{kind}segment cut or flipped",
             when=damages,
         )
-        if not real:
-            pairs, stores = options.drivers, options.stores
-            add(lambda row: two_drivers(row, place, count=pairs, **common), "two drivers of one output", when=pairs)
-            del common["seed"]
-            add(lambda row: refusing_store(row, place, count=stores, **common), "request refused, 1 in 10", when=stores)
+        pairs, stores = (0, 1) if real else (options.drivers, options.stores)
+        add(lambda row: two_drivers(row, place, count=pairs, **common), "two drivers of one output", when=pairs)
+        del common["seed"]
+        add(
+            lambda row: refusing_store(row, place, count=stores, **common),
+            f"{kind}request refused, 1 in 10",
+            when=stores,
+        )
 
     if options.kills or options.driver_kills or options.damages or options.drivers or options.stores:
         series(False, options.kills, options.driver_kills, options.damages)
