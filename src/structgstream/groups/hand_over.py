@@ -57,9 +57,10 @@ class HandOver:
             for name, step in self._steps.items()
         }
         self._thresholds = {name: _thresholds(difference) for name, difference in self._differences.items()}
-        light = {name: _bins(then[name] - now[name], steps[name]) for name in fields_of("shared") if name in steps}
-        self._light = {name: difference for name, difference in light.items() if difference.any()}
-        self._steps |= {name: steps[name] for name in self._light}
+        self._light: dict[FieldName, Tensor] = {}
+        for name in fields_of("shared"):
+            if name in steps and (difference := _bins(then[name] - now[name], steps[name])).any():
+                self._light[name], self._steps[name] = difference, steps[name]
 
     def scene(self, found: Scene) -> Scene:
         """A frame of the stream instead of the group's own, ``found``; frames are given in order."""
