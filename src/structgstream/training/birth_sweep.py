@@ -35,7 +35,7 @@ class Missing:
         view: in full size.
         residual: of the rendering.
         tiles: those in which something is missing or wrong, or all; None for a view without a focus.
-        picture: ``[H, W, 3]`` the rendering.
+        picture: ``[H, W, 3]`` the rendering; None for a view without a focus.
         drawn: mask ``[rows, columns]`` of the tiles in which it is not the focus's; None for none.
     """
 
