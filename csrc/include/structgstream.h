@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 2
+#define SGS_ABI_VERSION 3
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -62,6 +62,12 @@ void sgs_l1_ssim_backward(
 int sgs_changed_pixels(
     const uint8_t* before, const uint8_t* now, int height, int width, float threshold, int reach, uint8_t* changed,
     int threads);
+
+/* Flow where it agrees with the flow back (kernels/reference_flow.py). flow and back [H,W,2], mask [H,W] one byte each or
+ * null. Out: maps [3,H,W]. */
+void sgs_confident_flow(
+    const float* flow, const float* back, const uint8_t* mask, int height, int width, float relative, float absolute,
+    float* maps, int threads);
 
 /* Flow in pictures lifted to displacements (kernels/reference_lift.py). centers [E,3], weights [V,E], flows [V,E,2],
  * viewmats [V,4,4], Ks [V,3,3], near_planes [V], neighbours [T,N] rows of movers, affinities [T,N], priors [T,3]. Out:

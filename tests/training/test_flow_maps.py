@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flow as maps: where it is believed, and where it is not looked for."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 import torch
@@ -8,7 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from structgstream.training.flow_maps import _parts, flow_map
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.flow_maps import FlowConfig, _parts, flow_map
+
+one_box = partial(flow_map, config=FlowConfig(), backend=reference_backend())
+boxes_apart = partial(flow_map, config=FlowConfig(apart=True), backend=reference_backend())
 
 
 def textured(height: int = 120, width: int = 160) -> np.ndarray:
@@ -21,7 +27,7 @@ def test_a_shifted_patch_is_told_at_half_the_size_in_whole_pixels() -> None:
     second = first.copy()
     second[40:80, 56:106] = first[40:80, 50:100]  # six to the right
     changed = torch.from_numpy(np.abs(first.astype(int) - second).sum(2) > 0)
-    maps = flow_map(torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
+    maps = one_box(torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
     assert maps.shape == (60, 80, 3)
     inner = maps[24:36, 30:45]
     confidence, flow = inner[..., 0], inner[..., 1:] / inner[..., :1].clamp(min=1e-6)
@@ -34,7 +40,7 @@ def test_beyond_the_box_around_what_changed_there_is_no_flow() -> None:
     second = np.roll(first, 3, 1)
     changed = torch.zeros(120, 160, dtype=torch.bool)
     changed[50:70, 60:90] = True
-    maps = flow_map(torch.from_numpy(first), torch.from_numpy(second), changed, (120, 160))
+    maps = one_box(torch.from_numpy(first), torch.from_numpy(second), changed, (120, 160))
     assert maps[50:70, 60:90, 0].mean() > 0.8
     assert not maps[:30].any()
     assert not maps[:, :40].any()
@@ -42,7 +48,7 @@ def test_beyond_the_box_around_what_changed_there_is_no_flow() -> None:
 
 def test_nothing_changed_is_no_flow() -> None:
     picture = torch.from_numpy(textured())
-    assert not flow_map(picture, picture, torch.zeros(120, 160, dtype=torch.bool), (60, 80)).any()
+    assert not one_box(picture, picture, torch.zeros(120, 160, dtype=torch.bool), (60, 80)).any()
 
 
 def test_flow_is_repeated_bit_for_bit() -> None:
@@ -50,7 +56,7 @@ def test_flow_is_repeated_bit_for_bit() -> None:
     second = np.roll(first, (2, 5), (0, 1))
     changed = torch.ones(120, 160, dtype=torch.bool)
     given = (torch.from_numpy(first), torch.from_numpy(second), changed, (60, 80))
-    assert torch.equal(flow_map(*given), flow_map(*given))
+    assert torch.equal(one_box(*given), one_box(*given))
 
 
 def test_parts_that_changed_are_searched_apart() -> None:
@@ -60,7 +66,7 @@ def test_parts_that_changed_are_searched_apart() -> None:
     second[140:172, 250:290] = first[146:178, 250:290]  # six up, down on the right
     changed = torch.from_numpy(np.abs(first.astype(int) - second).sum(2) > 0)
     pictures = torch.from_numpy(first), torch.from_numpy(second)
-    one, apart = (flow_map(*pictures, changed, (192, 320), apart=value) for value in (False, True))
+    one, apart = (search(*pictures, changed, (192, 320)) for search in (one_box, boxes_apart))
     left, right = (slice(32, 50), slice(44, 66)), (slice(152, 166), slice(262, 278))
     for (rows, columns), flow in ((left, [4.0, 0.0]), (right, [0.0, -6.0])):
         for maps in (one, apart):
@@ -78,7 +84,7 @@ def test_parts_near_each_other_are_searched_together() -> None:
     changed = torch.zeros(120, 160, dtype=torch.bool)
     changed[40:60, 40:60] = changed[40:60, 90:110] = True
     pictures = torch.from_numpy(first), torch.from_numpy(second)
-    one, apart = (flow_map(*pictures, changed, (120, 160), apart=value) for value in (False, True))
+    one, apart = (search(*pictures, changed, (120, 160)) for search in (one_box, boxes_apart))
     assert torch.equal(one, apart)
 
 

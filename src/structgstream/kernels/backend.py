@@ -19,6 +19,7 @@ from structgstream.kernels.operations import (
     AdamStep,
     BlendingWeights,
     ChangedPixels,
+    ConfidentFlow,
     Excess,
     GenerateStructured,
     Lift,
@@ -51,6 +52,7 @@ class Backend:
     excess: Excess
     neighbour_difference: NeighbourDifference
     changed_pixels: ChangedPixels
+    confident_flow: ConfidentFlow
     lift: Lift
     sweep: Sweep
     generate_structured: GenerateStructured
@@ -64,6 +66,7 @@ def reference_backend() -> Backend:
         reference_anchors,
         reference_change,
         reference_excess,
+        reference_flow,
         reference_lift,
         reference_neighbours,
         reference_raster,
@@ -82,6 +85,7 @@ def reference_backend() -> Backend:
         excess=reference_excess.excess,
         neighbour_difference=reference_neighbours.neighbour_difference,
         changed_pixels=reference_change.changed_pixels,
+        confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
         generate_structured=reference_anchors.generate_structured,
@@ -100,6 +104,7 @@ def cpu_backend() -> Backend:
         cpu_anchors,
         cpu_change,
         cpu_excess,
+        cpu_flow,
         cpu_lift,
         cpu_neighbours,
         cpu_raster,
@@ -120,6 +125,7 @@ def cpu_backend() -> Backend:
         excess=cpu_excess.excess,
         neighbour_difference=cpu_neighbours.neighbour_difference,
         changed_pixels=cpu_change.changed_pixels,
+        confident_flow=cpu_flow.confident_flow,
         lift=cpu_lift.lift,
         sweep=cpu_sweep.sweep,
         generate_structured=cpu_anchors.generate_structured,
@@ -139,6 +145,7 @@ def cuda_backend() -> Backend:
         reference_anchors,
         reference_change,
         reference_excess,
+        reference_flow,
         reference_lift,
         reference_neighbours,
         reference_raster,
@@ -164,6 +171,7 @@ def cuda_backend() -> Backend:
         excess=reference_excess.excess,
         neighbour_difference=reference_neighbours.neighbour_difference,
         changed_pixels=reference_change.changed_pixels,
+        confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
         generate_structured=reference_anchors.generate_structured,

@@ -140,6 +140,26 @@ class ChangedPixels(Protocol):
     def __call__(self, before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor: ...
 
 
+class ConfidentFlow(Protocol):
+    """Maps ``[3, H, W]`` of c, c flow_x and c flow_y, where c is 1 if flow there and back agree (forward-backward
+    consistency, Sundaram et al., 2010), else 0.
+
+    With ``f`` the flow and ``b`` the flow back: ``|f(p) + b(p + f(p))|^2 <= relative (|f(p)|^2 + |b(p + f(p))|^2) +
+    absolute``, and ``p + f(p)`` lies inside the outermost pixel centres. Tensors are on the CPU, where flow is found.
+
+    Args:
+        flow: ``[H, W, 2]`` float32, pixels.
+        back: ``[H, W, 2]`` float32, from the second picture to the first.
+        mask: ``[H, W]`` bool, c is 0 elsewhere; None for all pixels.
+        relative: share of the squared lengths.
+        absolute: squared pixels.
+    """
+
+    def __call__(
+        self, flow: Tensor, back: Tensor, mask: Tensor | None, *, relative: float, absolute: float
+    ) -> Tensor: ...
+
+
 class Lift(Protocol):
     """For each of ``T`` targets the 3D displacement d that fits its neighbours' optical flow in all views.
 

@@ -1,20 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """Optical flow of a training camera as maps to be summed by blending weights."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from structgstream.errors import MissingExtraError
-from structgstream.flow import consistency_mask, dis_search
+from structgstream.flow import ABSOLUTE, RELATIVE, dis_search
+from structgstream.kernels.backend import Backend
 from structgstream.training.views import area_mean
 
 CONTEXT_PIXELS = 16
 """Margin in pixels around the bounding box of the changed pixels, in which flow is estimated."""
 LEAST_SAVING = 0.8
 """Boxes around parts have to be together smaller than this share of the box around all."""
+
+
+@dataclass(frozen=True)
+class FlowConfig:
+    """How finely flow is searched (``flow.dis_search``)."""
+
+    finest_level: int = 1
+    """Of the search's pyramid: 0 is the size of the pictures, 1 half of it."""
+    apart: bool = False
+    """Search in a box for each part of a picture that changed, instead of one around all: quicker where things move far
+    from each other."""
 
 
 def flow_map(
@@ -24,13 +37,13 @@ def flow_map(
     size: tuple[int, int],
     *,
     mask: Tensor | None = None,
-    finest_level: int = 1,
-    apart: bool = False,
+    config: FlowConfig,
+    backend: Backend,
 ) -> Tensor:
     """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
 
-    c is the share of consistent pixels (``flow.consistency_mask``), zero outside a box around
-    ``changed``, or with ``apart`` outside boxes around its parts, where these are small.
+    c is the share of consistent pixels (``kernels.operations.ConfidentFlow``), zero outside a box around ``changed``,
+    or with ``config.apart`` outside boxes around its parts, where these are small.
 
     Args:
         first: ``[H, W, 3]`` uint8.
@@ -38,33 +51,31 @@ def flow_map(
         changed: ``[H, W]`` bool, where the two differ.
         size: h and w of the maps; flow is in pixels of the pictures.
         mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
-        finest_level: of the flow search's pyramid (``flow.dis_search``).
-        apart: search in a box for each part, which takes less time where things move far from each other.
+        config: of the search.
+        backend: the compute back-end.
     """
-    height, width = changed.shape
-    maps = torch.zeros(height, width, 3)
-    for rows, columns in _boxes(changed) if apart else _box(changed):
-        search = dis_search("capture", refined=False, finest_level=finest_level)
+    maps = torch.zeros(3, *changed.shape)
+    search = dis_search("capture", refined=False, finest_level=config.finest_level)
+    where = changed.numpy(force=True)
+    for rows, columns in _boxes(where) if config.apart else _box(where):
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
-        forward, backward = search(earlier, later), search(later, earlier)
-        confidence = consistency_mask(forward, backward).astype(np.float32)[..., None]
-        if mask is not None:
-            confidence *= mask[rows, columns, None].numpy(force=True)
-        maps[rows, columns] = torch.from_numpy(np.concatenate([confidence, confidence * forward], axis=-1))
-    small = area_mean(maps.permute(2, 0, 1)[None], size)
-    return small[0].permute(1, 2, 0).to(first.device)
+        forward, back = (torch.from_numpy(search(*pair)) for pair in ((earlier, later), (later, earlier)))
+        counts = None if mask is None else mask[rows, columns].cpu()
+        maps[:, rows, columns] = backend.confident_flow(forward, back, counts, relative=RELATIVE, absolute=ABSOLUTE)
+    return area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device)
 
 
 Box = tuple[slice, slice]
+Mask = NDArray[np.bool_]
 
 
-def _box(mask: Tensor) -> list[Box]:
+def _box(mask: Mask) -> list[Box]:
     """Bounding box of the mask ``[H, W]`` with margin; none if it is empty or too small for the flow search."""
     if not mask.any():
         return []
     spans = []
     for axis in (1, 0):
-        hit = mask.any(axis).nonzero()[:, 0]
+        hit = np.flatnonzero(mask.any(axis))
         low, high = int(hit[0]) - CONTEXT_PIXELS, int(hit[-1]) + 1 + CONTEXT_PIXELS
         spans.append(slice(max(0, low), min(mask.shape[1 - axis], high)))
     if min(span.stop - span.start for span in spans) < 2 * CONTEXT_PIXELS:
@@ -72,18 +83,30 @@ def _box(mask: Tensor) -> list[Box]:
     return [(spans[0], spans[1])]
 
 
-def _boxes(mask: Tensor) -> list[Box]:
+def _boxes(mask: Mask) -> list[Box]:
     """Disjoint boxes with margin around the parts of the mask ``[H, W]``; one around all if that is hardly larger."""
     one = _box(mask)
-    cells = max_pool2d(mask[None, None].float(), CONTEXT_PIXELS, ceil_mode=True)
-    near = max_pool2d(cells, 3, stride=1, padding=1)[0, 0].bool().numpy(force=True)
-    found = [_pixels(box, mask) for box in _parts(near)]
+    rows, columns = (-(-length // CONTEXT_PIXELS) for length in mask.shape)
+    padded = np.zeros((rows * CONTEXT_PIXELS, columns * CONTEXT_PIXELS), bool)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    cells = padded.reshape(rows, CONTEXT_PIXELS, columns, CONTEXT_PIXELS).max((1, 3))
+    found = [_pixels(box, mask) for box in _parts(_dilated(cells))]
     if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
         return one
     return [box for box in found if min(span.stop - span.start for span in box) >= 2 * CONTEXT_PIXELS]
 
 
-def _parts(cells: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
+def _dilated(cells: Mask) -> Mask:
+    """``cells`` and the eight around each."""
+    height, width = cells.shape
+    around = np.zeros((height + 2, width + 2), bool)
+    for row in range(3):
+        for column in range(3):
+            around[row : row + height, column : column + width] |= cells
+    return around[1:-1, 1:-1]
+
+
+def _parts(cells: Mask) -> list[tuple[int, int, int, int]]:
     """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells``."""
     try:
         import cv2
@@ -110,7 +133,7 @@ def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -
     return one[0] < other[1] and other[0] < one[1] and one[2] < other[3] and other[2] < one[3]
 
 
-def _pixels(box: tuple[int, int, int, int], mask: Tensor) -> Box:
+def _pixels(box: tuple[int, int, int, int], mask: Mask) -> Box:
     top, bottom, left, right = (CONTEXT_PIXELS * edge for edge in box)
     return slice(top, min(bottom, mask.shape[0])), slice(left, min(right, mask.shape[1]))
 

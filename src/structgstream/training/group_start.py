@@ -28,6 +28,7 @@ from structgstream.training.picture_change import PictureChange
 from structgstream.training.renewal import renew_free_gaussians
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
+from structgstream.training.stragglers import StragglerConfig, recall_stragglers
 from structgstream.training.views import View
 
 USUAL_FRAMES = 7
@@ -45,6 +46,8 @@ class GroupStartConfig:
     """Rounds of flow, births and iterations."""
     flow_rounds: int = 1
     """Displacements by flow from the rendering to the pictures before the iterations of a round. Each adds noise."""
+    stragglers: StragglerConfig = StragglerConfig()
+    """Anchors that tracking lost."""
     births: int = 2000
     """Largest number of births in a round: content that came since frame 0."""
     coherence_share: float = 0.25
@@ -99,8 +102,8 @@ def fit_group_start(
     def fit_with(fit: FrameFit) -> FitResult[Scene]:
         rounds = _Rounds(fit, start, scene, views, changes, floor)
         current, results = with_displacements(scene, displacements), []
-        for _ in range(start.rounds):
-            results.append(rounds.run(current))
+        for number in range(start.rounds):
+            results.append(rounds.run(current, again=number > 0))
             current = results[-1].scene
         return _together(results)
 
@@ -127,12 +130,15 @@ class _Rounds:
     changes: list[PictureChange | None]
     floor: ResidualFloor | None
 
-    def run(self, current: Scene) -> FitResult[Scene]:
-        """One round from ``current``, whose anchors are those of frame 0."""
+    def run(self, current: Scene, *, again: bool) -> FitResult[Scene]:
+        """One round from ``current``, whose anchors are those of frame 0; ``again`` if it is not the first."""
         fit, config, backend = self.fit, self.fit.config, self.fit.backend
         with fit.watch.stage("find motion"):
             partition = self._partition(current)
             trusted = [self.views[number] for number in partition.segmentation.trusted]
+        with fit.watch.stage("recall stragglers"):
+            # What the first round's flow and iterations have found needs no help.
+            partition, recalled = self._recalled(partition, trusted) if again else (partition, 0)
         with fit.watch.stage("start motion"):
             displaced, lifted = self._displaced(partition, trusted)
             focuses = focus_views(displaced, trusted, config=config.motion, backend=backend)
@@ -164,7 +170,7 @@ class _Rounds:
             scene=displaced.merge(result.scene),
             pruned=result.pruned + int((~new.kept).sum()),
             spawned=result.spawned + len(new.new_free),
-            counts={"corrected": lifted, **new.counts},
+            counts={"corrected": lifted, "recalled": recalled, **new.counts},
         )
 
     def _partition(self, current: Scene) -> Partition:
@@ -175,6 +181,22 @@ class _Rounds:
         )
         away = (current.anchors.positions != self.first.anchors.positions).any(1)
         return Partition.of(current, replace(found, anchors=found.anchors | away, free=~found.unseen))
+
+    def _recalled(self, partition: Partition, views: list[View]) -> tuple[Partition, int]:
+        """``partition`` with its stragglers where their neighbours are; how many they are."""
+        fit, config = self.fit, self.fit.config
+        moving, count = recall_stragglers(
+            partition.moving,
+            self.first.anchors.select(partition.segmentation.anchors),
+            views,
+            focus_views(partition, views, config=config.motion, backend=fit.backend),
+            floor=self.floor,
+            least_pixels=config.motion.least_pixels,
+            births=config.births,
+            config=self.start.stragglers,
+            backend=fit.backend,
+        )
+        return replace(partition, moving=moving), count
 
     def _displaced(self, partition: Partition, views: list[View]) -> tuple[Partition, int]:
         """``partition`` after rounds of flow from its rendering to the pictures; how many movers flow displaced."""

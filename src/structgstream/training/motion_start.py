@@ -16,7 +16,7 @@ from torch import Tensor
 from structgstream.kernels.backend import Backend
 from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
-from structgstream.training.flow_maps import flow_map
+from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.lifting import LiftConfig, LiftedMotion, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
 from structgstream.training.observation import flow_evidence, gather_maps, mover_centers, sum_by_mover
@@ -144,7 +144,7 @@ def residual_motion(
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)
             counting = torch.ones(size) if small.mask is None else small.mask
-            flow = flow_map(picture, view.image, inside, size, mask=view.mask)
+            flow = flow_map(picture, view.image, inside, size, mask=view.mask, config=FlowConfig(), backend=backend)
             maps = [flow, counting[..., None].to(image), small.colors]
             found = gather_maps(gaussians, folded, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
             found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])

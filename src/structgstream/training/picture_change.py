@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.training.flow_maps import flow_map
+from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.views import View, blackened
 
 
@@ -40,8 +40,7 @@ def detect_picture_changes(
     scale: float,
     backend: Backend,
     flow_from: Collection[int] = (),
-    finest_level: int = 1,
-    apart: bool = False,
+    flow: FlowConfig | None = None,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -56,8 +55,7 @@ def detect_picture_changes(
         scale: of the maps of flow, relative to the pictures.
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
-        finest_level: of the flow search's pyramid (``flow.dis_search``).
-        apart: search for flow in a box for each part that changed (``flow_maps.flow_map``).
+        flow: how it is searched; None as usual.
     """
     changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
@@ -71,12 +69,12 @@ def detect_picture_changes(
             then, now = blackened(last.image, both), blackened(view.image, both)
             changed = backend.changed_pixels(then, now, threshold=threshold, reach_pixels=reach_pixels)
             changed = changed if both is None else changed & both
-            small, flow = view.reduced(scale).camera, None
+            small, found = view.reduced(scale).camera, None
             if view.index in flow_from:
                 size = (small.height, small.width)
-                maps = flow_map(then, now, changed, size, mask=both, finest_level=finest_level, apart=apart)
-                flow = torch.cat([maps, last.reduced(scale).colors], dim=-1)
-            changes.append(PictureChange(changed, torch.equal(then, now), flow))
+                maps = flow_map(then, now, changed, size, mask=both, config=flow or FlowConfig(), backend=backend)
+                found = torch.cat([maps, last.reduced(scale).colors], dim=-1)
+            changes.append(PictureChange(changed, torch.equal(then, now), found))
     return changes
 
 

@@ -20,11 +20,11 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.scene.scene import Scene
-from structgstream.training.flow_maps import flow_map
+from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.lifting import LiftConfig, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
 from structgstream.training.motion_start import with_displacements
-from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
+from structgstream.training.observation import MotionEvidence, flow_evidence, mover_centers, slot_count
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
 from structgstream.training.residuals import apply_camera_color
 from structgstream.training.stopwatch import Stopwatch
@@ -42,10 +42,8 @@ class TrackConfig:
     """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
-    finest_level: int = 1
-    """Of the flow search's pyramid: 0 is the size of these pictures, 1 half of it."""
-    apart: bool = True
-    """Search for flow in a box for each part of a picture that changed, instead of one around all."""
+    flow: FlowConfig = FlowConfig(apart=True)
+    """How flow is searched."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
     correct_every: int = 2
@@ -107,8 +105,7 @@ class Tracker:
             scale=self.config.picture_scale,
             backend=self.backend,
             flow_from=[view.index for view in taken],
-            finest_level=self.config.finest_level,
-            apart=self.config.apart,
+            flow=self.config.flow,
         )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
@@ -157,18 +154,16 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             movers = (votes >= tracker.motion.least_views).nonzero()[:, 0]
         with watch.stage("flow between pictures"):
             views = [entry.view for entry in seen]
-            evidence = _evidence([entry.flows for entry in seen])
-            centers = mover_centers(scene, torch.stack([entry.coverage for entry in seen]).sum(0))
+            evidence = _evidence([entry.flows[movers] for entry in seen])
+            centers = mover_centers(scene, _coverage(seen, scene))
             priors, lift = tracker.config.prior * past.velocities[movers], tracker.lift
-            found = lift_motion(
-                evidence.select(movers), centers[movers], priors, views, config=lift, backend=tracker.backend
-            )
+            found = lift_motion(evidence, centers[movers], priors, views, config=lift, backend=tracker.backend)
             velocities[movers] = found.displacements
         if len(movers) and pictures.index % tracker.config.correct_every == 0:
             with watch.stage("flow from the rendering"):
-                evidence = _evidence([_rendered_flow(tracker, scene, entry, velocities) for entry in seen])
+                flows = [_rendered_flow(tracker, scene, entry, velocities)[movers] for entry in seen]
                 again = lift_motion(
-                    evidence.select(movers),
+                    _evidence(flows),
                     (centers + velocities)[movers],
                     torch.zeros_like(priors),
                     views,
@@ -181,11 +176,13 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
 
 @dataclass(frozen=True)
 class _Seen:
-    """What one camera tells: its Gaussians in changed tiles, votes ``[E]``, coverage by id, and sums of flow."""
+    """What one camera tells: its ``N`` Gaussians in changed tiles, the mover and coverage ``[N]`` of each, votes
+    ``[E]`` and sums of flow ``[E, 7]``."""
 
     view: View
     tiles: TileSelection
     gaussians: Gaussians
+    movers: Tensor
     votes: Tensor
     coverage: Tensor
     flows: Tensor
@@ -201,20 +198,22 @@ def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> 
     inside = area_mean(_counting(tiles, view)[None, None].float(), size)[0, 0]
     part = area_mean(change.changed[None, None].float(), size)[0, 0]
     assert change.flow is not None, "estimated for all that are tracked with"
-    maps = torch.cat([inside[..., None], part[..., None], change.flow], dim=-1)
-    sums = gather_maps(gaussians, scene, small.camera, maps, backend) * _enlarged(tracker, view, size)
-    moved = sum_by_mover(sums, scene)
-    total, changed = moved[:, 0], moved[:, 1]
+    # In the order of the evidence, then the changed part.
+    maps = torch.cat([change.flow[..., :3], inside[..., None], change.flow[..., 3:], part[..., None]], dim=-1)
+    movers = _movers_of(gaussians, scene)
+    sums = backend.blending_weights(gaussians, small.camera.viewport(gaussians.means), maps)
+    sums *= _enlarged(tracker, view, size)
+    moved = _by_mover(sums, movers, scene)
+    total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
-    share = float(change.changed.float().mean())
-    of_view = ViewChange(share, 0.0, identical=change.identical)
-    return _Seen(view, tiles, gaussians, votes, sums[:, 0], moved[:, [2, 3, 4, 0, 5, 6, 7]], of_view)
+    of_view = ViewChange(float(change.changed.float().mean()), 0.0, identical=change.identical)
+    return _Seen(view, tiles, gaussians, movers, votes, sums[:, 3], moved[:, :7], of_view)
 
 
 def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tensor) -> Tensor:
     """Sums ``[E, 7]`` of the flow from the rendering of the displaced movers to the picture."""
     view, backend, gaussians = seen.view, tracker.backend, seen.gaussians
-    moved = replace(gaussians, means=gaussians.means + velocities[_movers_of(gaussians, scene)])
+    moved = replace(gaussians, means=gaussians.means + velocities[seen.movers])
     drawn = backend.rasterize(
         moved, view.camera.viewport(moved.means), background=scene.background(view.camera), tiles=seen.tiles
     )
@@ -225,18 +224,32 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     picture = torch.where(counting[..., None], rendered, view.image)
     small = view.reduced(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    level, apart = tracker.config.finest_level, tracker.config.apart
-    flow = flow_map(picture, view.image, counting, size, mask=counting, finest_level=level, apart=apart)
+    flow = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([flow, inside[..., None], small.colors], dim=-1)
-    sums = gather_maps(moved, scene, small.camera, maps, backend) * _enlarged(tracker, view, size)
-    return sum_by_mover(sums, scene)
+    sums = backend.blending_weights(moved, small.camera.viewport(moved.means), maps)
+    sums *= _enlarged(tracker, view, size)
+    return _by_mover(sums, seen.movers, scene)
 
 
 def _movers_of(gaussians: Gaussians, scene: Scene) -> Tensor:
     """Row of each Gaussian's mover (Note [Movers])."""
     m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
     return torch.where(gaussians.ids < m * k, gaussians.ids // k, gaussians.ids - m * k + m)
+
+
+def _by_mover(sums: Tensor, movers: Tensor, scene: Scene) -> Tensor:
+    """Sums ``[N, C]`` of Gaussians as sums of their movers, ``[M + F, C]``; in the order of the Gaussians."""
+    found = sums.new_zeros(len(scene.anchors) + len(scene.free), sums.shape[1])
+    return found.index_add_(0, movers, sums)
+
+
+def _coverage(seen: Sequence[_Seen], scene: Scene) -> Tensor:
+    """Coverage by id in all views, ``[M * K + F]``."""
+    found = torch.zeros(slot_count(scene)).to(scene.anchors.positions)
+    for entry in seen:
+        found[entry.gaussians.ids] += entry.coverage
+    return found
 
 
 def _evidence(sums: Sequence[Tensor]) -> MotionEvidence:

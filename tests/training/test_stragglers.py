@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An anchor that was left behind and looks wrong goes where its neighbours went."""
+
+from dataclasses import replace
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.scene import Scene
+from structgstream.training.births import BirthConfig
+from structgstream.training.motion import MotionConfig
+from structgstream.training.partition import Partition, focus_views
+from structgstream.training.stragglers import StragglerConfig, recall_stragglers
+from structgstream.training.views import training_views
+from worlds import moved_since, moving_world
+
+SHIFT = 0.4
+WORLD = moving_world(2, cameras=6, speed=SHIFT, width=96, height=64)
+BACKEND = reference_backend()
+CONFIG = StragglerConfig(neighbours=8, feature_bandwidth=5.0)
+
+
+def arrived(*, but: list[int], by: float = 0.0) -> Scene:
+    """The scene as it is in the second frame, with the anchors ``but`` displaced ``by`` of their way only."""
+    shares = torch.ones(60, 1)
+    shares[but] = by
+    anchors = WORLD.scene.anchors
+    shift = torch.tensor([SHIFT, 0.0, 0.0])
+    return replace(WORLD.scene, anchors=replace(anchors, positions=anchors.positions + shares * shift))
+
+
+def recalled(scene: Scene, *, config: StragglerConfig = CONFIG) -> tuple[torch.Tensor, int]:
+    motion = MotionConfig(enabled=True, picture_scale=1.0)
+    first, views = (training_views(WORLD.frames[t], WORLD.rig, BACKEND.device) for t in (0, 1))
+    found = moved_since(scene, views, first, config=motion, backend=BACKEND)
+    partition = Partition.of(scene, replace(found, anchors=torch.ones(60, dtype=torch.bool)))
+    moving, count = recall_stragglers(
+        partition.moving,
+        WORLD.scene.anchors,
+        views,
+        focus_views(partition, views, config=motion, backend=BACKEND),
+        floor=None,
+        least_pixels=motion.least_pixels,
+        births=BirthConfig(enabled=True, picture_width=96),
+        config=config,
+        backend=BACKEND,
+    )
+    return moving.anchors.positions, count
+
+
+def seen_alone() -> int:
+    """An anchor that looks wrong when it is left behind."""
+    for row in range(60):
+        if recalled(arrived(but=[row]))[1] == 1:
+            return row
+    raise AssertionError("no anchor of this world is seen by two cameras")
+
+
+def test_a_straggler_goes_where_its_neighbours_went() -> None:
+    row = seen_alone()
+    positions, count = recalled(arrived(but=[row]))
+    assert count == 1
+    torch.testing.assert_close(positions, arrived(but=[]).anchors.positions, atol=1e-4, rtol=0)
+
+
+def test_what_is_where_it_should_be_stays_bit_for_bit() -> None:
+    everything = arrived(but=[])
+    positions, count = recalled(everything)
+    assert count == 0
+    assert torch.equal(positions, everything.anchors.positions)
+
+
+def test_what_is_a_little_off_is_left_to_the_iterations() -> None:
+    row = seen_alone()
+    wide = replace(CONFIG, least_pixels=1e3)
+    positions, count = recalled(arrived(but=[row]), config=wide)
+    assert count == 0
+    assert torch.equal(positions, arrived(but=[row]).anchors.positions)
+
+
+def test_it_can_be_switched_off() -> None:
+    row = seen_alone()
+    positions, count = recalled(arrived(but=[row]), config=replace(CONFIG, enabled=False))
+    assert count == 0
+    assert torch.equal(positions[row], WORLD.scene.anchors.positions[row])
