@@ -16,6 +16,7 @@ from structgstream.rate_control import RateConfig
 from structgstream.training.births import BirthConfig, ThinBirthConfig
 from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.environment import EnvironmentConfig
+from structgstream.training.flow_maps import FlowConfig
 from structgstream.training.free_space import FreeSpaceConfig
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates
@@ -288,7 +289,7 @@ COMPACT = replace(
     codec="compact",
     online=replace(
         MOTION.online,
-        iterations=125,
+        iterations=140,
         mean_of_last=0.25,
         rates=replace(
             MOTION.online.rates,
@@ -307,7 +308,7 @@ COMPACT = replace(
             tiles_around=1,
             rest_every=3,
         ),
-        start=MotionStartConfig(enabled=True),
+        start=MotionStartConfig(enabled=True, flow=FlowConfig(apart=True)),
         births=BirthConfig(enabled=True, thin=ThinBirthConfig(enabled=True)),
         motion_prior=0.7,
         coherence=CoherenceConfig(weight=8e-4),

@@ -30,6 +30,9 @@ class FlowConfig:
     from each other."""
 
 
+USUAL_FLOW = FlowConfig()
+
+
 def flow_map(
     first: Tensor,
     second: Tensor,

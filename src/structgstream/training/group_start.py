@@ -209,7 +209,7 @@ class _Rounds:
                 seen,
                 focus_views(partition, seen, config=config.motion, backend=fit.backend),
                 scale=config.motion.picture_scale,
-                config=config.start.lift,
+                config=config.start,
                 backend=fit.backend,
             )
             lifted = int(found.lifted.sum())

@@ -18,6 +18,7 @@ from torch.nn.functional import max_pool2d
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, Granularity, fields_of, parameters_of
+from structgstream.training.flow_maps import USUAL_FLOW, FlowConfig
 from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
 from structgstream.training.residuals import ResidualFloor, rendering_residual
@@ -131,6 +132,7 @@ def detect_changes(
     config: MotionConfig,
     backend: Backend,
     flow_from: Collection[int] = (),
+    flow: FlowConfig = USUAL_FLOW,
 ) -> list[PictureChange | None]:
     """:func:`~structgstream.training.picture_change.detect_picture_changes` with the values of ``config``."""
     return detect_picture_changes(
@@ -141,6 +143,7 @@ def detect_changes(
         scale=config.picture_scale,
         backend=backend,
         flow_from=flow_from,
+        flow=flow,
     )
 
 

@@ -36,6 +36,8 @@ class MotionStartConfig:
     views: int = 14
     """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
     every second or third, in turn."""
+    flow: FlowConfig = FlowConfig()
+    """How flow is searched."""
     lift: LiftConfig = field(default_factory=LiftConfig)
 
 
@@ -95,7 +97,7 @@ def estimate_initial_motion(
     focuses = focus_views(moved, views, config=motion, backend=backend)
     if config.rounds > 1:
         second = residual_motion(
-            moved.moving, views_with_flow, focuses, scale=motion.picture_scale, config=config.lift, backend=backend
+            moved.moving, views_with_flow, focuses, scale=motion.picture_scale, config=config, backend=backend
         )
         displacements, corrections = displacements + second.displacements, int(second.lifted.sum())
     return InitialMotion(displacements, focuses, lifted, corrections)
@@ -117,7 +119,7 @@ def residual_motion(
     focuses: Mapping[int, Focus],
     *,
     scale: float,
-    config: LiftConfig,
+    config: MotionStartConfig,
     backend: Backend,
 ) -> LiftedMotion:
     """Remaining displacements of the movers of ``moving``, from the flow of its rendering to the pictures.
@@ -144,7 +146,7 @@ def residual_motion(
             picture = torch.where(inside[..., None], picture, view.image)
             size = (small.camera.height, small.camera.width)
             counting = torch.ones(size) if small.mask is None else small.mask
-            flow = flow_map(picture, view.image, inside, size, mask=view.mask, config=FlowConfig(), backend=backend)
+            flow = flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend)
             maps = [flow, counting[..., None].to(image), small.colors]
             found = gather_maps(gaussians, folded, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
             found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
@@ -154,4 +156,4 @@ def residual_motion(
     if not seen:
         return LiftedMotion(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
     evidence = flow_evidence(sums, least_pixels=FLOW_LEAST_PIXELS, most_pixels=FLOW_MOST_PIXELS)
-    return lift_motion(evidence, mover_centers(moving, coverage), nothing, seen, config=config, backend=backend)
+    return lift_motion(evidence, mover_centers(moving, coverage), nothing, seen, config=config.lift, backend=backend)

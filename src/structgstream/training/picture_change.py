@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.training.flow_maps import FlowConfig, flow_map
+from structgstream.training.flow_maps import USUAL_FLOW, FlowConfig, flow_map
 from structgstream.training.views import View, blackened
 
 
@@ -40,7 +40,7 @@ def detect_picture_changes(
     scale: float,
     backend: Backend,
     flow_from: Collection[int] = (),
-    flow: FlowConfig | None = None,
+    flow: FlowConfig = USUAL_FLOW,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -55,7 +55,7 @@ def detect_picture_changes(
         scale: of the maps of flow, relative to the pictures.
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
-        flow: how it is searched; None as usual.
+        flow: how it is searched.
     """
     changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
@@ -72,7 +72,7 @@ def detect_picture_changes(
             small, found = view.reduced(scale).camera, None
             if view.index in flow_from:
                 size = (small.height, small.width)
-                maps = flow_map(then, now, changed, size, mask=both, config=flow or FlowConfig(), backend=backend)
+                maps = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
                 found = torch.cat([maps, last.reduced(scale).colors], dim=-1)
             changes.append(PictureChange(changed, torch.equal(then, now), found))
     return changes

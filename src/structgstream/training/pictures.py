@@ -52,4 +52,5 @@ def pictures_of(
     if len(compared) < min(motion.least_views, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, start)
-    return FramePictures(views, detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from))
+    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.flow)
+    return FramePictures(views, changes)
