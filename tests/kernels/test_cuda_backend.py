@@ -9,23 +9,25 @@ import pytest
 import torch
 
 from structgstream.cli import doctor
-from structgstream.kernels import _nvcc, backend, cuda, cuda_ssim, reference_ssim
+from structgstream.kernels import _nvcc, backend, cuda, reference_anchors, reference_ssim
+from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.prototypes import CUDA_PROTOTYPES
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_loss_is_the_kernels_or_says_why_not(
+def test_own_operations_are_the_kernels_or_it_says_why_not(
     compiled: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
-    library = cuda_ssim.LossLibrary(functions, "cuda", lambda device: 0) if compiled else None
+    library = KernelLibrary(functions, "cuda", lambda device: 0) if compiled else None
     monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    monkeypatch.setattr(_nvcc, "loss_library", lambda: (library, "this is why"))
+    monkeypatch.setattr(_nvcc, "kernel_library", lambda: (library, "this is why"))
     with caplog.at_level(logging.INFO):
         found = backend.cuda_backend()
     assert found.name == "cuda"
     assert found.device == torch.device("cuda")
     assert (found.l1_ssim is reference_ssim.l1_ssim) is not compiled
+    assert (found.generate_structured is reference_anchors.generate_structured) is not compiled
     assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
         (logging.INFO if compiled else logging.WARNING, "this is why")
     ]
@@ -36,5 +38,5 @@ def test_doctor_tells_what_the_loss_runs_on(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(_nvcc, "find_nvcc", lambda environment: None)
     first = doctor.diagnose()["backends"][0]
     assert first["name"] == "cuda"
-    assert first["advice"].startswith("L1 and SSIM run in torch")
+    assert first["advice"].startswith("L1, SSIM, anchors, sweeps and tile lists run in torch")
     assert "put nvcc on PATH" in first["advice"]

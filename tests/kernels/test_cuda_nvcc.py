@@ -10,6 +10,7 @@ import torch
 
 from structgstream.errors import BackendError
 from structgstream.kernels import _nvcc
+from structgstream.kernels.prototypes import CUDA_PROTOTYPES
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 NVCC = _nvcc.find_nvcc(os.environ)
@@ -35,7 +36,7 @@ def test_the_sources_compile(architecture: str, tmp_path: Path) -> None:
     assert NVCC is not None
     path = _nvcc.compiled(architecture, nvcc=NVCC, sources=SOURCES, cache=tmp_path)
     library = ctypes.CDLL(str(path))  # CUDA's runtime is linked in, so it loads without a GPU.
-    for name in ("sgs_cuda_l1_ssim", "sgs_cuda_l1_ssim_backward", "sgs_cuda_error"):
+    for name in CUDA_PROTOTYPES:
         assert hasattr(library, name)
     library.sgs_cuda_error.restype = ctypes.c_char_p
     assert library.sgs_cuda_error(ctypes.c_int(1)) == b"invalid argument"
@@ -45,7 +46,9 @@ def test_the_sources_are_installed() -> None:
     installed = _nvcc.source_folder()
     if not installed.is_dir():
         pytest.skip("structgstream was not installed from its wheel or by cmake --install")
-    assert {path.name for path in SOURCES.glob("ssim*")} == {path.name for path in installed.iterdir()}
+    assert {path.name for path in SOURCES.iterdir() if not path.name.startswith("emulate")} == {
+        path.name for path in installed.iterdir()
+    }
 
 
 def test_a_library_is_compiled_once_until_something_changes(tmp_path: Path) -> None:
@@ -102,9 +105,9 @@ def test_without_kernels_it_says_why(found: bool, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(_nvcc, "source_folder", lambda: SOURCES)
     monkeypatch.setattr(_nvcc, "cache_folder", lambda environment: tmp_path / "cache")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
-    _nvcc.loss_library.cache_clear()
-    library, sentence = _nvcc.loss_library()
-    _nvcc.loss_library.cache_clear()
+    _nvcc.kernel_library.cache_clear()
+    library, sentence = _nvcc.kernel_library()
+    _nvcc.kernel_library.cache_clear()
     assert library is None
-    assert sentence.startswith("L1 and SSIM run in torch")
+    assert sentence.startswith("L1, SSIM, anchors, sweeps and tile lists run in torch")
     assert ("no host compiler" if found else "put nvcc on PATH") in sentence

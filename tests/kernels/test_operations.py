@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from rigs import arc_rig, random_scene
-from structgstream.kernels import _nvcc, cuda, cuda_anchors, cuda_ssim, operations
+from structgstream.kernels import _nvcc, cuda, cuda_anchors, operations
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, nonblocking, reference_backend
+from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.prototypes import CUDA_PROTOTYPES
 from structgstream.kernels.raster_types import TileSelection, tile_grid
@@ -82,9 +83,9 @@ def refused_by_the_type_checker(backend: Backend) -> None:
 @pytest.fixture
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
-    library = cuda_ssim.LossLibrary(functions, "cuda", lambda device: 0)
+    library = KernelLibrary(functions, "cuda", lambda device: 0)
     monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    monkeypatch.setattr(_nvcc, "loss_library", lambda: (library, "compiled"))
+    monkeypatch.setattr(_nvcc, "kernel_library", lambda: (library, "compiled"))
 
 
 def cuda_without_waiting() -> Backend:

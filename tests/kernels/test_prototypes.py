@@ -11,7 +11,11 @@ from structgstream.kernels._load import native_library, native_reason
 from structgstream.kernels.prototypes import CUDA_PROTOTYPES, PROTOTYPES, TYPES
 
 SOURCES = Path(__file__).parents[2] / "csrc"
-HEADERS = {"include/structgstream.h": PROTOTYPES, "cuda/ssim.h": CUDA_PROTOTYPES}
+HEADERS = {"structgstream.h": PROTOTYPES, "cuda": CUDA_PROTOTYPES}
+FILES = {
+    "structgstream.h": ["include/structgstream.h"],
+    "cuda": ["cuda/ssim.h", "cuda/anchors.h", "cuda/sweep.h", "cuda/tiles.h"],
+}
 LETTERS = {"int": "i", "int64_t": "l", "float": "f", "double": "d", "void": "v"}
 
 
@@ -24,7 +28,8 @@ def letter(declaration: str) -> str:
 
 def code_of(header: str) -> str:
     """Without its comments."""
-    return re.sub(r"/\*.*?\*/", "", (SOURCES / header).read_text(), flags=re.DOTALL)
+    text = "".join((SOURCES / name).read_text() for name in FILES[header])
+    return re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
 
 
 def declared(header: str) -> dict[str, tuple[str, str]]:

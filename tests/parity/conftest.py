@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instruction sets that this machine can run the kernels on."""
+"""The instruction sets that this machine can run the kernels on, and the CUDA kernels run on a processor."""
 
-from collections.abc import Iterator
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
 from structgstream.kernels._load import ISA_NAMES, native_library
+from structgstream.kernels.cuda_library import KernelLibrary
+
+SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 
 
 @pytest.fixture(params=range(len(ISA_NAMES)), ids=ISA_NAMES)
@@ -17,3 +24,16 @@ def isa(request: pytest.FixtureRequest) -> Iterator[int]:
     library.sgs_use_isa(request.param)
     yield request.param
     library.sgs_use_isa(len(ISA_NAMES))
+
+
+@pytest.fixture(scope="session")
+def emulation(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], KernelLibrary]:
+    """The interface of the CUDA kernels on the processor; the argument says in which order threads run (0 or 1)."""
+    compiler = shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("no C++ compiler to build the emulation with")
+    built = tmp_path_factory.mktemp("cuda") / "emulation.so"
+    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    subprocess.run([compiler, *flags, "-o", built, *sorted(SOURCES.glob("emulate_*.cpp"))], check=True)
+    library = ctypes.CDLL(str(built))
+    return lambda order: KernelLibrary(library, "cpu", lambda device: order)

@@ -18,8 +18,9 @@ def test_steps(device: str, shape: tuple[int, ...]) -> None:
     gradients = [torch.randn_like(param) * 1e-6 * (torch.rand_like(param) < 0.8) for _ in range(10)]
     ours, exact = steps(cuda_adam, param, gradients), steps(reference_adam, param.double(), gradients)
     assert torch.allclose(ours[0].double(), exact[0], rtol=1e-6, atol=1e-6)
-    for moment, wanted in zip(ours[1:], exact[1:], strict=True):
-        assert (moment.double() - wanted).norm() <= 1e-6 * wanted.norm()
+    # On a GPU torch takes 1 - beta in float32, which for the second moment is 1.3e-5 too little.
+    for moment, wanted, tolerance in zip(ours[1:], exact[1:], (1e-6, 1e-6 if device == "cpu" else 2e-5), strict=True):
+        assert (moment.double() - wanted).norm() <= tolerance * wanted.norm()
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -14,6 +14,7 @@ from torch import Tensor
 from splats import splats_of, viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, reference_raster
+from structgstream.kernels._nvcc import kernel_library
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.operations import Rasterize
 from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
@@ -195,11 +196,14 @@ def test_a_budget_that_is_too_small_says_so() -> None:
 
 @pytest.mark.needs_cuda
 @pytest.mark.parametrize("tiled", [False, True])
-def test_with_a_budget_gsplat_draws_the_same(tiled: bool) -> None:
+@pytest.mark.parametrize("kernels", [False, True])
+def test_with_a_budget_gsplat_draws_the_same(tiled: bool, kernels: bool) -> None:
     values, budget = splats("cuda"), PairBudget.of(PAIRS, torch.device("cuda"))
     options = {"tiles": asked("cuda")} if tiled else {}
+    library = kernel_library()[0] if kernels else None
+    assert (library is not None) is kernels
     plain, plain_gradients = run(cuda.rasterize, values, **options)
-    ours, gradients = run(partial(cuda.rasterize, budget=budget), values, **options)
+    ours, gradients = run(partial(cuda.rasterize, budget=budget, library=library), values, **options)
     assert 30 < int(budget.needed) < PAIRS
     assert all(torch.equal(a, b) for a, b in zip(ours, plain, strict=True))
     for got, truth in zip(gradients, plain_gradients, strict=True):  # gsplat adds gradients in any order
@@ -210,10 +214,12 @@ def test_with_a_budget_gsplat_draws_the_same(tiled: bool) -> None:
 def test_with_a_budget_nothing_waits_for_the_gpu() -> None:
     values, budget = splats("cuda"), PairBudget.of(PAIRS, torch.device("cuda"))
     leaves = [value.requires_grad_() for value in values]
-    splats_, view = splats_of(*leaves[:5]), camera(values[0])
+    splats_, view, tiles = splats_of(*leaves[:5]), camera(values[0]), asked("cuda")
 
     def once() -> None:
-        output = cuda.rasterize(splats_, view, screen_offsets=leaves[5], budget=budget)
+        output = cuda.rasterize(
+            splats_, view, screen_offsets=leaves[5], budget=budget, library=kernel_library()[0], tiles=tiles, trained=20
+        )
         torch.autograd.grad(output.image.sum(), leaves)
 
     once()  # the kernels are loaded

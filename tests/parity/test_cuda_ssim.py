@@ -3,13 +3,9 @@
 is a GPU, the kernels themselves.
 """
 
-import ctypes
-import shutil
-import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,23 +15,10 @@ from torch import Tensor
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_ssim, cuda_ssim, reference_ssim
 from structgstream.kernels._load import native_reason
+from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.raster_types import TileSelection, tile_grid
 
-SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 Loss = Callable[..., tuple[Tensor, Tensor]]
-
-
-@pytest.fixture(scope="module")
-def emulation(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], cuda_ssim.LossLibrary]:
-    """The interface of the kernels on the processor; the argument says in which order threads run (0 or 1)."""
-    compiler = shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("no C++ compiler to build the emulation with")
-    built = tmp_path_factory.mktemp("cuda") / "emulation.so"
-    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
-    subprocess.run([compiler, *flags, "-o", built, SOURCES / "emulate_ssim.cpp"], check=True)
-    library = ctypes.CDLL(str(built))
-    return lambda order: cuda_ssim.LossLibrary(library, "cpu", lambda device: order)
 
 
 @pytest.fixture(params=["emulated", pytest.param("cuda", marks=pytest.mark.needs_cuda)])
@@ -146,7 +129,7 @@ def test_repeats_bit_for_bit(loss: Loss) -> None:
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_within_a_phase_threads_may_run_in_any_order(emulation: Callable[[int], cuda_ssim.LossLibrary]) -> None:
+def test_within_a_phase_threads_may_run_in_any_order(emulation: Callable[[int], KernelLibrary]) -> None:
     image, target = pictures(45, 120)
     tiles = TileSelection(torch.rand(tile_grid(120, 45)) < 0.5, 120, 45)
     forth, back = (
@@ -156,7 +139,7 @@ def test_within_a_phase_threads_may_run_in_any_order(emulation: Callable[[int], 
     assert all(torch.equal(a, b) for a, b in zip(forth, back, strict=True))
 
 
-def test_what_it_cannot_compare(loss: Loss, emulation: Callable[[int], cuda_ssim.LossLibrary]) -> None:
+def test_what_it_cannot_compare(loss: Loss, emulation: Callable[[int], KernelLibrary]) -> None:
     image, target = pictures(8, 8)
     with pytest.raises(BackendError, match="float64"):
         loss(image.double(), target)

@@ -1,17 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tile lists of fixed size beside lists made one Gaussian at a time. It is plain torch: the processor tells as well."""
+"""Tile lists of fixed size beside lists made one Gaussian at a time: those in torch and those of the kernels, whose
+functions run on the processor, too.
+"""
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget, tile_lists
-from structgstream.kernels.raster_types import TILE_PIXELS, tile_grid
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.cuda_tiles import (
+    PairBudget,
+    TileLists,
+    radii_reaching_tiles,
+    run_with_pair_budget,
+    tile_lists,
+    tile_lists_in_kernels,
+)
+from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.reference_raster import boxes_reaching_tiles
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+Listed = Callable[..., TileLists]
+
+
+@pytest.fixture(params=["torch", "kernels"])
+def listed(request: pytest.FixtureRequest, device: str) -> Listed:
+    """The lists in torch or of the kernels, of tensors of ``device``."""
+    return tile_lists if request.param == "torch" else partial(tile_lists_in_kernels, kernels_of(device, request))
+
+
+def kernels_of(device: str, request: pytest.FixtureRequest) -> KernelLibrary:
+    """The kernels, or on the processor their emulation."""
+    if device == "cpu":
+        return request.getfixturevalue("emulation")(0)
+    from structgstream.kernels._nvcc import kernel_library
+
+    library, reason = kernel_library()
+    assert library is not None, reason
+    return library
 
 
 def splats(count: int, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -51,14 +83,14 @@ def found(starts: Tensor, ids: Tensor) -> list[list[int]]:
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("size", [(75, 53), (64, 32), (5, 3)])
-def test_each_tile_lists_its_gaussians_front_to_back(device: str, size: tuple[int, int]) -> None:
+def test_each_tile_lists_its_gaussians_front_to_back(listed: Listed, device: str, size: tuple[int, int]) -> None:
     width, height = size
     values = splats(120, width, height)
     exact = expected(*values, width, height)
     count = sum(map(len, exact))
     assert count > 20
     for capacity in (count, count + 500):
-        lists = tile_lists(*(value.to(device) for value in values), width=width, height=height, capacity=capacity)
+        lists = listed(*(value.to(device) for value in values), width=width, height=height, capacity=capacity)
         rows, columns = tile_grid(width, height)
         assert lists.starts.shape == (rows + 1, columns)
         assert lists.starts.dtype == lists.ids.dtype == torch.int32
@@ -72,26 +104,52 @@ def test_each_tile_lists_its_gaussians_front_to_back(device: str, size: tuple[in
         assert lists.ids.max() < 120
 
 
-def test_of_too_many_the_nearest_stay() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_of_too_many_the_nearest_stay(listed: Listed, device: str) -> None:
     means2d, radii = torch.full((50, 2), 8.0), torch.full((50, 2), 2, dtype=torch.int32)
     depths = torch.arange(50.0).flip(0) + 1.0
-    lists = tile_lists(means2d, radii, depths, width=16, height=16, capacity=20)
+    lists = listed(*(value.to(device) for value in (means2d, radii, depths)), width=16, height=16, capacity=20)
     assert int(lists.needed) == 50
     assert found(lists.starts, lists.ids)[0] == list(range(49, 29, -1))
 
 
-def test_nothing_is_drawn() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_nothing_is_drawn(listed: Listed, device: str) -> None:
     means2d, radii = torch.full((4, 2), torch.nan), torch.zeros(4, 2, dtype=torch.int32)
-    lists = tile_lists(means2d, radii, torch.full((4,), torch.nan), width=40, height=20, capacity=10)
+    depths = torch.full((4,), torch.nan)
+    lists = listed(*(value.to(device) for value in (means2d, radii, depths)), width=40, height=20, capacity=10)
     assert int(lists.needed) == 0
     assert [len(ids) for ids in found(lists.starts, lists.ids)[:6]] == [0] * 6
 
 
-def test_a_picture_with_more_tiles_than_a_short_number_holds() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_picture_with_more_tiles_than_a_short_number_holds(listed: Listed, device: str) -> None:
     width, height = 200 * TILE_PIXELS, 170 * TILE_PIXELS
     means2d, radii = torch.tensor([[width - 1.0, height - 1.0]]), torch.ones(1, 2, dtype=torch.int32)
-    lists = tile_lists(means2d, radii, torch.ones(1), width=width, height=height, capacity=3)
+    lists = listed(*(v.to(device) for v in (means2d, radii, torch.ones(1))), width=width, height=height, capacity=3)
     assert found(lists.starts, lists.ids)[200 * 170 - 1] == [0]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_radii_of_those_that_reach_a_tile(device: str, request: pytest.FixtureRequest) -> None:
+    means2d, radii, _ = splats(400, 75, 53)
+    means2d = means2d.nan_to_num(1e30)
+    tiles = TileSelection(torch.rand(tile_grid(75, 53)) < 0.2, 75, 53)
+    reaching = boxes_reaching_tiles(means2d - radii, means2d + radii, tiles)
+    exact = torch.where(reaching & (radii > 0).all(1), radii.amax(1).float(), 0.0)
+    there = replace(tiles, mask=tiles.mask.to(device))
+    given = (radii * (radii > 0).all(1, keepdim=True)).to(torch.int32)  # gsplat's radii are both 0, or none is
+    ours = radii_reaching_tiles(kernels_of(device, request), means2d.to(device), given.to(device), there)
+    assert torch.equal(ours.cpu(), exact)
+    assert 20 < int((exact > 0).sum()) < int((given > 0).all(1).sum())
+
+
+def test_places_need_no_order(emulation: Callable[[int], KernelLibrary]) -> None:
+    values = splats(80, 75, 53)
+    one, other = (
+        tile_lists_in_kernels(emulation(order), *values, width=75, height=53, capacity=3000) for order in (0, 1)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def test_a_budget_remembers_the_worst_picture() -> None:

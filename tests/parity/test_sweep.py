@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sweep along rays: the C++ against the oracle."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import pytest
 import torch
 
 from rigs import arc_rig
-from structgstream.kernels import cpu_sweep, reference_sweep
+from structgstream.kernels import cpu_sweep, cuda_sweep, reference_sweep
 from structgstream.kernels._load import native_reason
-from structgstream.kernels.motion_types import SweepView
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.motion_types import SweepView, Swept
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -44,10 +49,36 @@ def rays(seed: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
 RULES = {"planes": 17, "least_supports": 2, "most_contradictions": 0.34}
 
 
-@needs_native
+@pytest.fixture(
+    params=[
+        pytest.param("cpu", marks=needs_native),
+        "emulated",
+        pytest.param("cuda", marks=pytest.mark.needs_cuda),
+    ]
+)
+def sweep(request: pytest.FixtureRequest) -> Callable[..., Swept]:
+    """A sweep in float32, of the C++, of the CUDA functions on a processor, or of a GPU; on the processor's tensors."""
+    if request.param == "cpu":
+        return cpu_sweep.sweep
+    if request.param == "emulated":
+        return partial(cuda_sweep.sweep, request.getfixturevalue("emulation")(0))
+    from structgstream.kernels._nvcc import kernel_library
+
+    library, reason = kernel_library()
+    assert library is not None, reason
+
+    def there(given: list[SweepView], view_index: int, *tensors: torch.Tensor, **rules: Any) -> Swept:
+        every: list[dict[str, Any]] = [vars(view) for view in given]
+        moved = [SweepView(**{k: v.cuda() if k != "near" else v for k, v in view.items()}) for view in every]
+        found = cuda_sweep.sweep(library, moved, view_index, *(t.cuda() for t in tensors), **rules)
+        return Swept(found.depths.cpu(), found.costs.cpu())
+
+    return there
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_cpu_finds_what_the_oracle_finds(seed: int) -> None:
-    found = cpu_sweep.sweep(views(seed, torch.float32), 1, *rays(seed, torch.float32), **RULES)
+def test_it_finds_what_the_oracle_finds(sweep: Callable[..., Swept], seed: int) -> None:
+    found = sweep(views(seed, torch.float32), 1, *rays(seed, torch.float32), **RULES)
     oracle = reference_sweep.sweep(views(seed, torch.float64), 1, *rays(seed, torch.float64), **RULES)
     assert 0 < found.costs.isfinite().sum() < 150, "both kinds of ray"
     # A point may fall on the border of two pixels, where precision decides.
@@ -68,3 +99,10 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
         torch.set_num_threads(threads)
     assert torch.equal(results[0].depths, results[1].depths)
     assert torch.equal(results[0].costs, results[1].costs)
+
+
+def test_the_cuda_elements_need_no_order(emulation: Callable[[int], KernelLibrary]) -> None:
+    given = views(4, torch.float32), 2, *rays(4, torch.float32)
+    one, other = (cuda_sweep.sweep(emulation(order), *given, **RULES) for order in (0, 1))
+    assert torch.equal(one.depths, other.depths)
+    assert torch.equal(one.costs, other.costs)

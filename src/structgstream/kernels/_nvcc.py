@@ -18,10 +18,11 @@ from pathlib import Path
 import torch
 
 from structgstream.errors import BackendError
-from structgstream.kernels.cuda_ssim import LossLibrary, cuda_stream
+from structgstream.kernels.cuda_library import KernelLibrary, cuda_stream
 from structgstream.whole_files import give_name
 
-FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC")
+FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
+_OPERATIONS = "L1, SSIM, anchors, sweeps and tile lists"
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
 
@@ -85,26 +86,26 @@ def _output(command: list[str]) -> str:
     return result.stdout
 
 
-def loss_plan() -> tuple[Path | None, str]:
-    """NVIDIA's compiler or None, and a sentence stating what computes the cuda back-end's loss. Compiles nothing."""
+def kernel_plan() -> tuple[Path | None, str]:
+    """NVIDIA's compiler or None, and a sentence that says what runs the back-end's own operations. Compiles nothing."""
     nvcc = find_nvcc(os.environ)
     if nvcc is None:
         return None, (
-            "L1 and SSIM run in torch, which is slower than this package's kernels: nvcc was not found; install "
+            f"{_OPERATIONS} run in torch, which is slower than this package's kernels: nvcc was not found; install "
             "NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
         )
-    return nvcc, f"L1 and SSIM run in this package's kernels, compiled by {nvcc}."
+    return nvcc, f"{_OPERATIONS} run in this package's kernels, compiled by {nvcc}."
 
 
 @cache
-def loss_library() -> tuple[LossLibrary | None, str]:
-    """The kernels for this machine's GPU or None, and the sentence of :func:`loss_plan`. The first call compiles."""
-    nvcc, sentence = loss_plan()
+def kernel_library() -> tuple[KernelLibrary | None, str]:
+    """The kernels for this machine's GPU or None, and the sentence of :func:`kernel_plan`. The first call compiles."""
+    nvcc, sentence = kernel_plan()
     if nvcc is None:
         return None, sentence
     major, minor = torch.cuda.get_device_capability()
     try:
         path = compiled(f"sm_{major}{minor}", nvcc=nvcc, sources=source_folder(), cache=cache_folder(os.environ))
-        return LossLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream), sentence
+        return KernelLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream), sentence
     except (BackendError, OSError) as error:
-        return None, f"L1 and SSIM run in torch, which is slower than this package's kernels: {error}"
+        return None, f"{_OPERATIONS} run in torch, which is slower than this package's kernels: {error}"

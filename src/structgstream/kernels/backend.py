@@ -134,14 +134,16 @@ def cpu_backend() -> Backend:
 
 
 def cuda_backend() -> Backend:
-    """gsplat's rasteriser and this package's loss on an NVIDIA GPU, torch for the other operations.
+    """gsplat's rasteriser, and this package's loss and generation of Gaussians on an NVIDIA GPU, torch for the rest.
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
     from structgstream.kernels import (
         cuda_adam,
+        cuda_generation,
         cuda_ssim,
+        cuda_sweep,
         reference_anchors,
         reference_change,
         reference_excess,
@@ -153,19 +155,19 @@ def cuda_backend() -> Backend:
         reference_sweep,
         reference_volume,
     )
-    from structgstream.kernels._nvcc import loss_library
+    from structgstream.kernels._nvcc import kernel_library
     from structgstream.kernels.cuda import cuda_reason, rasterize
 
     reason = cuda_reason()
     if reason is not None:
         raise BackendError(reason)
-    library, sentence = loss_library()
+    library, sentence = kernel_library()
     _log.log(logging.WARNING if library is None else logging.INFO, sentence)
     return Backend(
         name="cuda",
         device=torch.device("cuda"),
-        rasterize=rasterize,
-        blending_weights=partial(reference_raster.blending_weights, rasterize),
+        rasterize=partial(rasterize, library=library),
+        blending_weights=partial(reference_raster.blending_weights, partial(rasterize, library=library)),
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         volume=reference_volume.volume,
         excess=reference_excess.excess,
@@ -173,8 +175,10 @@ def cuda_backend() -> Backend:
         changed_pixels=reference_change.changed_pixels,
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
-        sweep=reference_sweep.sweep,
-        generate_structured=reference_anchors.generate_structured,
+        sweep=reference_sweep.sweep if library is None else partial(cuda_sweep.sweep, library),
+        generate_structured=reference_anchors.generate_structured
+        if library is None
+        else partial(cuda_generation.generate_structured, library),
         adam_step=cuda_adam.adam_step,
     )
 
@@ -182,22 +186,27 @@ def cuda_backend() -> Backend:
 def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
     """The cuda back-end with shapes that do not depend on data, so that an iteration has no host synchronisation.
 
-    ``generate_structured`` gives all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]). A picture has
+    ``generate_structured`` gives all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]); it and the
+    tile lists run in this package's kernels if those were compiled, else in torch. A picture has
     at most ``budget.capacity`` (Gaussian, tile) pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]); check
     ``budget.shortage()`` at the end.
 
     Raises:
         BackendError: ``backend`` is not the cuda one.
     """
-    from structgstream.kernels import cuda_anchors
+    from structgstream.kernels import cuda_anchors, cuda_generation
+    from structgstream.kernels._nvcc import kernel_library
     from structgstream.kernels.cuda import rasterize
 
     if backend.name != "cuda":
         raise BackendError(f"Only the cuda back-end runs asynchronously, not {backend.name}; use it as it is.")
+    library, _ = kernel_library()
     return replace(
         backend,
-        rasterize=partial(rasterize, budget=budget),
-        generate_structured=cuda_anchors.generate_structured,
+        rasterize=partial(rasterize, budget=budget, library=library),
+        generate_structured=cuda_anchors.generate_structured
+        if library is None
+        else partial(cuda_generation.generate_all, library),
     )
 
 
@@ -210,10 +219,10 @@ def backend_reasons() -> dict[str, str | None]:
 
 
 def backend_remarks() -> dict[str, str]:
-    """Remarks about available back-ends for the user: what computes the cuda back-end's loss."""
-    from structgstream.kernels._nvcc import loss_plan
+    """Remarks about available back-ends for the user: what computes the cuda back-end's own operations."""
+    from structgstream.kernels._nvcc import kernel_plan
 
-    return {"cuda": loss_plan()[1]}
+    return {"cuda": kernel_plan()[1]}
 
 
 def select_backend(name: BackendName | Backend) -> Backend:

@@ -40,7 +40,7 @@ def generate_structured(
     distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)
     parts = [features, to_anchor / distance]
     inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
-    opacity, color, covariance = _outputs(mlps, inputs)
+    opacity, color, covariance = head_outputs(mlps, inputs)
     raw = torch.where(seen[:, None], torch.tanh(opacity), -1.0)  # [M, K]
     drawn = raw > 0
     covariance = covariance.reshape(count, k, 7)
@@ -56,7 +56,7 @@ def generate_structured(
     return StructuredGaussians(gaussians, torch.arange(count, device=positions.device), raw.detach())
 
 
-def _outputs(mlps: MLPWeights, inputs: Tensor) -> list[Tensor]:
+def head_outputs(mlps: MLPWeights, inputs: Tensor) -> list[Tensor]:
     """Outputs of each head before activation."""
     # One product for the three first layers, because the cost of small products is their launch.
     first, bias = torch.cat([head.w1 for head in mlps]), torch.cat([head.b1 for head in mlps])

@@ -55,6 +55,16 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
     "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
     "sgs_cuda_error": ("s", "i"),
+    "sgs_cuda_anchor_inputs": ("i", "pppppiiiipppiifpppp"),
+    "sgs_cuda_anchor_inputs_backward": ("i", "piiipppp"),
+    "sgs_cuda_anchor_outputs": ("i", "ppppiipppppppppppp"),
+    "sgs_cuda_anchor_outputs_backward": ("i", "pppiipppppppppppppppp"),
+    "sgs_cuda_sweep": ("i", "piippiiifpppp"),
+    "sgs_cuda_tile_depths": ("i", "ppipp"),
+    "sgs_cuda_tile_counts": ("i", "pppiiipp"),
+    "sgs_cuda_tile_fill": ("i", "ppppiiilppp"),
+    "sgs_cuda_tile_starts": ("i", "pppliippp"),
+    "sgs_cuda_tile_reached": ("i", "ppipiipp"),
 }
 """The same for the CUDA library."""
 

@@ -2,6 +2,7 @@
 """Types that all rasterisers share: selections of tiles, and the result."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -34,7 +35,11 @@ class TileSelection:
         assert self.mask.shape == tile_grid(self.width, self.height), (self.mask.shape, self.width, self.height)
 
     def pixels(self) -> Tensor:
-        """Mask ``[H, W]`` of the pixels in the selected tiles."""
+        """Mask ``[H, W]`` of the pixels in the selected tiles; the same tensor in every call."""
+        return self._pixels
+
+    @cached_property
+    def _pixels(self) -> Tensor:
         rows = self.mask.repeat_interleave(TILE_PIXELS, 0)
         return rows.repeat_interleave(TILE_PIXELS, 1)[: self.height, : self.width]
 

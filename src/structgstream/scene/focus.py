@@ -22,9 +22,11 @@ class Focus:
             Drawn into in place: its tiles hold the last drawing.
         still: Gaussians that reach the tiles and do not move; without gradient.
         changed: those of the tiles in which something has changed; None if that is not known.
+        background: ``[3]`` colour behind the scene; None for black.
     """
 
     tiles: TileSelection
     picture: Tensor
     still: Gaussians
     changed: TileSelection | None = None
+    background: Tensor | None = None

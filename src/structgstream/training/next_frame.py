@@ -111,6 +111,7 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
             watch=self.watch,
             focus=drawn,
+            background=None if focus is None else focus.background,
         )
         loss = replace(loss, focus=focus)  # Tiles that are not drawn now hold their last drawing.
         if comparable:

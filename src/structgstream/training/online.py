@@ -215,7 +215,7 @@ def run_frame_fit(
             FrameFit(config, backend, iteration_backend, frame_index, generator, watch, steps or {}, on_step)
         )
 
-    if backend.device.type != "cuda":
+    if backend.name != "cuda":
         return run(backend)
     # The host can run ahead of a GPU because no iteration synchronises.
     return run_with_pair_budget(

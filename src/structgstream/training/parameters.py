@@ -21,7 +21,7 @@ from structgstream.scene.state import (
     state_of,
     tensor_of,
 )
-from structgstream.training.rounding import round_straight_through
+from structgstream.training.rounding import round_all_straight_through
 
 
 def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
@@ -76,7 +76,8 @@ class Parameters:
             p.name: value for p in PARAMETERS if not p.trainable and (value := tensor_of(template, p)) is not None
         }
         values |= {**self.values, "free_births": self.births}
-        values |= {name: round_straight_through(self.values[name], step) for name, step in self.steps.items()}
+        rounded = round_all_straight_through([self.values[name] for name in self.steps], [*self.steps.values()])
+        values |= dict(zip(self.steps, rounded, strict=True))
         found = scene_from(values, distance_input=template.distance_input)
         gauged = any(self.values[name].requires_grad for name in CAMERA_ROWS)
         return replace(found, camera_color=found.camera_color.gauged()) if gauged else found

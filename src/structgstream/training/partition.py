@@ -119,7 +119,7 @@ def _focus(
     drawn, behind = concatenate(in_motion, at_rest), still.background(camera)
     rendering = draw(drawn, camera, backend, focus=Focus(ring, empty, nothing), background=behind)
     # Anchors were culled as a whole; Gaussians that reach no tile are dropped.
-    return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0), tiles_of_change)
+    return Focus(tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0), tiles_of_change, behind)
 
 
 def _grown(mask: Tensor, by: int) -> Tensor:

@@ -8,7 +8,10 @@ gradients pass the rounding unchanged (straight-through). Bins are absolute, so 
 integers and errors do not accumulate.
 """
 
-from collections.abc import Iterable
+# torch's operations on lists of tensors have a leading underscore; its own optimisers are built on them.
+# pyright: reportPrivateImportUsage=false
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -20,18 +23,28 @@ from structgstream.scene.state import PARAMETERS, ParameterName
 
 
 class _RoundStraightThrough(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, step: float) -> Tensor:
-        return (value / step).round_().mul_(step)
+    """Operations are on lists of tensors, which on a GPU is one launch for all of them."""
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
-        return grads[0], None
+    def forward(ctx: Any, steps: list[float], *values: Tensor) -> tuple[Tensor, ...]:
+        found = torch._foreach_div(values, steps)
+        torch._foreach_round_(found)
+        torch._foreach_mul_(found, steps)
+        return tuple(found)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *grads
 
 
 def round_straight_through(value: Tensor, step: float) -> Tensor:
     """``value`` on the grid of ``step``; the gradient is that of ``value``."""
-    return _RoundStraightThrough.apply(value, step)
+    return round_all_straight_through([value], [step])[0]
+
+
+def round_all_straight_through(values: Sequence[Tensor], steps: Sequence[float]) -> tuple[Tensor, ...]:
+    """Each of ``values`` on the grid of its step; the gradients are those of ``values``."""
+    return _RoundStraightThrough.apply([*steps], *values) if values else ()  # type: ignore[return-value]
 
 
 # The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. For frame 0 it

@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+// The interface of anchors.h, by the elements of anchor_elements.h: anchors.cu compiles it for a GPU, emulate_elements.cpp
+// for a processor.
+#pragma once
+
+#include "anchor_elements.h"
+#include "anchors.h"
+
+int sgs_cuda_anchor_inputs(
+    const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
+    const float* features, int anchors, int offsets_per_anchor, int feature_size, int distance_input,
+    const float* viewmat, const float* intrinsics, const float* center, int width, int height, float near,
+    const uint8_t* tiles, float* inputs, uint8_t* seen, void* stream) {
+    using namespace structgstream::cuda;
+    const int columns = feature_size + 3 + (distance_input ? 1 : 0);
+    const Seen see = {positions, log_offset_scales, log_base_scales, offsets, offsets_per_anchor, viewmat, intrinsics,
+                      {width, height}, near, tiles, seen};
+    const int error = for_each(see, anchors, stream);
+    if (error) return error;
+    const Input input = {positions, features, center, feature_size, columns, inputs};
+    return for_each(input, static_cast<int64_t>(anchors) * columns, stream);
+}
+
+int sgs_cuda_anchor_inputs_backward(
+    const float* positions, int anchors, int feature_size, int distance_input, const float* center,
+    const float* v_inputs, float* v_positions, void* stream) {
+    using namespace structgstream::cuda;
+    const int columns = feature_size + 3 + (distance_input ? 1 : 0);
+    const InputBackward backward = {positions, center, feature_size, columns, v_inputs, v_positions};
+    return for_each(backward, anchors, stream);
+}
+
+int sgs_cuda_anchor_outputs(
+    const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
+    int anchors, int offsets_per_anchor, const float* opacity, const float* color, const float* covariance,
+    const uint8_t* seen, float* means, float* quats, float* scales, float* opacities, float* colors,
+    float* raw_opacities, int64_t* ids, void* stream) {
+    using namespace structgstream::cuda;
+    const Output output = {positions, log_offset_scales, log_base_scales, offsets, offsets_per_anchor, opacity, color,
+                           covariance, seen, means, quats, scales, opacities, colors, raw_opacities, ids};
+    return for_each(output, static_cast<int64_t>(anchors) * offsets_per_anchor, stream);
+}
+
+int sgs_cuda_anchor_outputs_backward(
+    const float* log_offset_scales, const float* log_base_scales, const float* offsets, int anchors,
+    int offsets_per_anchor, const float* color, const float* covariance, const float* raw_opacities,
+    const float* v_means, const float* v_quats, const float* v_scales, const float* v_opacities, const float* v_colors,
+    float* v_positions, float* v_log_offset_scales, float* v_log_base_scales, float* v_offsets, float* v_opacity,
+    float* v_color, float* v_covariance, void* stream) {
+    using namespace structgstream::cuda;
+    const OutputBackward backward = {
+        log_offset_scales, log_base_scales, offsets, offsets_per_anchor, color, covariance, raw_opacities, v_means,
+        v_quats, v_scales, v_opacities, v_colors, v_positions, v_log_offset_scales, v_log_base_scales, v_offsets,
+        v_opacity, v_color, v_covariance};
+    return for_each(backward, anchors, stream);
+}

@@ -1,0 +1,45 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* The C interface of anchors to Gaussians on a GPU, without the MLPs, which are matrix products: what is before and what is
+ * after them. Plain pointers to the GPU's memory; tensors are contiguous, row-major, float32 unless said otherwise;
+ * `stream` is a cudaStream_t. Nothing here waits for the GPU or takes memory. All return 0, or CUDA's error number. */
+#pragma once
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* The inputs of the MLPs, and which anchors' balls of Gaussians reach the picture, or one of its tiles.
+ * positions, log_offset_scales, log_base_scales [M,3], offsets [M,K,3], features [M,D]; viewmat [4,4], intrinsics [3,3],
+ * center [3], of directions and distances; tiles: a byte for each tile of 16 x 16 pixels, or null for all. Out: inputs
+ * [M,D+3+distance_input], seen: a byte for each anchor. */
+int sgs_cuda_anchor_inputs(
+    const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
+    const float* features, int anchors, int offsets_per_anchor, int feature_size, int distance_input,
+    const float* viewmat, const float* intrinsics, const float* center, int width, int height, float near,
+    const uint8_t* tiles, float* inputs, uint8_t* seen, void* stream);
+/* Out: v_positions [M,3], from v_inputs, the gradient of the inputs. That of the features is its first D columns. */
+int sgs_cuda_anchor_inputs_backward(
+    const float* positions, int anchors, int feature_size, int distance_input, const float* center,
+    const float* v_inputs, float* v_positions, void* stream);
+/* The Gaussians of all anchors. opacity [M,K], color [M,K,3], covariance [M,K,7]: the MLPs' outputs before activation. Out:
+ * means, scales, colors [M,K,3], quats [M,K,4], opacities, raw_opacities [M,K], ids [M,K] int64. What is not drawn has
+ * opacity and scale 0; raw opacities of anchors that are not seen are -1. */
+int sgs_cuda_anchor_outputs(
+    const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
+    int anchors, int offsets_per_anchor, const float* opacity, const float* color, const float* covariance,
+    const uint8_t* seen, float* means, float* quats, float* scales, float* opacities, float* colors,
+    float* raw_opacities, int64_t* ids, void* stream);
+/* From the gradients of the Gaussians those of the inputs of sgs_cuda_anchor_outputs, of the same shapes; v_offsets may be
+ * null. */
+int sgs_cuda_anchor_outputs_backward(
+    const float* log_offset_scales, const float* log_base_scales, const float* offsets, int anchors,
+    int offsets_per_anchor, const float* color, const float* covariance, const float* raw_opacities,
+    const float* v_means, const float* v_quats, const float* v_scales, const float* v_opacities, const float* v_colors,
+    float* v_positions, float* v_log_offset_scales, float* v_log_base_scales, float* v_offsets, float* v_opacity,
+    float* v_color, float* v_covariance, void* stream);
+
+#ifdef __cplusplus
+}
+#endif

@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: Apache-2.0
+// Kernels in which every thread makes its own elements and reads none of another's: `for_each` runs them on a GPU, or one
+// after another on a processor, where tests run the same functions without a GPU.
+#pragma once
+
+#include <cstdint>
+
+#ifdef __CUDACC__
+#define SGS_ELEMENT __host__ __device__ inline
+#else
+#define SGS_ELEMENT inline
+#endif
+
+namespace structgstream {
+namespace cuda {
+
+#ifdef __CUDACC__
+
+constexpr int kElementThreads = 256;
+
+template <typename Element>
+__global__ void __launch_bounds__(kElementThreads) element_kernel(const Element element, int64_t count) {
+    const int64_t i = static_cast<int64_t>(blockIdx.x) * kElementThreads + threadIdx.x;
+    if (i < count) element(i);
+}
+
+// Calls `element(i)` for i in 0 ... count - 1; gives CUDA's error number.
+template <typename Element>
+int for_each(const Element& element, int64_t count, void* stream) {
+    if (count <= 0) return 0;
+    const unsigned blocks = static_cast<unsigned>((count + kElementThreads - 1) / kElementThreads);
+    element_kernel<<<blocks, kElementThreads, 0, static_cast<cudaStream_t>(stream)>>>(element, count);
+    return static_cast<int>(cudaGetLastError());
+}
+
+#else
+
+// `stream` is not a stream: the elements are made last first when it is not null.
+template <typename Element>
+int for_each(const Element& element, int64_t count, void* stream) {
+    for (int64_t i = 0; i < count; ++i) element(stream == nullptr ? i : count - 1 - i);
+    return 0;
+}
+
+#endif
+
+}  // namespace cuda
+}  // namespace structgstream

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Anchors to Gaussians in CUDA kernels, beside the oracle in float64: the kernels' functions run on the processor and,
+where there is a GPU, the kernels themselves.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from parity.test_cuda_anchors import ATTRIBUTES, HEIGHT, WIDTH, K, M, camera, tensors
+from structgstream.errors import BackendError
+from structgstream.kernels import cuda_generation, reference_anchors
+from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.raster_types import TileSelection, tile_grid
+
+ONLINE = (0, 1, 2, 4, 9, 10, 11, 12)  # positions, both scales, features and F_c
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+
+
+def compiled() -> KernelLibrary:
+    from structgstream.kernels._nvcc import kernel_library
+
+    library, reason = kernel_library()
+    assert library is not None, reason
+    return library
+
+
+@pytest.fixture(params=DEVICES)
+def library(request: pytest.FixtureRequest) -> KernelLibrary:
+    return compiled() if request.param == "cuda" else request.getfixturevalue("emulation")(0)
+
+
+def generate(
+    generator: Callable[..., StructuredGaussians],
+    values: list[Tensor],
+    *,
+    tiles: TileSelection | None = None,
+    distance_input: bool = True,
+    seen_from: Tensor | None = None,
+) -> StructuredGaussians:
+    mlps = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13)))
+    view = camera(values[0])
+    return generator(Anchors(*values[:5]), mlps, view, distance_input=distance_input, tiles=tiles, seen_from=seen_from)
+
+
+def on_device(values: list[Tensor], library: KernelLibrary) -> list[Tensor]:
+    return [value.to(library.device_type, torch.float32) for value in values]
+
+
+def some_tiles() -> TileSelection:
+    return TileSelection(torch.rand(tile_grid(WIDTH, HEIGHT)) < 0.3, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.parametrize("distance_input", [True, False])
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_drawn_set_is_the_references(
+    library: KernelLibrary, tiled: bool, distance_input: bool, moved: bool
+) -> None:
+    values = tensors(distance_input=distance_input)
+    tiles = some_tiles() if tiled else None
+    there = None if tiles is None else replace(tiles, mask=tiles.mask.to(library.device_type))
+    center = torch.tensor([0.3, -0.2, 0.1]).double() if moved else None
+    exact = generate(
+        reference_anchors.generate_structured, values, distance_input=distance_input, tiles=tiles, seen_from=center
+    )
+    found = generate(
+        partial(cuda_generation.generate_structured, library),
+        on_device(values, library),
+        distance_input=distance_input,
+        tiles=there,
+        seen_from=None if center is None else center.to(library.device_type, torch.float32),
+    )
+    assert torch.equal(found.anchors.cpu(), exact.anchors)
+    assert 0 < len(exact.anchors) < M
+    assert torch.equal(found.gaussians.ids.cpu(), exact.gaussians.ids)
+    assert torch.allclose(found.raw_opacities.cpu().double(), exact.raw_opacities, rtol=1e-4, atol=1e-5)
+    for name in ATTRIBUTES:
+        ours, wanted = getattr(found.gaussians, name).cpu().double(), getattr(exact.gaussians, name)
+        assert torch.allclose(ours, wanted, rtol=1e-4, atol=1e-5), name
+
+
+def test_all_of_them_are_the_drawn_and_others_that_leave_no_trace(library: KernelLibrary) -> None:
+    values = on_device(tensors(distance_input=True), library)
+    everything = generate(partial(cuda_generation.generate_all, library), values)
+    drawn = generate(partial(cuda_generation.generate_structured, library), values)
+    g = everything.gaussians
+    assert g.means.shape == (M * K, 3)
+    assert torch.equal(everything.anchors.cpu(), torch.arange(M))
+    assert torch.equal(g.ids.cpu(), torch.arange(M * K))
+    positive = g.opacities > 0
+    assert torch.equal(g.ids[positive], drawn.gaussians.ids)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(g, name)[positive], getattr(drawn.gaussians, name)), name
+    assert not g.scales[~positive].any()
+    assert not g.opacities[~positive].any()
+    assert (everything.raw_opacities[drawn.anchors] > -1).all()
+    assert int((everything.raw_opacities > -1).any(1).sum()) == len(drawn.anchors) < M
+    assert not everything.raw_opacities.requires_grad
+
+
+@pytest.mark.parametrize("trained", [ONLINE, tuple(range(17))], ids=["online", "all"])
+@pytest.mark.parametrize("distance_input", [True, False])
+def test_gradients(library: KernelLibrary, trained: tuple[int, ...], distance_input: bool) -> None:
+    values = tensors(distance_input=distance_input)
+    ours = on_device(values, library)
+    for i in trained:
+        values[i].requires_grad_()
+        ours[i].requires_grad_()
+    exact = generate(reference_anchors.generate_structured, values, distance_input=distance_input).gaussians
+    found = generate(partial(cuda_generation.generate_all, library), ours, distance_input=distance_input).gaussians
+    rows = exact.ids.to(library.device_type)
+    cotangents = {name: torch.randn_like(getattr(exact, name)) for name in ATTRIBUTES}
+    wanted = torch.autograd.grad(
+        [getattr(exact, name) for name in ATTRIBUTES],
+        [values[i] for i in trained],
+        [cotangents[name] for name in ATTRIBUTES],
+    )
+    got = torch.autograd.grad(
+        [getattr(found, name)[rows] for name in ATTRIBUTES],
+        [ours[i] for i in trained],
+        [cotangents[name].to(rows.device, torch.float32) for name in ATTRIBUTES],
+    )
+    for i, a, b in zip(trained, got, wanted, strict=True):
+        assert b.norm() > 0, i
+        assert (a.cpu().double() - b).norm() <= 1e-4 * b.norm(), i
+
+
+def test_anchors_at_the_centre_and_quaternions_of_length_zero(library: KernelLibrary) -> None:
+    """Directions and rotations that are none stay finite, forward and backward, as the oracle's do."""
+    values = [value.float() for value in tensors(distance_input=True)]
+    values[0][0] = camera(values[0]).center
+    values[15][3:7], values[16][3:7] = 0.0, 0.0  # F_Sigma's rotation of every first Gaussian
+    ours = on_device(values, library)
+    for i in ONLINE:
+        values[i].requires_grad_()
+        ours[i].requires_grad_()
+    exact = generate(reference_anchors.generate_structured, values).gaussians
+    found = generate(partial(cuda_generation.generate_structured, library), ours).gaussians
+    assert torch.equal(found.ids.cpu(), exact.ids)
+    assert torch.allclose(found.quats.cpu(), exact.quats, atol=1e-5)
+    assert (exact.quats.norm(dim=1) == 0).any()
+    gradients = torch.autograd.grad(
+        sum(getattr(found, name).sum() for name in ATTRIBUTES),  # type: ignore[arg-type]
+        [ours[i] for i in ONLINE],
+    )
+    assert all(torch.isfinite(gradient).all() for gradient in gradients)
+
+
+def test_elements_need_no_order(emulation: Callable[[int], KernelLibrary]) -> None:
+    values = on_device(tensors(distance_input=True), emulation(0))
+    found = []
+    for order in (0, 1):
+        leaves = [value.clone().requires_grad_() for value in values]
+        g = generate(partial(cuda_generation.generate_all, emulation(order)), leaves, tiles=some_tiles_once()).gaussians
+        total = sum((getattr(g, name) * (1 + i)).sum() for i, name in enumerate(ATTRIBUTES))
+        found.append([g.means.detach(), *torch.autograd.grad(total, leaves)])  # type: ignore[arg-type]
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def some_tiles_once() -> TileSelection:
+    mask = torch.zeros(tile_grid(WIDTH, HEIGHT), dtype=torch.bool)
+    mask[0, 1] = mask[2, 2] = True
+    return TileSelection(mask, WIDTH, HEIGHT)
+
+
+def test_what_the_kernels_cannot_read(emulation: Callable[[int], KernelLibrary]) -> None:
+    generator = partial(cuda_generation.generate_structured, emulation(0))
+    with pytest.raises(BackendError, match="float32"):
+        generate(generator, tensors(distance_input=True))
+    elsewhere = [value.float() for value in tensors(distance_input=True)]
+    elsewhere[3] = elsewhere[3].to("meta")
+    with pytest.raises(BackendError, match="not on meta"):
+        generate(generator, elsewhere)
+
+
+@pytest.mark.needs_cuda
+def test_nothing_waits_for_the_gpu() -> None:
+    library = compiled()
+    values = [value.requires_grad_() for value in on_device(tensors(distance_input=True), library)]
+    mlps, view = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13))), camera(values[0])
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        g = cuda_generation.generate_all(library, Anchors(*values[:5]), mlps, view, distance_input=True).gaussians
+        torch.autograd.grad(sum(getattr(g, name).sum() for name in ATTRIBUTES), values)  # type: ignore[arg-type]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
