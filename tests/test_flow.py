@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.flow import consistency_mask, inside, sampled
+from structgstream.flow import consistency_mask, inside, picture_shift, sampled
 
 
 def constant(dx: float, dy: float, height: int = 6, width: int = 8) -> np.ndarray:
@@ -38,3 +38,23 @@ def test_sampling_is_bilinear() -> None:
     expected = np.stack([x - 0.25, y + 0.5, 2 * (x - 0.25) - (y + 0.5)], 2)
     np.testing.assert_allclose(taken[:5, 1:], expected[:5, 1:], atol=1e-4)
     assert taken[0, 0, 0] == pytest.approx(0.0, abs=1e-5)  # the border's value beyond it
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (7, -4), (-2, 3)])
+def test_the_shift_of_a_whole_picture(shift: tuple[int, int]) -> None:
+    """Also where a part of it moves otherwise, and where light has changed."""
+    rough = np.random.default_rng(3).random((90, 120, 1)).astype(np.float32)
+    scene = np.repeat(sampled(rough, np.zeros((90, 120, 2), np.float32)), 3, axis=2) * 200
+    first = scene.astype(np.uint8)
+    second = np.roll(first, (shift[1], shift[0]), axis=(0, 1))
+    second[20:50, 30:60] = first[22:52, 41:71]
+    second = (second * 0.8 + 20).astype(np.uint8)
+    found, clarity = picture_shift(first, second)
+    assert found == pytest.approx(np.hypot(*shift), abs=0.5)
+    assert clarity > 0.3
+
+
+def test_pictures_of_different_things_have_no_clear_shift() -> None:
+    first, second = np.random.default_rng(4).integers(0, 255, (2, 90, 120, 3), dtype=np.uint8)
+    assert picture_shift(first, second)[1] < 0.3
+    assert picture_shift(first[:1], second[:1]) == (0.0, 0.0)

@@ -30,6 +30,10 @@ def test_a_blank_picture_is_there_but_shows_nothing(level: int) -> None:
 
 def test_pictures_of_a_dark_or_plain_scene_count() -> None:
     assert frame_of("c0", "c1").showing(["c0", "c1", "c2", "c3", "c4"]) == ("c0", "c1", "c2", "c3", "c4")
+    later = replace(frame_of("c0", "c1"), index=7)
+    assert later.showing(later.images) == ("c2", "c3", "c4"), "what records c0 and c1 has failed"
+    dark = replace(frame_of(*later.images), index=7)
+    assert dark.showing(dark.images) == ()
     faint = frame_of("c1", noise=12)
     assert faint.showing(faint.images) == tuple(faint.images), "a standard deviation of 3.5 levels is a picture"
 

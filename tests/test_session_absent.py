@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
 from backends import quickest_backend
@@ -237,3 +238,29 @@ def test_scores_are_of_the_pixels_that_count(world: World, tmp_path: Path) -> No
     assert "masks leave out pixels of cam00" in reasons["temporal_flip"]
     assert all(name in reasons for name in OF_WHOLE_PICTURES)
     assert found[0].stream["masked_share"] == {"cam00": pytest.approx(30 / 96)}
+
+
+def test_a_scene_that_no_picture_shows_is_held_and_found_again(world: World, tmp_path: Path) -> None:
+    """All cameras black in frame 2: the scene stays, and frame 3 is compared with frame 1, in a resumed stream too."""
+    source = capture(world, {})
+    source.pictures = [
+        replace(frame, images={name: np.zeros_like(image) for name, image in frame.images.items()})
+        if frame.index == 2
+        else frame
+        for frame in source.pictures
+    ]
+    whole = tmp_path / "whole.sgs"
+    reports = run(source, whole)
+    assert [dict(report.counts).get("held", 0) for report in reports] == [0, 0, 1, 0]
+    assert set(world.rig.training) <= set(reports[2].absent)
+    assert reports[2].bytes < 100 < reports[3].bytes
+    assert "the scene is held" in summary(reports[2], 4)
+    assert 0 < reports[3].moving < reports[3].anchors
+    scenes = decoded(whole)
+    assert torch.equal(scenes[2].anchors.positions, scenes[1].anchors.positions)
+    assert not torch.equal(scenes[3].anchors.positions, scenes[2].anchors.positions)
+    for done in (2, 3):
+        begun = tmp_path / f"begun{done}.sgs"
+        run(section(source, frames=done), begun)
+        run(source, begun, resume=True)
+        assert begun.read_bytes() == whole.read_bytes()

@@ -49,6 +49,25 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
     return flow
 
 
+def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[float, float]:
+    """How far ``second`` is shifted as a whole against ``first`` ``[H, W, 3]``, in pixels, and how clearly, 0 to 1:
+    phase correlation (Kuglin and Hines, 1975) of grey pictures under a Hann window.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", "capture") from None
+    one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (first, second))
+    height, width = one.shape
+    if min(height, width) < 2:
+        return 0.0, 0.0
+    (x, y), clarity = cv2.phaseCorrelate(one, other, cv2.createHanningWindow((width, height), cv2.CV_32F))
+    return float(np.hypot(x, y)), float(clarity)
+
+
 def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mask ``[H, W]`` of the pixels whose flow is forward-backward consistent, hence not occluded (Sundaram et al.,
     2010).

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 BLANK_LEVELS = 2.0
 """Standard deviation, in levels of 255, below which a picture shows nothing: a covered lens, a camera that starts."""
 MOST_BLANK_SHARE = 0.25
-"""Share of the pictures that may be blank while the others are not; if more are, the scene is dark or plain."""
+"""Share of frame 0's pictures that may be blank while the others are not; if more are, the scene is dark or plain."""
 _EVERY_PIXELS = 8  # A picture that shows something does so in every eighth row and column.
 
 
@@ -44,10 +44,15 @@ class MultiViewFrame:
         )
 
     def showing(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of :meth:`present` whose picture shows something, while most of the others do, too."""
+        """Those of :meth:`present` whose picture shows something; in frame 0 all of them if many show nothing.
+
+        Later many pictures are blank at once where what records them fails, or the light is off.
+        """
         present = self.present(names)
         blank = [name for name in present if self._is_blank(name)]
-        return present if len(blank) > MOST_BLANK_SHARE * len(present) else tuple(n for n in present if n not in blank)
+        if self.index == 0 and len(blank) > MOST_BLANK_SHARE * len(present):
+            return present
+        return tuple(name for name in present if name not in blank)
 
     def _is_blank(self, name: str) -> bool:
         sample = (slice(None, None, _EVERY_PIXELS), slice(None, None, _EVERY_PIXELS))

@@ -17,13 +17,18 @@ def frame_seed(seed: int, index: int) -> int:
     return (seed * 1_000_003 + index) % 2**63
 
 
+def shows_enough(frame: MultiViewFrame, rig: CameraRig) -> bool:
+    """Whether a later frame can be fitted: the pictures of at least two training cameras show something."""
+    return len(frame.showing(rig.training)) >= LEAST_CAMERAS
+
+
 def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
-    """Check that a frame can be fitted: at least two training cameras have pictures.
+    """Check that at least two training cameras have pictures, which in frame 0 show something.
 
     Raises:
         CaptureError: naming them.
     """
-    present = frame.showing(rig.training)
+    present = frame.present(rig.training) if frame.index else frame.showing(rig.training)
     if len(present) < LEAST_CAMERAS:
         raise CaptureError(
             f"Frame {frame.index} of {capture} has pictures of {', '.join(present) or 'none'} of its "

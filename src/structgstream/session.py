@@ -21,7 +21,7 @@ from structgstream.data.source import FrameStream, frame_count, keep_frames, may
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
-from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of
+from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of, shows_enough
 from structgstream.kernels.backend import Backend
 from structgstream.key_frames import KeyFrames
 from structgstream.lookahead import Lookahead
@@ -128,17 +128,24 @@ class Session(Generic[State, Memory]):
         # Changes are relative to the previous frame, so a resumed stream reads that one again.
         again = start > 0 and method.needs_before
         frames = self._source.frames(start - again)
-        before = next(frames) if again else None
+        before = self._showing_from(next(frames)) if again else None
         for frame in frames:
             check_enough_pictures(frame, self._rig, self._source.name)
             yield frame, method.observe(frame, before, rig=self._rig, backend=self._backend)
-            before = frame if method.needs_before else None
+            if method.needs_before and (frame.index == 0 or shows_enough(frame, self._rig)):
+                before = frame
+
+    def _showing_from(self, frame: MultiViewFrame) -> MultiViewFrame:
+        """``frame``, or the last one before it whose pictures show something."""
+        while frame.index > 0 and not shows_enough(frame, self._rig):
+            frame = next(self._source.frames(frame.index - 1))
+        return frame
 
     def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
         """The tasks of frames; each is made after the previous frame is written, on which its pressure depends."""
         for frame, pictures in observed:
             key = self._keys.kind(frame.index, frame.pts_seconds) is PacketKind.KEY
-            begins = self._plan.due(frame.index, frame.pts_seconds) if key else None
+            begins = self._plan.due(frame.index, frame.pts_seconds) if key and shows_enough(frame, self._rig) else None
             yield self._task(frame, pictures, begins=begins)
 
     def _task(self, frame: MultiViewFrame, pictures: FramePictures, *, begins: str | None = None) -> FrameTask:
@@ -209,7 +216,9 @@ class Session(Generic[State, Memory]):
     def _measure(self, state: State, task: FrameTask) -> None:
         """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
         index = task.frame.index
-        if self._pipeline.residual is not None and self._plan.measures(index, task.frame.pts_seconds, self._keys):
+        if self._pipeline.residual is None or (index > 0 and not shows_enough(task.frame, self._rig)):
+            return
+        if self._plan.measures(index, task.frame.pts_seconds, self._keys):
             self._plan.add(index, self._pipeline.residual(state, task))
 
     def _reopen(self, resumed: StoredStream[State]) -> None:

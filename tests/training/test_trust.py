@@ -7,7 +7,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
-from structgstream.training.trust import ViewChange, is_scene_cut, trusted_views
+from structgstream.training.trust import ViewChange, is_scene_cut, suspects, trusted_views
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
@@ -42,6 +42,17 @@ def test_a_camera_near_to_what_moves_is_believed() -> None:
     assert all(trusted_views([*throw, replace(USUAL, wrong_share=0.25)]))
     few_wrong = [replace(USUAL, wrong_share=share) for share in (0.001, 0.001, 0.001, 0.19)]
     assert all(trusted_views(few_wrong))
+
+
+def test_a_shifted_picture_is_a_bumped_camera_however_little_of_it_is_wrong() -> None:
+    """The shares of a camera of basketball that was moved by 14 and 9 pixels, before a plain wall, and of others."""
+    shares = (0.005, 0.004, 0.014, 0.018, 0.176)
+    views = [ViewChange(changed_share=0.05, wrong_share=share, identical=False) for share in shares]
+    assert all(trusted_views(views))
+    assert suspects(views) == [4]
+    assert trusted_views([*views[:4], replace(views[4], shift_pixels=16.0)]) == [True, True, True, True, False]
+    assert all(trusted_views([*views[:4], replace(views[4], shift_pixels=1.5)])), "someone comes near that camera"
+    assert suspects([replace(view, wrong_share=0.1 * view.wrong_share) for view in views]) == []
 
 
 def test_a_frozen_picture_is_not_while_others_change() -> None:

@@ -70,6 +70,8 @@ def change(came: int, went: int) -> str:
 def remarks(counts: Mapping[str, int]) -> str:
     """Remarks on a frame's pictures: outlier views and refused births (``training/trust.py``)."""
     found = []
+    if counts.get("held"):
+        found.append("no pictures show anything: the scene is held")
     if counts.get("views left out"):
         found.append(f"{counts['views left out']} views left out: only their pictures changed, or theirs did not")
     if counts.get("jumps"):

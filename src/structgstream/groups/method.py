@@ -19,7 +19,8 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.struct_gstream import FirstFrame, StructGStream
 from structgstream.training.group_start import GroupStartConfig, fit_group_start
-from structgstream.training.online import OnlineConfig
+from structgstream.training.motion_start import with_displacements
+from structgstream.training.online import LEAST_VIEWS, OnlineConfig, held
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.result import FitResult
 
@@ -128,6 +129,8 @@ class GroupMethod:
 
     def _begin(self, entry: GroupEntry, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         pictures, device = task.pictures, task.backend.device
+        if len(pictures.views) < LEAST_VIEWS:
+            return held(with_displacements(on_device(past.state, device), entry.displacements.to(device)))
         return fit_group_start(
             on_device(past.state, device),
             entry.displacements.to(device),

@@ -285,5 +285,5 @@ def _observed(past: Pass, source: FrameSource) -> Generator[TrackPictures, None,
     before = past.tracker.pictures(next(frames), None).views
     for frame in frames:
         found = past.tracker.pictures(frame, before)
-        before = found.views
+        before = found.views or before  # Where no picture shows anything nothing moves.
         yield found

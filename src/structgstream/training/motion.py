@@ -15,15 +15,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from structgstream.flow import picture_shift
 from structgstream.kernels.backend import Backend
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, Granularity, fields_of, parameters_of
 from structgstream.training.flow_maps import USUAL_FLOW, FlowConfig
 from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
-from structgstream.training.residuals import ResidualFloor, rendering_residual
-from structgstream.training.trust import ViewChange, is_scene_cut, trusted_views
-from structgstream.training.views import View, area_mean, mean_of_counting
+from structgstream.training.residuals import ResidualFloor, apply_camera_color, rendering_residual
+from structgstream.training.trust import CLEAR_SHIFT, ViewChange, is_scene_cut, suspects, trusted_views
+from structgstream.training.views import View, area_mean, blackened, mean_of_counting
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,9 @@ def segment_motion(
                 _view_evidence(folded, view, change, config=config, backend=backend, ease=ease, floor=floor)
             )
     view_changes = [of_view.change for of_view in view_evidence]
+    for number in suspects(view_changes):
+        shift = _shift_pixels(folded, views[number], config, backend)
+        view_changes[number] = replace(view_changes[number], shift_pixels=shift)
     trusted = [number for number, good in enumerate(trusted_views(view_changes)) if good]
     seen, votes = (torch.stack([getattr(view_evidence[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))
     coverage = torch.stack([view_evidence[n].coverage for n in trusted])
@@ -217,6 +222,15 @@ class _ViewEvidence:
     flows: Tensor
     change: ViewChange
     changed: Tensor | None = None
+
+
+def _shift_pixels(scene: Scene, view: View, config: MotionConfig, backend: Backend) -> float:
+    """How far the picture is shifted against the rendering of ``scene``, in pixels; 0 if that is not clear."""
+    small = view.reduced(config.picture_scale)
+    rendered = apply_camera_color(render(scene, small.camera, backend).image, scene.camera_color, view.index)
+    picture = blackened(small.image, small.mask).cpu().numpy()
+    shift, clarity = picture_shift(to_8bit_image(blackened(rendered, small.mask)), picture)
+    return shift * view.camera.width / small.camera.width if clarity > CLEAR_SHIFT else 0.0
 
 
 def _view_evidence(

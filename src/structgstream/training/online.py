@@ -50,6 +50,9 @@ from structgstream.training.statistics import GradientStatistics
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, shuffled_views
 
+LEAST_VIEWS = 2
+"""A frame with fewer pictures that show something holds the scene, unless the rig has no more."""
+
 
 @dataclass(frozen=True)
 class OnlineRates:
@@ -160,10 +163,12 @@ def fit_next_frame(
             (:func:`~structgstream.training.pictures.pictures_of`), if computed already.
         on_step: called after every iteration.
     """
-    if config.patching.lifetime == "frame":
-        scene = scene.without_free()
     if pictures is None:
         pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
+    if len(pictures.views) < min(LEAST_VIEWS, len(rig.training)):
+        return held(scene)
+    if config.patching.lifetime == "frame":
+        scene = scene.without_free()
     counts: dict[str, int] = {}
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
@@ -189,6 +194,11 @@ def fit_next_frame(
         slots=slot_count(scene),
     )
     return replace(result, counts={**result.counts, **counts})
+
+
+def held(scene: Scene) -> FitResult[Scene]:
+    """The result of a frame whose pictures show nothing: the scene as it was."""
+    return FitResult(detached(scene), iterations=0, train_psnr=math.nan, counts={"held": 1})
 
 
 def needs_older(config: OnlineConfig) -> bool:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detection of outlier views: failing or moved cameras, and global changes of light.
 
-A view is an outlier in three cases. Its picture changed, or has large residuals, nearly everywhere while the median
+A view is an outlier in four cases. Its picture changed, or has large residuals, nearly everywhere while the median
 view did not. Or it has many times the large residuals of the median view, as of a camera that was bumped, whose picture
-stays right where it shows plain surfaces. Or it is identical to the last one while others changed: the camera is
-frozen. If most views changed everywhere, motion between the frames cannot be segmented.
+stays right where it shows plain surfaces. Or it has several times them and its picture is shifted as a whole, as of a
+bumped camera that shows little else. Or it is identical to the last one while others changed: the camera is frozen. If
+most views changed everywhere, motion between the frames cannot be segmented.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,13 @@ MEDIAN_SHARE = 0.25
 """An outlier requires that the median view's share is below this."""
 BUMPED_SHARE, BUMPED_TIMES = 0.2, 8.0
 """Least share of wrong pixels of a bumped camera, and least multiple of the median view's."""
+SUSPECT_SHARE, SUSPECT_TIMES = 0.02, 3.0
+"""Least share of wrong pixels of a view whose shift is looked for, and least multiple of the median view's."""
+SHIFTED_PIXELS = 2.5
+"""Least shift of a whole picture. In basketball's 60 frames it is found to be 1.5 at most, and 4 or more of pictures
+that were shifted by 5 and 3 pixels."""
+CLEAR_SHIFT = 0.3
+"""Least clarity of a shift, 0 to 1 (``flow.picture_shift``); basketball's are 0.53 or more."""
 FROZEN_SHARE = 0.005
 """Least share of changed pixels in the median view for an identical picture to count as frozen; at most one view in
 four may be."""
@@ -30,11 +38,19 @@ class ViewChange:
         changed_share: share of its pixels that changed since the last frame; None if the camera was absent from that.
         wrong_share: share of its pixels with a residual above frame 0's.
         identical: whether it equals the last picture bit for bit.
+        shift_pixels: how far the picture is shifted as a whole; known of suspects only (:func:`suspects`).
     """
 
     changed_share: float | None
     wrong_share: float
     identical: bool
+    shift_pixels: float = 0.0
+
+
+def suspects(changes: Sequence[ViewChange]) -> list[int]:
+    """The views that have several times the wrong pixels of the median view: their shift is worth looking for."""
+    least = max(SUSPECT_SHARE, SUSPECT_TIMES * median(c.wrong_share for c in changes))
+    return [number for number, change in enumerate(changes) if change.wrong_share > least]
 
 
 def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
@@ -46,6 +62,7 @@ def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
             ((c.changed_share or 0.0) > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
             or (c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE)
             or c.wrong_share > max(BUMPED_SHARE, BUMPED_TIMES * usual_wrong)
+            or c.shift_pixels > SHIFTED_PIXELS
             or (c.identical and few_same and usual_change > FROZEN_SHARE)
         )
         for c in changes
