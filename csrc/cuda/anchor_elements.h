@@ -11,7 +11,6 @@ namespace cuda {
 
 constexpr float kBallDeviations = 3.4f;   // reference_anchors.BALL_DEVIATIONS
 constexpr float kBoxMargin = 2.0f;        // pixels, reference_anchors.BOX_MARGIN_PIXELS
-constexpr int kTilePixels = 16;           // raster_types.TILE_PIXELS
 constexpr float kLeastLength = 1e-12f;
 
 SGS_ELEMENT float least(float a, float b) { return a < b ? a : b; }

@@ -14,6 +14,8 @@
 namespace structgstream {
 namespace cuda {
 
+constexpr int kTilePixels = 16;  // raster_types.TILE_PIXELS
+
 #ifdef __CUDACC__
 
 constexpr int kElementThreads = 256;

@@ -10,8 +10,6 @@
 namespace structgstream {
 namespace cuda {
 
-constexpr float kTileSide = 16.0f;  // pixels, raster_types.TILE_PIXELS
-
 // The tiles that a Gaussian's box reaches, inside the picture; none if it is not drawn.
 struct Boxes {
     const float* means2d;
@@ -28,9 +26,9 @@ struct Boxes {
 
     SGS_ELEMENT Box of(int64_t i) const {
         if (radii[2 * i] <= 0 || radii[2 * i + 1] <= 0) return {0, 0, 0, 0};
-        const float x = means2d[2 * i] / kTileSide, y = means2d[2 * i + 1] / kTileSide;
-        const float wide = static_cast<float>(radii[2 * i]) / kTileSide;
-        const float high = static_cast<float>(radii[2 * i + 1]) / kTileSide;
+        const float x = means2d[2 * i] / kTilePixels, y = means2d[2 * i + 1] / kTilePixels;
+        const float wide = static_cast<float>(radii[2 * i]) / kTilePixels;
+        const float high = static_cast<float>(radii[2 * i + 1]) / kTilePixels;
         const int64_t x0 = edge(floorf(x - wide), columns), x1 = edge(ceilf(x + wide), columns);
         const int64_t y0 = edge(floorf(y - high), rows), y1 = edge(ceilf(y + high), rows);
         return {x0, y0, x1 - x0, y1 - y0};
@@ -127,9 +125,9 @@ struct TileReached {
             last[axis] = static_cast<int>(fminf(fmaxf(high, 0.0f), limit));
             if (first[axis] >= last[axis]) return;
         }
-        const int columns = (size[0] + 15) / 16;
-        for (int row = first[1] / 16; row <= (last[1] - 1) / 16; ++row)
-            for (int column = first[0] / 16; column <= (last[0] - 1) / 16; ++column)
+        const int columns = (size[0] + kTilePixels - 1) / kTilePixels;
+        for (int row = first[1] / kTilePixels; row <= (last[1] - 1) / kTilePixels; ++row)
+            for (int column = first[0] / kTilePixels; column <= (last[0] - 1) / kTilePixels; ++column)
                 if (mask[row * columns + column]) return;
         drawn[i] = 0.0f;
     }

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+LEAST_CAMERAS = 2
+"""Training cameras that a frame needs: one picture does not say where things are."""
 BLANK_LEVELS = 2.0
 """Standard deviation, in levels of 255, below which a picture shows nothing: a covered lens, a camera that starts."""
 MOST_BLANK_SHARE = 0.25

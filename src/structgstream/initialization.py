@@ -6,9 +6,8 @@ import torch
 from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameStream
-from structgstream.data.timeline import LEAST_CAMERAS
 from structgstream.errors import CaptureError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.similarity import Similarity
 
 

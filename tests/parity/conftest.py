@@ -37,3 +37,19 @@ def emulation(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Kerne
     subprocess.run([compiler, *flags, "-o", built, *sorted(SOURCES.glob("emulate_*.cpp"))], check=True)
     library = ctypes.CDLL(str(built))
     return lambda order: KernelLibrary(library, "cpu", lambda device: order)
+
+
+@pytest.fixture
+def kernels_on(request: pytest.FixtureRequest) -> Callable[[str], KernelLibrary]:
+    """The CUDA kernels of a device type: their emulation for ``cpu``."""
+
+    def kernels(device_type: str) -> KernelLibrary:
+        if device_type == "cpu":
+            return request.getfixturevalue("emulation")(0)
+        from structgstream.kernels._nvcc import kernel_library
+
+        library, reason = kernel_library()
+        assert library is not None, reason
+        return library
+
+    return kernels

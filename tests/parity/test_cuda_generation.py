@@ -22,17 +22,9 @@ ONLINE = (0, 1, 2, 4, 9, 10, 11, 12)  # positions, both scales, features and F_c
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
 
 
-def compiled() -> KernelLibrary:
-    from structgstream.kernels._nvcc import kernel_library
-
-    library, reason = kernel_library()
-    assert library is not None, reason
-    return library
-
-
 @pytest.fixture(params=DEVICES)
-def library(request: pytest.FixtureRequest) -> KernelLibrary:
-    return compiled() if request.param == "cuda" else request.getfixturevalue("emulation")(0)
+def library(request: pytest.FixtureRequest, kernels_on: Callable[[str], KernelLibrary]) -> KernelLibrary:
+    return kernels_on(request.param)
 
 
 def generate(
@@ -180,8 +172,8 @@ def test_what_the_kernels_cannot_read(emulation: Callable[[int], KernelLibrary])
 
 
 @pytest.mark.needs_cuda
-def test_nothing_waits_for_the_gpu() -> None:
-    library = compiled()
+def test_nothing_waits_for_the_gpu(kernels_on: Callable[[str], KernelLibrary]) -> None:
+    library = kernels_on("cuda")
     values = [value.requires_grad_() for value in on_device(tensors(distance_input=True), library)]
     mlps, view = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13))), camera(values[0])
     torch.cuda.set_sync_debug_mode("error")

@@ -30,20 +30,9 @@ Listed = Callable[..., TileLists]
 
 
 @pytest.fixture(params=["torch", "kernels"])
-def listed(request: pytest.FixtureRequest, device: str) -> Listed:
+def listed(request: pytest.FixtureRequest, device: str, kernels_on: Callable[[str], KernelLibrary]) -> Listed:
     """The lists in torch or of the kernels, of tensors of ``device``."""
-    return tile_lists if request.param == "torch" else partial(tile_lists_in_kernels, kernels_of(device, request))
-
-
-def kernels_of(device: str, request: pytest.FixtureRequest) -> KernelLibrary:
-    """The kernels, or on the processor their emulation."""
-    if device == "cpu":
-        return request.getfixturevalue("emulation")(0)
-    from structgstream.kernels._nvcc import kernel_library
-
-    library, reason = kernel_library()
-    assert library is not None, reason
-    return library
+    return tile_lists if request.param == "torch" else partial(tile_lists_in_kernels, kernels_on(device))
 
 
 def splats(count: int, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -131,7 +120,7 @@ def test_a_picture_with_more_tiles_than_a_short_number_holds(listed: Listed, dev
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_radii_of_those_that_reach_a_tile(device: str, request: pytest.FixtureRequest) -> None:
+def test_radii_of_those_that_reach_a_tile(device: str, kernels_on: Callable[[str], KernelLibrary]) -> None:
     means2d, radii, _ = splats(400, 75, 53)
     means2d = means2d.nan_to_num(1e30)
     tiles = TileSelection(torch.rand(tile_grid(75, 53)) < 0.2, 75, 53)
@@ -139,7 +128,7 @@ def test_radii_of_those_that_reach_a_tile(device: str, request: pytest.FixtureRe
     exact = torch.where(reaching & (radii > 0).all(1), radii.amax(1).float(), 0.0)
     there = replace(tiles, mask=tiles.mask.to(device))
     given = (radii * (radii > 0).all(1, keepdim=True)).to(torch.int32)  # gsplat's radii are both 0, or none is
-    ours = radii_reaching_tiles(kernels_of(device, request), means2d.to(device), given.to(device), there)
+    ours = radii_reaching_tiles(kernels_on(device), means2d.to(device), given.to(device), there)
     assert torch.equal(ours.cpu(), exact)
     assert 20 < int((exact > 0).sum()) < int((given > 0).all(1).sum())
 

@@ -56,16 +56,13 @@ RULES = {"planes": 17, "least_supports": 2, "most_contradictions": 0.34}
         pytest.param("cuda", marks=pytest.mark.needs_cuda),
     ]
 )
-def sweep(request: pytest.FixtureRequest) -> Callable[..., Swept]:
+def sweep(request: pytest.FixtureRequest, kernels_on: Callable[[str], KernelLibrary]) -> Callable[..., Swept]:
     """A sweep in float32, of the C++, of the CUDA functions on a processor, or of a GPU; on the processor's tensors."""
     if request.param == "cpu":
         return cpu_sweep.sweep
     if request.param == "emulated":
-        return partial(cuda_sweep.sweep, request.getfixturevalue("emulation")(0))
-    from structgstream.kernels._nvcc import kernel_library
-
-    library, reason = kernel_library()
-    assert library is not None, reason
+        return partial(cuda_sweep.sweep, kernels_on("cpu"))
+    library = kernels_on("cuda")
 
     def there(given: list[SweepView], view_index: int, *tensors: torch.Tensor, **rules: Any) -> Swept:
         every: list[dict[str, Any]] = [vars(view) for view in given]

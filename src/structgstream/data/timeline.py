@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError
+from structgstream.frames import LEAST_CAMERAS
 
 log = logging.getLogger(__name__)
 
-LEAST_CAMERAS = 2
-"""Training cameras that a frame needs: one picture does not say where things are."""
 MOST_SINGLE = 2
 """Cameras that lack frames and get a line each; of more one line tells."""
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past
 from structgstream.presets import StreamConfig
@@ -20,7 +20,7 @@ from structgstream.scene.state import on_device
 from structgstream.struct_gstream import FirstFrame, StructGStream
 from structgstream.training.group_start import GroupStartConfig, fit_group_start
 from structgstream.training.motion_start import with_displacements
-from structgstream.training.online import LEAST_VIEWS, OnlineConfig, held
+from structgstream.training.online import OnlineConfig, held
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.result import FitResult
 
@@ -129,7 +129,7 @@ class GroupMethod:
 
     def _begin(self, entry: GroupEntry, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         pictures, device = task.pictures, task.backend.device
-        if len(pictures.views) < LEAST_VIEWS:
+        if len(pictures.views) < LEAST_CAMERAS:
             return held(with_displacements(on_device(past.state, device), entry.displacements.to(device)))
         return fit_group_start(
             on_device(past.state, device),

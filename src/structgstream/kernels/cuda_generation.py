@@ -21,7 +21,7 @@ from structgstream.kernels.prototypes import addresses
 from structgstream.kernels.raster_types import TileSelection
 
 
-class _Seen(NamedTuple):
+class _KernelCamera(NamedTuple):
     """A camera, as the kernels read it."""
 
     library: KernelLibrary
@@ -35,7 +35,7 @@ class _Inputs(torch.autograd.Function):
     """The MLPs' inputs ``[M, I]`` and the mask ``[M]`` of the anchors that are seen."""
 
     @staticmethod
-    def forward(ctx: Any, camera: _Seen, *anchors: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, camera: _KernelCamera, *anchors: Tensor) -> tuple[Tensor, Tensor]:
         positions, log_offset_scales, log_base_scales, offsets, features = anchors
         (m, k), d, view = offsets.shape[:2], features.shape[1], camera.viewport
         inputs = features.new_empty(m, d + 3 + camera.distance_input)
@@ -174,7 +174,7 @@ def _generated(
         )
     view = viewport._replace(viewmat=viewport.viewmat.contiguous(), K=viewport.K.contiguous())
     values = [value.contiguous() for value in anchors]
-    inputs, seen = _Inputs.apply(_Seen(library, view, center, mask, distance_input), *values)  # type: ignore[misc]
+    inputs, seen = _Inputs.apply(_KernelCamera(library, view, center, mask, distance_input), *values)  # type: ignore[misc]
     outputs = [value.contiguous() for value in head_outputs(mlps, inputs)]
     means, quats, scales, opacities, colors, raw, ids = _Outputs.apply(library, seen, *values[:4], *outputs)  # type: ignore[misc]
     return Gaussians(means, quats, scales, opacities, colors, ids), seen, raw

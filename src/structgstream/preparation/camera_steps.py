@@ -6,9 +6,10 @@ from dataclasses import asdict
 
 from structgstream.data.calibration import listed
 from structgstream.data.posed import Calibration
-from structgstream.data.timeline import LEAST_CAMERAS, Clock
+from structgstream.data.timeline import Clock
 from structgstream.data.tone import ToneCurve
 from structgstream.errors import ConfigError
+from structgstream.frames import LEAST_CAMERAS
 from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import run_with_pair_budget
 from structgstream.scene.scene import Scene
@@ -49,9 +49,6 @@ from structgstream.training.rounding import RoundingConfig
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, shuffled_views
-
-LEAST_VIEWS = 2
-"""A frame with fewer pictures that show something holds the scene, unless the rig has no more."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +162,7 @@ def fit_next_frame(
     """
     if pictures is None:
         pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
-    if len(pictures.views) < min(LEAST_VIEWS, len(rig.training)):
+    if len(pictures.views) < min(LEAST_CAMERAS, len(rig.training)):
         return held(scene)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()

@@ -34,11 +34,10 @@ from structgstream.data.live.recording import Recording
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
 from structgstream.data.live.status import LiveStatus, SetAges
 from structgstream.data.source import FrameSource
-from structgstream.data.timeline import LEAST_CAMERAS
 from structgstream.data.video_index import load_av
 from structgstream.data.video_pictures import srgb
 from structgstream.errors import ConfigError, StorageError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 
 log = logging.getLogger(__name__)
 
