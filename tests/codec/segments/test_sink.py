@@ -104,26 +104,26 @@ def test_a_stream_that_grows_is_read_up_to_its_edge(tmp_path: Path) -> None:
 
 
 def test_killed_at_any_operation_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    """Before and after each, once and again; what was reported written is there."""
+    """Before each, which is after the one before it, and after the last, once and again; what was reported is there."""
     whole = as_file(SENT)
     counter = KilledStore(folder(tmp_path / "count"), at=10**9, done=True)
     options = SegmentsOptions(grace_seconds=1.5)
     written(counter, SENT, options=options)
     assert any("delete part" in operation for operation in counter.operations)
-    for at in range(len(counter.operations)):
-        for done in (False, True):
-            store = folder(tmp_path / f"{at}-{done}")
-            reported: list[int] = []
-            for place in (at, at // 2 + 1):
-                with suppress(Killed):  # The second run may end before its place.
-                    written(KilledStore(store, place, done), SENT, options=options, after=reported.append)
-                store.prepare()
-                found = find(store)
-                edge = -1 if found is None else found.manifest.edge.frame
-                assert edge >= max(reported, default=-1)
-            written(store, SENT, options=options)
-            assert archived(store) == whole, (at, done)
-            assert not [name for name in os.listdir(store.folder) if name.startswith(".")]
+    last = len(counter.operations) - 1
+    for at, done in (*((at, False) for at in range(last + 1)), (last, True)):
+        store = folder(tmp_path / f"{at}-{done}")
+        reported: list[int] = []
+        for place in (at, at // 2 + 1):
+            with suppress(Killed):  # The second run may end before its place.
+                written(KilledStore(store, place, done), SENT, options=options, after=reported.append)
+            store.prepare()
+            found = find(store)
+            edge = -1 if found is None else found.manifest.edge.frame
+            assert edge >= max(reported, default=-1)
+        written(store, SENT, options=options)
+        assert archived(store) == whole, (at, done)
+        assert not [name for name in os.listdir(store.folder) if name.startswith(".")]
 
 
 @pytest.mark.parametrize("more", [0, 1, 5])

@@ -14,6 +14,8 @@ from structgstream.preparation.calibration.keypoints import (
     spread_order,
 )
 
+pytestmark = pytest.mark.finds_keypoints
+
 
 def scene(shift: int) -> np.ndarray:
     """A still background with a patch that has moved by ``shift`` pixels."""

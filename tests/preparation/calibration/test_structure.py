@@ -84,6 +84,7 @@ def test_shared_intrinsics_are_one() -> None:
         np.testing.assert_array_equal(found.cameras[name].camera.K, first.camera.K)
 
 
+@pytest.mark.finds_keypoints
 def test_the_same_pictures_give_the_same_numbers() -> None:
     _, pictures = filmed()
     one, two = (solve_structure(pictures, lens="radial", field_of_view=60.0) for _ in range(2))
