@@ -11,7 +11,7 @@ import torch
 from rigs import random_scene
 from structgstream.errors import ConfigError, OutOfMemoryError
 from structgstream.groups import method
-from structgstream.groups.method import GroupEntry, GroupMethod, lowered_budget, lowered_start
+from structgstream.groups.method import GroupEntry, GroupMethod, group_config, lowered_budget, lowered_start
 from structgstream.pipeline import Past
 from structgstream.presets import TINY
 from structgstream.struct_gstream import FirstFrame
@@ -141,3 +141,11 @@ def test_lower_is_half_of_the_views_and_a_quarter_of_the_births() -> None:
     two = replace(wide, start=replace(online.start, views=2))
     assert lowered_budget(two).start.views == 2, "flow needs two"
     assert lowered_start(START) == replace(START, births=10)
+
+
+def test_a_group_bears_thin_content_in_small_clusters_and_is_else_as_any_stream() -> None:
+    found, births = group_config(TINY), TINY.online.births
+    assert (births.thin.crowded, found.online.births.for_thin.crowded) == ("none", "small clusters")
+    assert found.online.births.crowded == births.crowded == "coarser"
+    thin = replace(found.online.births.thin, crowded="none")
+    assert replace(found, online=replace(found.online, births=replace(births, thin=thin))) == TINY

@@ -3,12 +3,20 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
-from structgstream.training.births import BirthConfig, ViewResidual, blamed_mask, sweep_births, view_residual
+from structgstream.training.births import (
+    BirthConfig,
+    ViewResidual,
+    _merge_points,
+    blamed_mask,
+    sweep_births,
+    view_residual,
+)
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
 from worlds import moving_world
@@ -87,3 +95,38 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     assert not absent.missing_share.any()
     assert not seen.missing_share.any()
     assert born(absent) == born(seen) > born(silent)
+
+
+def lines(*lengths: int) -> torch.Tensor:
+    """Points ``[P, 3]`` in straight lines of these lengths, a voxel apart in a line, lines far from each other."""
+    return torch.cat([torch.tensor([[float(x), 50.0 * row, 0.0] for x in range(n)]) for row, n in enumerate(lengths)])
+
+
+@pytest.mark.parametrize(
+    ("crowded", "most", "rows", "refused"),
+    [
+        ("none", 9, [], 15),
+        ("none", 15, [0, 1, 2], 0),
+        ("small clusters", 9, [0, 2], 8),
+        ("small clusters", 6, [2], 12),
+        ("small clusters", 2, [], 15),
+        ("small clusters", 15, [0, 1, 2], 0),
+    ],
+)
+def test_where_there_are_too_many_whole_clusters_are_born_or_none(
+    crowded: str, most: int, rows: list[int], refused: int
+) -> None:
+    points = lines(4, 8, 3)
+    config = replace(CONFIG, crowded=crowded, most=most, least_hits=1)
+    found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_birth=7, config=config)
+    assert found.refused_count == refused
+    assert sorted({round(float(y) / 50) for y in found.free.means[:, 1]}) == rows
+    assert len(found.free) == sum((4, 8, 3)[row] for row in rows)
+    assert found.free.births.tolist() == list(range(7, 7 + len(found.free)))
+
+
+def test_where_there_are_too_many_births_are_coarser() -> None:
+    config = replace(CONFIG, crowded="coarser", most=9, least_hits=1)
+    found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, config=config)
+    assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
+    assert float(found.free.log_scales.mean()) > float(torch.tensor(CONFIG.size).log())

@@ -148,6 +148,14 @@ class GroupMethod:
         )
 
 
+def group_config(config: StreamConfig) -> StreamConfig:
+    """``config`` for the frames of a group that does not begin with frame 0: thin births in small clusters come also
+    where there are many (``ThinBirthConfig.crowded``)."""
+    births = config.online.births
+    thin = replace(births.thin, crowded="small clusters")
+    return replace(config, online=replace(config.online, births=replace(births, thin=thin)))
+
+
 def lowered_budget(online: OnlineConfig) -> OnlineConfig:
     """``online`` with less memory: flow in half of the views, a quarter of the births."""
     return replace(

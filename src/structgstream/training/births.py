@@ -8,7 +8,7 @@ ray of such a pixel, in front of the rendered depth, at the depth where other vi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -27,6 +27,8 @@ MASK_PIXELS = 5
 HIT_VOXELS = 1.8
 COARSEST = 8.0
 """Births are coarser than the swept rays by at most about this."""
+CLUSTER_VOXELS = 2.0
+"""Births nearer to each other than this belong to one cluster."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,10 @@ class ThinBirthConfig:
     most_cost: float = 0.2
     least_hits: int = 3
     most: int = 150
-    coarsen: bool = False
+    crowded: Literal["coarser", "none", "small clusters"] = "none"
     """Thin content is little. Where more would be born, what moves is not where it should be, as in a throw: births in
-    its place follow it worse and cost more than what they stand for."""
+    its place follow it worse and cost more than what they stand for. A group of frames that is fitted apart lacks what
+    the frames before it would have borne, in every frame more than that: it bears what lies in small clusters."""
     most_missing_share: float = 0.02
     """Of the pictures 0.0005 lack something where a pitcher pours. More is light that changed."""
 
@@ -77,8 +80,8 @@ class BirthConfig:
     """Least number of ray points within 1.8 voxels for a birth."""
     most: int = 500
     """Largest number of births per frame."""
-    coarsen: bool = True
-    """Whether voxels and births are larger where there would be more than ``most``, or there are none."""
+    crowded: Literal["coarser", "none", "small clusters"] = "coarser"
+    """Where there would be more than ``most``: births in larger voxels, none, or those in the smallest clusters."""
     most_missing_share: float = 0.25
     """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
     size: float = 0.7
@@ -148,8 +151,8 @@ class Births:
 
     Args:
         free: the new free Gaussians.
-        refused_count: how many it would have borne, had they not been more than allowed
-            (``BirthConfig.most`` without ``coarsen``); then ``free`` is empty.
+        refused_count: how many more it would have borne, had they not been more than ``BirthConfig.most``; always 0
+            where births are coarser then (``BirthConfig.crowded``).
     """
 
     free: FreeGaussians
@@ -242,8 +245,11 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
         wanted = int(enough.sum())
         if wanted <= config.most or voxel > COARSEST * float(spacings.median()):
             break
-        if not config.coarsen:
+        if config.crowded == "none":
             return Births(FreeGaussians.empty(points), wanted)
+        if config.crowded == "small clusters":
+            enough[enough.clone()] = _in_small_clusters(means[enough, :3], CLUSTER_VOXELS * voxel, most=config.most)
+            break
         voxel *= 2.0**0.5  # Too many: what is missing is large, and is born coarser.
     order = hits.argsort(descending=True, stable=True)
     chosen = order[enough[order]][: config.most].sort().values
@@ -260,8 +266,25 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             logit_opacities=opacity.expand(count).clone(),
             colors=looks.contiguous(),
             births=first_birth + torch.arange(count, device=points.device),
-        )
+        ),
+        wanted - count if config.crowded == "small clusters" else 0,
     )
+
+
+def _in_small_clusters(means: Tensor, reach: float, *, most: int) -> Tensor:
+    """Mask ``[C]`` of the points ``means`` ``[C, 3]`` in the smallest clusters, as many whole ones as have at most
+    ``most`` points; points nearer than ``reach`` are in one cluster."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(means.double().numpy(force=True)).query_pairs(reach, output_type="ndarray")
+    near = coo_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(means), len(means)))
+    _, cluster = connected_components(near, directed=False)
+    sizes = np.bincount(cluster)
+    order = sizes.argsort(kind="stable")
+    chosen = order[sizes[order].cumsum() <= most]
+    return torch.from_numpy(np.isin(cluster, chosen)).to(means.device)
 
 
 def _cells(values: Tensor, tree: Any, voxel: float) -> tuple[Tensor, Tensor]:

@@ -31,9 +31,9 @@ from structgstream.training.result import FitResult, StepListener
 from structgstream.training.stragglers import StragglerConfig, recall_stragglers
 from structgstream.training.views import View
 
-USUAL_FRAMES = 7
-"""A group's first frame has the iterations of so many online frames. With 1.5 of them births stand in for what
-iterations would have mended, which costs bytes, and late groups fall behind (docs/groups.md)."""
+USUAL_FRAMES = 11
+"""A group's first frame has the iterations of so many online frames. With fewer, births stand in for what iterations
+would have mended, which costs bytes, and late groups fall behind (docs/groups.md)."""
 
 
 @dataclass(frozen=True)
