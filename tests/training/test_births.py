@@ -107,10 +107,10 @@ def lines(*lengths: int) -> torch.Tensor:
     [
         ("none", 9, [], 15),
         ("none", 15, [0, 1, 2], 0),
-        ("small clusters", 9, [0, 2], 8),
-        ("small clusters", 6, [2], 12),
-        ("small clusters", 2, [], 15),
-        ("small clusters", 15, [0, 1, 2], 0),
+        ("small-clusters", 9, [0, 2], 8),
+        ("small-clusters", 6, [2], 12),
+        ("small-clusters", 2, [], 15),
+        ("small-clusters", 15, [0, 1, 2], 0),
     ],
 )
 def test_where_there_are_too_many_whole_clusters_are_born_or_none(

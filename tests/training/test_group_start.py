@@ -77,11 +77,11 @@ def test_tracked_positions_and_two_rounds_reach_the_far_frame() -> None:
     assert tracked.counts["corrected"] > 0
 
 
-def test_it_has_the_iterations_of_seven_online_frames_unless_told() -> None:
+def test_it_has_the_iterations_of_eleven_online_frames_unless_told() -> None:
     world = scenery(movers=20)
     config = replace(CONFIG, iterations=3)
     usual = replace(START, iterations=None, rounds=3)
-    assert fit(world, truth(world, 20), start=usual, config=config).iterations == 21
+    assert fit(world, truth(world, 20), start=usual, config=config).iterations == 33
 
 
 def test_what_does_not_change_keeps_the_bits_of_frame_0() -> None:

@@ -152,7 +152,7 @@ def group_config(config: StreamConfig) -> StreamConfig:
     """``config`` for the frames of a group that does not begin with frame 0: thin births in small clusters come also
     where there are many (``ThinBirthConfig.crowded``)."""
     births = config.online.births
-    thin = replace(births.thin, crowded="small clusters")
+    thin = replace(births.thin, crowded="small-clusters")
     return replace(config, online=replace(config.online, births=replace(births, thin=thin)))
 
 

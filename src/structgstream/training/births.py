@@ -48,7 +48,7 @@ class ThinBirthConfig:
     most_cost: float = 0.2
     least_hits: int = 3
     most: int = 150
-    crowded: Literal["coarser", "none", "small clusters"] = "none"
+    crowded: Literal["coarser", "none", "small-clusters"] = "none"
     """Thin content is little. Where more would be born, what moves is not where it should be, as in a throw: births in
     its place follow it worse and cost more than what they stand for. A group of frames that is fitted apart lacks what
     the frames before it would have borne, in every frame more than that: it bears what lies in small clusters."""
@@ -80,7 +80,7 @@ class BirthConfig:
     """Least number of ray points within 1.8 voxels for a birth."""
     most: int = 500
     """Largest number of births per frame."""
-    crowded: Literal["coarser", "none", "small clusters"] = "coarser"
+    crowded: Literal["coarser", "none", "small-clusters"] = "coarser"
     """Where there would be more than ``most``: births in larger voxels, none, or those in the smallest clusters."""
     most_missing_share: float = 0.25
     """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
@@ -247,7 +247,7 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             break
         if config.crowded == "none":
             return Births(FreeGaussians.empty(points), wanted)
-        if config.crowded == "small clusters":
+        if config.crowded == "small-clusters":
             enough[enough.clone()] = _in_small_clusters(means[enough, :3], CLUSTER_VOXELS * voxel, most=config.most)
             break
         voxel *= 2.0**0.5  # Too many: what is missing is large, and is born coarser.
@@ -267,7 +267,7 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             colors=looks.contiguous(),
             births=first_birth + torch.arange(count, device=points.device),
         ),
-        wanted - count if config.crowded == "small clusters" else 0,
+        wanted - count if config.crowded == "small-clusters" else 0,
     )
 
 
