@@ -11,7 +11,14 @@ import torch
 from rigs import random_scene
 from structgstream.errors import ConfigError, OutOfMemoryError
 from structgstream.groups import method
-from structgstream.groups.method import GroupEntry, GroupMethod, group_config, lowered_budget, lowered_start
+from structgstream.groups.method import (
+    CATCH_UP_FRAMES,
+    GroupEntry,
+    GroupMethod,
+    catching_up,
+    lowered_budget,
+    lowered_start,
+)
 from structgstream.pipeline import Past
 from structgstream.presets import TINY
 from structgstream.struct_gstream import FirstFrame
@@ -28,9 +35,11 @@ class Usual:
     """The method of any stream, and the fit of a group's start, which keep what they are asked for."""
 
     asked: list[tuple[str, Any]] = field(default_factory=list)
+    thin: list[str] = field(default_factory=list)
     fails: int = 0
 
-    def __call__(self, config: object) -> "Usual":
+    def __call__(self, config: Any) -> "Usual":
+        self.thin.append(config.online.births.thin.crowded)
         return self
 
     def observe(self, frame: Any, before: Any, **options: Any) -> str:
@@ -107,6 +116,15 @@ def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
     for index in (1, 2):
         made.next(past, task(index))
     assert usual.asked == [("next", past)] * 2
+    assert usual.thin == ["none"] * 2
+
+
+def test_the_first_frames_catch_up(usual: Usual) -> None:
+    made = group()
+    for index in range(FIRST, FIRST + CATCH_UP_FRAMES + 2):
+        made.next(Past(SCENE, FirstFrame()), task(index))
+    assert usual.asked[0][1].config.births.thin.crowded == "small-clusters"
+    assert usual.thin == ["small-clusters"] * (CATCH_UP_FRAMES - 1) + ["none"] * 2
 
 
 def test_the_first_frame_is_compared_with_frame_0_and_others_with_the_one_before(usual: Usual) -> None:
@@ -143,8 +161,8 @@ def test_lower_is_half_of_the_views_and_a_quarter_of_the_births() -> None:
     assert lowered_start(START) == replace(START, births=10)
 
 
-def test_a_group_bears_thin_content_in_small_clusters_and_is_else_as_any_stream() -> None:
-    found, births = group_config(TINY), TINY.online.births
+def test_a_group_catches_up_by_thin_births_in_small_clusters_and_is_else_as_any_stream() -> None:
+    found, births = catching_up(TINY), TINY.online.births
     assert (births.thin.crowded, found.online.births.for_thin.crowded) == ("none", "small-clusters")
     assert found.online.births.crowded == births.crowded == "coarser"
     thin = replace(found.online.births.thin, crowded="none")

@@ -24,6 +24,8 @@ from structgstream.training.online import OnlineConfig, held
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.result import FitResult
 
+CATCH_UP_FRAMES = 6
+"""In so many frames from its first one on a group bears what the frames before it would have borne."""
 _log = logging.getLogger(__name__)
 _OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
 
@@ -67,6 +69,11 @@ class GroupMethod:
     @property
     def _usual(self) -> StructGStream:
         return StructGStream(self.config)
+
+    def _config_at(self, frame: int) -> StreamConfig:
+        """That of the stream, or where the group begins that for :data:`CATCH_UP_FRAMES`."""
+        first = None if self.entry is None else self.entry.frame
+        return self.config if first is None or frame >= first + CATCH_UP_FRAMES else catching_up(self.config)
 
     @property
     def needs_before(self) -> bool:
@@ -125,7 +132,7 @@ class GroupMethod:
             return self._begin(entry, past, task)
         if entry is not None and task.frame.index == entry.frame + 1:
             past = replace(past, older=_older(past.state, entry.velocities))
-        return self._usual.next(past, task)
+        return StructGStream(self._config_at(task.frame.index)).next(past, task)
 
     def _begin(self, entry: GroupEntry, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
         pictures, device = task.pictures, task.backend.device
@@ -137,7 +144,7 @@ class GroupMethod:
             pictures.views,
             pictures.changes or [None] * len(pictures.views),
             frame_index=task.frame.index,
-            config=with_rate_control(self.config.online, task.pressure),
+            config=with_rate_control(self._config_at(task.frame.index).online, task.pressure),
             start=self.start,
             backend=task.backend,
             seed=task.seed,
@@ -148,9 +155,9 @@ class GroupMethod:
         )
 
 
-def group_config(config: StreamConfig) -> StreamConfig:
-    """``config`` for the frames of a group that does not begin with frame 0: thin births in small clusters come also
-    where there are many (``ThinBirthConfig.crowded``)."""
+def catching_up(config: StreamConfig) -> StreamConfig:
+    """``config`` for a group's first frames, which lack what the frames before them would have borne: thin births in
+    small clusters come also where there are many (``ThinBirthConfig.crowded``)."""
     births = config.online.births
     thin = replace(births.thin, crowded="small-clusters")
     return replace(config, online=replace(config.online, births=replace(births, thin=thin)))

@@ -11,7 +11,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.groups.base import GroupBase
-from structgstream.groups.method import GroupEntry, GroupMethod, group_config
+from structgstream.groups.method import GroupEntry, GroupMethod
 from structgstream.groups.pictures import fingerprint, open_for
 from structgstream.groups.segment_file import Segment, SegmentIdentity
 from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_segment
@@ -132,10 +132,7 @@ def _run(
         found.close()
     sink = SegmentSink(path, base, identity, found)
     so_far = GroupSoFar(base, identity.first, records)
-    if start is None:
-        method = GroupMethod(base.config, config, None)
-    else:
-        method = GroupMethod(group_config(base.config), config, _entry(start, base, source))
+    method = GroupMethod(base.config, config, None if start is None else _entry(start, base, source))
     return record(
         path,
         source,

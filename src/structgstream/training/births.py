@@ -51,7 +51,7 @@ class ThinBirthConfig:
     crowded: Literal["coarser", "none", "small-clusters"] = "none"
     """Thin content is little. Where more would be born, what moves is not where it should be, as in a throw: births in
     its place follow it worse and cost more than what they stand for. A group of frames that is fitted apart lacks what
-    the frames before it would have borne, in every frame more than that: it bears what lies in small clusters."""
+    the frames before it would have borne: its first frames bear what lies in small clusters."""
     most_missing_share: float = 0.02
     """Of the pictures 0.0005 lack something where a pitcher pours. More is light that changed."""
 
