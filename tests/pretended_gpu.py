@@ -190,4 +190,5 @@ def pretended_gpu(on_processor: Rasterize) -> Backend:
         device=DEVICE,
         rasterize=there,
         blending_weights=partial(reference_raster.blending_weights, there),
+        picture_and_weights=partial(reference_raster.picture_and_weights, there),
     )

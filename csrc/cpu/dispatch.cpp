@@ -8,6 +8,7 @@
 
 #include "bin.h"
 #include "lift.h"
+#include "planes.h"
 #include "splat.h"
 #include "ssim.h"
 #include "structgstream.h"
@@ -19,7 +20,7 @@
     void project(const GaussianInputs&, Raster&, float*, int);                                                        \
     void project_backward(const GaussianInputs&, const Raster&, const float*, const GaussianGradients&, int);         \
     void rasterize(const Raster&, const float*, float*, float*, int);                                                 \
-    void weigh(const Raster&, const float*, int, float*, int);                                                        \
+    void weigh(const Raster&, const float*, int, float*, const float*, float*, int);                                  \
     void rasterize_backward(                                                                                          \
         const Raster&, const float*, const float*, const float*, const float*, const float*, float*, int);            \
     void l1_ssim(const Pictures&, const Part*, int, float*, int);                                                     \
@@ -34,6 +35,7 @@
         float*, const float*, float*, float*, const int64_t*, int64_t, int64_t, double, int64_t, double, double,      \
         double, int);                                                                                                 \
     void lift_flow(const FlowLift&, int);                                                                             \
+    void plane_scores(const PlaneSweep&);                                                                             \
     }
 
 SGS_DECLARE(baseline)
@@ -94,8 +96,10 @@ void rasterize_backward_dispatched(
     SGS_DISPATCH(rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments, threads))
 }
 
-void weigh_dispatched(const Raster& raster, const float* maps, int channels, float* sums, int threads) {
-    SGS_DISPATCH(weigh(raster, maps, channels, sums, threads))
+void weigh_dispatched(
+    const Raster& raster, const float* maps, int channels, float* sums, const float* background, float* image,
+    int threads) {
+    SGS_DISPATCH(weigh(raster, maps, channels, sums, background, image, threads))
 }
 
 void project_backward_dispatched(
@@ -114,6 +118,8 @@ void anchors_visible_dispatched(
 
 void lift_flow_dispatched(const FlowLift& lift, int threads) { SGS_DISPATCH(lift_flow(lift, threads)) }
 
+void plane_scores_dispatched(const PlaneSweep& sweep) { SGS_DISPATCH(plane_scores(sweep)) }
+
 Pinhole pinhole(const float* viewmat, const float* K, int width, int height, float near_plane) {
     Pinhole c;
     std::copy_n(viewmat, 12, c.view);
@@ -123,6 +129,19 @@ Pinhole pinhole(const float* viewmat, const float* K, int width, int height, flo
     c.up = c.cy / c.fy + margin_y, c.down = (height - c.cy) / c.fy + margin_y;
     c.near = near_plane, c.width = width, c.height = height;
     return c;
+}
+
+// A byte for each tile: whether any of its `channels` maps is not zero.
+std::vector<uint8_t> tiles_with_values(const Raster& raster, const float* maps, int channels) {
+    std::vector<uint8_t> found(static_cast<size_t>(raster.tiles_x) * raster.tiles_y, 0);
+    const int width = raster.camera.width;
+    for (int y = 0; y < raster.camera.height; ++y)
+        for (int x = 0; x < width; ++x) {
+            const float* pixel = maps + (static_cast<size_t>(y) * width + x) * channels;
+            found[y / kTile * raster.tiles_x + x / kTile] |=
+                std::any_of(pixel, pixel + channels, [](float value) { return value != 0.0f; });
+        }
+    return found;
 }
 
 }  // namespace
@@ -168,21 +187,23 @@ void* sgs_raster_forward(
 
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, int channels,
-    float* weights, int threads) {
+    const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
+    const float* background, const float* maps, int channels, float* weights, float* image, int threads) {
     try {
         Raster raster;
         raster.camera = pinhole(viewmat, K, width, height, near_plane);
         raster.tiles_x = (width + kTile - 1) / kTile;
         raster.tiles_y = (height + kTile - 1) / kTile;
+        if (!image) raster.drawn_tiles = tiles_with_values(raster, maps, channels);
         raster.trained = 0;
         raster.splats.resize(count);
         std::vector<float> radii(count);
-        // Colours play no part; any numbers of the right count will do.
-        project_dispatched({means, quats, scales, opacities, means, nullptr, count}, raster, radii.data(), threads);
+        // Without a picture colours play no part; any numbers of the right count will do.
+        project_dispatched(
+            {means, quats, scales, opacities, image ? colors : means, nullptr, count}, raster, radii.data(), threads);
         bin(raster);
         const std::unique_ptr<float[]> sums(new float[raster.pairs.size() * channels]);
-        weigh_dispatched(raster, maps, channels, sums.get(), threads);
+        weigh_dispatched(raster, maps, channels, sums.get(), background, image, threads);
         std::fill_n(weights, count * channels, 0.0f);
         for (int64_t i = 0; i < count; ++i)
             for (int64_t slot = raster.slots[i]; slot < raster.slots[i + 1]; ++slot)
@@ -203,6 +224,18 @@ int sgs_lift_flow(
             {centers, weights, flows, viewmats, Ks, near_planes, neighbours, affinities, priors, movers, targets, views,
              neighbour_count, share, displacements, inlier_share, agreeing_views},
             threads);
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
+}
+
+int sgs_plane_scores(
+    const float* picture, int height, int width, const sgs_neighbour* neighbours, int neighbour_count,
+    const double* homographies, int64_t planes, int window, float noise, float* scores) {
+    try {
+        plane_scores_dispatched(
+            {picture, height, width, neighbours, neighbour_count, homographies, planes, window, noise, scores});
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;

@@ -15,7 +15,9 @@ namespace SGS_ISA {
 typedef __mmask16 mask;
 inline mask at_least(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
 inline mask above(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GT_OQ); }
+inline mask differs(vf a, vf b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_NEQ_UQ); }
 inline mask both(mask a, mask b) { return a & b; }
+inline mask either(mask a, mask b) { return a | b; }
 inline mask without(mask a, mask b) { return a & static_cast<mask>(~b); }
 inline bool any(mask m) { return m != 0; }
 inline uint32_t bits(mask m) { return m; }
@@ -27,7 +29,9 @@ inline vf keep(mask m, vf a) { return (vf)_mm512_maskz_mov_ps(m, (__m512)a); }
 typedef vi mask;
 inline mask at_least(vf a, vf b) { return a >= b; }
 inline mask above(vf a, vf b) { return a > b; }
+inline mask differs(vf a, vf b) { return a != b; }
 inline mask both(mask a, mask b) { return a & b; }
+inline mask either(mask a, mask b) { return a | b; }
 inline mask without(mask a, mask b) { return a & ~b; }
 inline vf choose(mask m, vf a, vf b) { return (vf)(((vi)a & m) | ((vi)b & ~m)); }
 inline vf keep(mask m, vf a) { return (vf)((vi)a & m); }

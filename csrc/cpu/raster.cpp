@@ -282,29 +282,52 @@ void blend_backward(
             std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
 }
 
-// Sums over the pixels of each pair's weight times each of the first Maps maps, of `stride`: sums[stride * slot].
+// The blocks of a tile in which some map is not zero.
 template <int Maps>
-void weigh(const Raster& raster, int index, const float* maps, int stride, float* sums) {
+uint64_t blocks_with_values(const float (&values)[Maps][kTilePixels]) {
+    uint64_t found = 0;
+    for (int block = 0; block < kBlocks; ++block) {
+        mask other = above(splat(0.0f), splat(0.0f));
+        for (int k = 0; k < Maps; ++k) {
+            const vf value = load(values[k] + block * kLanes);
+            other = either(other, differs(value, splat(0.0f)));
+        }
+        found |= uint64_t{any(other)} << block;
+    }
+    return found;
+}
+
+// Sums over the pixels of each pair's weight times each of the first Maps maps, of `stride`: sums[stride * slot]. With
+// `image` the tile is drawn, too; without it blocks in which all maps are zero are passed over.
+template <int Maps, bool kDraws>
+void weigh(const Raster& raster, int index, const float* maps, int stride, float* sums, const float* background,
+           float* image) {
     const Tile tile(raster, index);
     const Lanes lanes;
     const BlockCentres centres;
     alignas(kAlignment) float values[Maps][kTilePixels] = {};
+    alignas(kAlignment) float color[3][kTilePixels];
+    if (kDraws) std::memset(color, 0, sizeof color);
     Front front;
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int at) {
 #pragma GCC unroll 8
         for (int k = 0; k < Maps; ++k) values[k][at] = maps[pixel * stride + k];
     });
+    if (!kDraws) front.live = blocks_with_values<Maps>(values);
     const int end = raster.starts[index + 1];
-    for (int n = raster.starts[index]; n < end; ++n) {
+    int n = raster.starts[index];
+    for (; n < end && front.live != 0; ++n) {
+        const Splat& s = splat_of(raster, n, end);
         float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
-        for_covered(splat_of(raster, n, end), tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
+        for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
             hit = true;
             const vf weight = c.alpha * before;
 #pragma GCC unroll 8
             for (int k = 0; k < Maps; ++k) m[k] += weight * load(values[k] + at);
+            for (int k = 0; k < 3 && kDraws; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
         });
         if (hit) {
             store_sums(m, out);
@@ -312,21 +335,33 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
             std::fill_n(out, Maps, 0.0f);
         }
     }
+    for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pair_slots[n]) * stride, Maps, 0.0f);  // hidden
+    if (!kDraws) return;
+    for (int i = 0; i < kTilePixels && background; i += kLanes)
+        for (int k = 0; k < 3; ++k)
+            store(color[k] + i, load(color[k] + i) + absolute(load(front.T + i)) * background[k]);
+    scatter<3>(color, raster.camera.width, tile, image);
 }
 
 // By the number of maps, from one on.
-constexpr void (*kWeigh[kMapsAtOnce])(const Raster&, int, const float*, int, float*) = {
-    weigh<1>, weigh<2>, weigh<3>, weigh<4>, weigh<5>, weigh<6>, weigh<7>, weigh<8>};
+using Weigh = void(const Raster&, int, const float*, int, float*, const float*, float*);
+template <bool kDraws>
+constexpr Weigh* kWeigh[kMapsAtOnce] = {weigh<1, kDraws>, weigh<2, kDraws>, weigh<3, kDraws>, weigh<4, kDraws>,
+                                        weigh<5, kDraws>, weigh<6, kDraws>, weigh<7, kDraws>, weigh<8, kDraws>};
 
 }  // namespace
 
-// maps: `count` numbers for each pixel; sums: as many for each pair, all of which are written.
-void weigh(const Raster& raster, const float* maps, int count, float* sums, int threads) {
+// maps: `count` numbers for each pixel; sums: as many for each pair, all of which are written. image: drawn, or null.
+void weigh(const Raster& raster, const float* maps, int count, float* sums, const float* background, float* image,
+           int threads) {
     const int tiles = raster.tiles_x * raster.tiles_y;
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4) if (threads > 1)
     for (int t = 0; t < tiles; ++t)
-        for (int first = 0; first < count; first += kMapsAtOnce)
-            kWeigh[std::min(count - first, kMapsAtOnce) - 1](raster, t, maps + first, count, sums + first);
+        for (int first = 0; first < count; first += kMapsAtOnce) {
+            const int place = std::min(count - first, kMapsAtOnce) - 1;
+            Weigh* const weigh_tile = image && first == 0 ? kWeigh<true>[place] : kWeigh<false>[place];
+            weigh_tile(raster, t, maps + first, count, sums + first, background, image);
+        }
 }
 
 void rasterize(const Raster& raster, const float* background, float* image, float* alpha, int threads) {

@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 3
+#define SGS_ABI_VERSION 4
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -32,12 +32,13 @@ void* sgs_raster_forward(
     const float* background, const float* screen_offsets, const uint8_t* drawn_tiles, int64_t trained, float* image,
     float* alpha, float* radii, int threads);
 /* weights [N,C]: for each Gaussian the sum over the pixels of its blending weight times each of maps [H,W,C], C =
- * channels >= 1. Takes C numbers of memory for each pair of a Gaussian and a tile. Returns 0, or 1 where memory does not
- * suffice. */
+ * channels >= 1. Takes C numbers of memory for each pair of a Gaussian and a tile. image [H,W,3]: the picture of colors
+ * [N,3] over background [3] or null, drawn in the same pass; or null, as then is colors. Returns 0, or 1 where memory does
+ * not suffice. */
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* viewmat, const float* K, int width, int height, float near_plane, const float* maps, int channels,
-    float* weights, int threads);
+    const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
+    const float* background, const float* maps, int channels, float* weights, float* image, int threads);
 /* grad_image [H,W,3]; grad_alpha [H,W] or null. Returns 0, or 1 where memory does not suffice. */
 int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,
@@ -88,6 +89,17 @@ struct sgs_sweep_view {
 void sgs_sweep(
     const struct sgs_sweep_view* views, int view_count, int view_index, const int64_t* pixels, const float* farthest,
     int64_t count, int planes, int least_supports, float most_contradictions, float* depths, float* costs, int threads);
+
+/* A grey picture [h,w] beside another (kernels/reference_planes.py). */
+struct sgs_neighbour {
+    const float* picture;
+    int width, height;
+};
+/* How well neighbours correlate with picture [H,W] through planes: homographies double [planes, neighbours, 3, 3] from its pixels to
+ * theirs, window odd, noise added to variances. Out: scores [planes, H, W]. Returns 0, or 1 where memory does not suffice. */
+int sgs_plane_scores(
+    const float* picture, int height, int width, const struct sgs_neighbour* neighbours, int neighbour_count,
+    const double* homographies, int64_t planes, int window, float noise, float* scores);
 
 /* Anchors (of `count`) that can put a Gaussian into the picture, or into its tiles that are not zero; ascending. Reads
  * positions, scales and offsets. Returns their number, or -1 where memory does not suffice. */

@@ -24,6 +24,7 @@ from structgstream.kernels.raster_types import TileSelection, tile_grid
 PROTOCOLS = {
     "rasterize": operations.Rasterize,
     "blending_weights": operations.BlendingWeights,
+    "picture_and_weights": operations.PictureAndWeights,
     "l1_ssim": operations.L1SSIM,
     "volume": operations.Volume,
     "excess": operations.Excess,
@@ -32,6 +33,7 @@ PROTOCOLS = {
     "confident_flow": operations.ConfidentFlow,
     "lift": operations.Lift,
     "sweep": operations.Sweep,
+    "plane_scores": operations.PlaneScores,
     "generate_structured": operations.GenerateStructured,
     "adam_step": operations.AdamStep,
 }
@@ -67,6 +69,7 @@ def refused_by_the_type_checker(backend: Backend) -> None:
         device=backend.device,
         rasterize=rasterize,
         blending_weights=backend.rasterize,  # pyright: ignore[reportArgumentType]
+        picture_and_weights=backend.picture_and_weights,
         l1_ssim=backend.l1_ssim,
         volume=volume,
         excess=excess,
@@ -75,6 +78,7 @@ def refused_by_the_type_checker(backend: Backend) -> None:
         confident_flow=backend.confident_flow,
         lift=backend.lift,
         sweep=backend.sweep,
+        plane_scores=backend.plane_scores,
         generate_structured=backend.generate_structured,
         adam_step=backend.adam_step,
     )
@@ -179,3 +183,7 @@ def test_weights_of_blending_have_no_graph(build: Callable[[], Backend]) -> None
     weights = build().blending_weights(gaussians, camera.viewport(gaussians.means), maps)
     assert weights.shape == (len(gaussians), 2)
     assert not weights.requires_grad
+    picture, again = build().picture_and_weights(gaussians, camera.viewport(gaussians.means), maps)
+    assert picture.shape == (camera.height, camera.width, 3)
+    assert not picture.requires_grad
+    torch.testing.assert_close(again, weights)

@@ -26,3 +26,23 @@ def test_the_pixels_of_tiles_are_counted_without_being_made(width: int, height: 
         y, x = (int(axis.min()) for axis in torch.nonzero(pixels, as_tuple=True))
         assert (y // TILE_PIXELS, x // TILE_PIXELS) == divmod(place, columns)
     assert TileSelection(torch.ones(rows, columns, dtype=torch.bool), width, height).count_pixels() == width * height
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_tiles_of_pixels_are_those_that_hold_one(width: int, height: int) -> None:
+    pixels = torch.zeros(height, width, dtype=torch.bool)
+    assert not TileSelection.of(pixels).mask.any()
+    pixels[-1, -1] = True
+    found = TileSelection.of(pixels)
+    assert (found.width, found.height) == (width, height)
+    assert found.mask.nonzero().tolist() == [[size - 1 for size in tile_grid(width, height)]]
+    assert found.pixels()[-1, -1]
+
+
+def test_a_picture_of_two_has_one_in_the_tiles_and_the_other_around_them() -> None:
+    selection = TileSelection(torch.tensor([[True, False], [False, True]]), 20, 18)
+    one, other = (torch.rand(18, 20, 3, generator=torch.Generator().manual_seed(n)) for n in range(2))
+    found, inside = selection.choose(one, other), selection.pixels()
+    assert torch.equal(found[inside], one[inside])
+    assert torch.equal(found[~inside], other[~inside])
+    assert 0 < inside.sum() < inside.numel()

@@ -290,6 +290,34 @@ def test_blending_weights_do_not_depend_on_threads(isa: int, channels: int) -> N
 
 
 @native
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 6, 7, 8, 9])
+@pytest.mark.parametrize("background", [None, torch.tensor([0.2, 0.5, 0.9])])
+def test_a_picture_with_weights_is_both(isa: int, channels: int, background: Tensor | None) -> None:
+    splats = splats_of(*(value.float() for value in gaussians(2000)[:5]))
+    maps = torch.rand(HEIGHT, WIDTH, channels, generator=torch.Generator().manual_seed(3))
+    picture, weights = cpu_raster.picture_and_weights(splats, camera(torch.float32), maps, background=background)
+    drawn = cpu_raster.rasterize(splats, camera(torch.float32), background=background)
+    assert torch.equal(picture, drawn.image)
+    assert torch.equal(weights, cpu_raster.blending_weights(splats, camera(torch.float32), maps))
+
+
+@native
+@pytest.mark.parametrize("channels", [1, 3, 8, 9])
+def test_what_maps_leave_out_changes_no_weight(isa: int, channels: int) -> None:
+    """Blocks and tiles in which all maps are zero are passed over; with the picture they are not."""
+    splats = splats_of(*(value.float() for value in gaussians(2000)[:5]))
+    generator = torch.Generator().manual_seed(4)
+    maps = torch.zeros(HEIGHT, WIDTH, channels)
+    maps[17:20, 30:50] = torch.rand(3, 20, channels, generator=generator)
+    maps[40, 3] = 1.0
+    sparse = cpu_raster.blending_weights(splats, camera(torch.float32), maps)
+    _, everywhere = cpu_raster.picture_and_weights(splats, camera(torch.float32), maps)
+    assert 0 < (sparse[:, 0] > 0).sum() < 400, "most Gaussians reach no such pixel"
+    assert torch.equal(sparse, everywhere)
+    assert not cpu_raster.blending_weights(splats, camera(torch.float32), torch.zeros_like(maps)).any()
+
+
+@native
 def test_blending_weights_of_nothing(isa: int) -> None:
     nothing = splats_of(*(value[:0].float() for value in gaussians()[:5]))
     maps = torch.ones(HEIGHT, WIDTH, 5)

@@ -6,9 +6,16 @@ from dataclasses import replace
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.gaussians import concatenate
+from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.observation import flow_evidence, gather_maps, mover_centers, slot_count, sum_by_mover
+from structgstream.training.observation import (
+    flow_evidence,
+    mover_centers,
+    movers_of,
+    slot_count,
+    sum_by_mover,
+    weigh_maps,
+)
 from worlds import emerging_ball
 
 RIG = arc_rig(4, width=48, height=32)
@@ -16,31 +23,46 @@ CAMERA = RIG[RIG.training[0]]
 BACKEND = reference_backend()
 
 
+def gaussians_with_ids(ids: list[int]) -> Gaussians:
+    n = len(ids)
+    zeros = torch.zeros(n, 3)
+    return Gaussians(zeros, torch.zeros(n, 4), zeros, torch.zeros(n), zeros, torch.tensor(ids))
+
+
 def test_movers_are_anchors_then_free_gaussians() -> None:
     scene = random_scene(4, free=2)
     k = scene.anchors.offsets_per_anchor
     assert slot_count(scene) == 4 * k + 2
-    sums = torch.arange(float(slot_count(scene)))[:, None]
-    found = sum_by_mover(sums, scene)[:, 0]
+    drawn = gaussians_with_ids([*range(4 * k), 4 * k, 4 * k + 1])
+    found = sum_by_mover(drawn.ids[:, None].float(), movers_of(drawn, scene), scene)[:, 0]
     assert found.tolist() == [sum(range(i * k, i * k + k)) for i in range(4)] + [4 * k, 4 * k + 1]
+
+
+def test_movers_that_are_not_drawn_get_nothing() -> None:
+    scene = random_scene(4, free=2)
+    k = scene.anchors.offsets_per_anchor
+    drawn = gaussians_with_ids([k, 2 * k - 1, 4 * k + 1])
+    found = sum_by_mover(torch.tensor([[1.0], [2.0], [4.0]]), movers_of(drawn, scene), scene)
+    assert found[:, 0].tolist() == [0.0, 3.0, 0.0, 0.0, 0.0, 4.0]
 
 
 def test_all_movers_may_be_free_gaussians() -> None:
     """A scene without anchors is what moves where only free Gaussians do."""
     scene = random_scene(0, free=2)
-    assert sum_by_mover(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), scene).tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    drawn, sums = gaussians_with_ids([0, 1]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    assert sum_by_mover(sums, movers_of(drawn, scene), scene).tolist() == sums.tolist()
     assert torch.equal(mover_centers(scene, torch.ones(2)), scene.free.means)
 
 
-def test_gathered_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from_it() -> None:
+def test_weighed_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from_it() -> None:
     scene = random_scene(30, free=3)
     gaussians = scene.gaussians(CAMERA, BACKEND)
     maps = torch.ones(32, 48, 1)
-    alone = gather_maps(gaussians, scene, CAMERA, maps, BACKEND)
-    assert alone.shape == (slot_count(scene), 1)
+    alone = weigh_maps(gaussians, CAMERA, maps, BACKEND)
+    assert alone.shape == (len(gaussians), 1)
     ball = emerging_ball(0.99)
     before = replace(ball, means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
-    covered = gather_maps(gaussians, scene, CAMERA, maps, BACKEND, still=before)
+    covered = weigh_maps(gaussians, CAMERA, maps, BACKEND, still=before)
     assert covered.shape == alone.shape, "what hides is not told of"
     assert float(covered.sum()) < 0.8 * float(alone.sum())
     assert (covered <= alone + 1e-4).all()

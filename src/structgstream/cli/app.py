@@ -70,6 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # loaded, so it is set before any command imports it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     given = list(sys.argv[1:] if arguments is None else arguments)
+    # OpenCV's threads spin, too, after every call, and here its calls are small. Only `prepare` gives it large ones.
+    if given[:1] != ["prepare"]:
+        os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]
     if not given or given[0] in ("-h", "--help"):

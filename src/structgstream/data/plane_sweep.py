@@ -12,13 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.images import reduced_mask
 from structgstream.data.matching import back_project, inside, load_cv2, project
-from structgstream.data.plane_correlation import FloatImage, Neighbour, ReferenceWindow, plane_score
+from structgstream.data.plane_homographies import plane_homographies
+from structgstream.kernels.backend import processor_backend
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class SweepConfig:
     views: int = 2
     level_planes: bool = False
 
+
+FloatImage = NDArray[np.float32]
 
 # Small windows for texture and outlines, then large ones, on pictures reduced until their noise averages out, for
 # surfaces with little texture.
@@ -291,14 +295,18 @@ def _search(
     """
     offsets = family.inverse_offsets
     tilt = _rays_of_pixels(reference.camera) @ family.normal
-    window = ReferenceWindow.of(reference.grey, size=config.window, noise=config.noise)
-    pairs = [Neighbour.of(reference.camera, view.camera, view.grey) for view in neighbours]
-    scores = np.empty((len(offsets), *reference.grey.shape), np.float32)
+    cameras = [view.camera for view in neighbours]
+    homographies = plane_homographies(reference.camera, cameras, offsets[:, None] * family.normal)
+    own, others = torch.from_numpy(reference.grey), [torch.from_numpy(view.grey) for view in neighbours]
+    found = processor_backend().plane_scores(
+        own, others, torch.from_numpy(homographies), window=config.window, noise=config.noise**2
+    )
+    scores = found.numpy()
     margin = 0.01 * limits[1]
     for number, offset in enumerate(offsets):
         inverse_depth = tilt * offset
         outside = (inverse_depth < limits[0] - margin) | (inverse_depth > limits[1] + margin)
-        scores[number] = np.where(outside, -1, plane_score(window, pairs, family.normal * offset))
+        scores[number][outside] = -1
     last = len(offsets) - 1
     best = scores.argmax(0)
     peak = np.take_along_axis(scores, best[None], 0)[0]

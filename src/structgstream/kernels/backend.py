@@ -24,6 +24,8 @@ from structgstream.kernels.operations import (
     GenerateStructured,
     Lift,
     NeighbourDifference,
+    PictureAndWeights,
+    PlaneScores,
     Rasterize,
     Sweep,
     Volume,
@@ -47,6 +49,7 @@ class Backend:
     device: torch.device
     rasterize: Rasterize
     blending_weights: BlendingWeights
+    picture_and_weights: PictureAndWeights
     l1_ssim: L1SSIM
     volume: Volume
     excess: Excess
@@ -55,6 +58,7 @@ class Backend:
     confident_flow: ConfidentFlow
     lift: Lift
     sweep: Sweep
+    plane_scores: PlaneScores
     generate_structured: GenerateStructured
     adam_step: AdamStep
 
@@ -69,6 +73,7 @@ def reference_backend() -> Backend:
         reference_flow,
         reference_lift,
         reference_neighbours,
+        reference_planes,
         reference_raster,
         reference_ssim,
         reference_sweep,
@@ -80,6 +85,7 @@ def reference_backend() -> Backend:
         device=torch.device("cpu"),
         rasterize=reference_raster.rasterize,
         blending_weights=partial(reference_raster.blending_weights, reference_raster.rasterize),
+        picture_and_weights=partial(reference_raster.picture_and_weights, reference_raster.rasterize),
         l1_ssim=reference_ssim.l1_ssim,
         volume=reference_volume.volume,
         excess=reference_excess.excess,
@@ -88,6 +94,7 @@ def reference_backend() -> Backend:
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
+        plane_scores=reference_planes.plane_scores,
         generate_structured=reference_anchors.generate_structured,
         adam_step=reference_adam.adam_step,
     )
@@ -107,6 +114,7 @@ def cpu_backend() -> Backend:
         cpu_flow,
         cpu_lift,
         cpu_neighbours,
+        cpu_planes,
         cpu_raster,
         cpu_ssim,
         cpu_sweep,
@@ -120,6 +128,7 @@ def cpu_backend() -> Backend:
         device=torch.device("cpu"),
         rasterize=cpu_raster.rasterize,
         blending_weights=cpu_raster.blending_weights,
+        picture_and_weights=cpu_raster.picture_and_weights,
         l1_ssim=cpu_ssim.l1_ssim,
         volume=cpu_volume.volume,
         excess=cpu_excess.excess,
@@ -128,9 +137,17 @@ def cpu_backend() -> Backend:
         confident_flow=cpu_flow.confident_flow,
         lift=cpu_lift.lift,
         sweep=cpu_sweep.sweep,
+        plane_scores=cpu_planes.plane_scores,
         generate_structured=cpu_anchors.generate_structured,
         adam_step=cpu_adam.adam_step,
     )
+
+
+def processor_backend() -> Backend:
+    """The cpu back-end, or the reference where the native library was not built."""
+    from structgstream.kernels._load import native_reason
+
+    return cpu_backend() if native_reason() is None else reference_backend()
 
 
 def cuda_backend() -> Backend:
@@ -163,11 +180,13 @@ def cuda_backend() -> Backend:
         raise BackendError(reason)
     library, sentence = kernel_library()
     _log.log(logging.WARNING if library is None else logging.INFO, sentence)
+    drawing = partial(rasterize, library=library)
     return Backend(
         name="cuda",
         device=torch.device("cuda"),
-        rasterize=partial(rasterize, library=library),
-        blending_weights=partial(reference_raster.blending_weights, partial(rasterize, library=library)),
+        rasterize=drawing,
+        blending_weights=partial(reference_raster.blending_weights, drawing),
+        picture_and_weights=partial(reference_raster.picture_and_weights, drawing),
         l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
         volume=reference_volume.volume,
         excess=reference_excess.excess,
@@ -176,6 +195,7 @@ def cuda_backend() -> Backend:
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep if library is None else partial(cuda_sweep.sweep, library),
+        plane_scores=processor_backend().plane_scores,
         generate_structured=reference_anchors.generate_structured
         if library is None
         else partial(cuda_generation.generate_structured, library),

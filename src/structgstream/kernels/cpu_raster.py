@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rasteriser in this package's C++; the contracts are ``kernels.operations.Rasterize`` and ``BlendingWeights``."""
+"""The rasteriser in this package's C++; contracts: ``Rasterize``, ``BlendingWeights`` and ``PictureAndWeights``."""
 
 import weakref
 from dataclasses import dataclass
@@ -156,20 +156,39 @@ def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> 
     Raises:
         OutOfMemoryError: there is no memory for the tiles' lists of Gaussians.
     """
+    return _weights(gaussians, viewport, maps, background=None, image=None)
+
+
+def picture_and_weights(
+    gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """See ``kernels.operations.PictureAndWeights``; float32, in one pass.
+
+    Raises:
+        OutOfMemoryError: there is no memory for the tiles' lists of Gaussians.
+    """
+    image = torch.empty(viewport.height, viewport.width, 3)
+    return image, _weights(gaussians, viewport, maps, background=background, image=image)
+
+
+def _weights(
+    gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None, image: Tensor | None
+) -> Tensor:
     tensors = [_constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
+    colors = None if image is None else _constant(gaussians.colors)
     maps = maps.float().contiguous()
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
     assert (width, height) == (viewport.width, viewport.height), maps.shape
-    view = _View(_in_float32(viewport), None, None, 0)
+    view = _View(_in_float32(viewport), None if background is None else _constant(background), None, 0)
     weights = torch.empty(len(gaussians), channels)
     failed = native_library().sgs_raster_weights(
         len(gaussians),
-        *addresses(*tensors),
+        *addresses(*tensors, colors),
         *view.arguments(),
-        *addresses(maps),
+        *addresses(view.background, maps),
         channels,
-        *addresses(weights),
+        *addresses(weights, image),
         torch.get_num_threads(),
     )
     if failed:

@@ -70,6 +70,21 @@ class BlendingWeights(Protocol):
     def __call__(self, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor: ...
 
 
+class PictureAndWeights(Protocol):
+    """The picture ``[H, W, 3]`` of ``Rasterize`` and the sums ``[N, C]`` of ``BlendingWeights``, without graph.
+
+    Args:
+        gaussians: to draw; their ids are not read.
+        viewport: the camera.
+        maps: as for ``BlendingWeights``.
+        background: ``[3]``, black when None.
+    """
+
+    def __call__(
+        self, gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]: ...
+
+
 class L1SSIM(Protocol):
     """Mean absolute difference and mean SSIM of ``gains * image + biases`` against ``target``.
 
@@ -210,6 +225,27 @@ class Sweep(Protocol):
         least_supports: int,
         most_contradictions: float,
     ) -> Swept: ...
+
+
+class PlaneScores(Protocol):
+    """How well a picture correlates with its neighbours seen through each of ``P`` planes: ``[P, H, W]``.
+
+    For each neighbour the zero-mean normalised cross-correlation over ``window`` x ``window`` pixels of the picture
+    with the neighbour's bilinear samples; -1 where it does not see the whole window. A score is the mean of the better
+    half of the neighbours (rounded up), in which one that does not see the window counts half of the best. Tensors
+    are on the CPU.
+
+    Args:
+        picture: ``[H, W]`` grey, in 0 ... 1.
+        neighbours: ``N`` grey pictures ``[h, w]``, at least one.
+        homographies: ``[P, N, 3, 3]`` float64, from pixel indices of the picture to those of each neighbour.
+        window: side in pixels, odd.
+        noise: added to variances, so that textureless windows correlate with none.
+    """
+
+    def __call__(
+        self, picture: Tensor, neighbours: Sequence[Tensor], homographies: Tensor, *, window: int, noise: float
+    ) -> Tensor: ...
 
 
 class GenerateStructured(Protocol):

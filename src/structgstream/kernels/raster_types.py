@@ -34,6 +34,15 @@ class TileSelection:
         assert self.mask.dtype == torch.bool, self.mask.dtype
         assert self.mask.shape == tile_grid(self.width, self.height), (self.mask.shape, self.width, self.height)
 
+    @classmethod
+    def of(cls, pixels: Tensor) -> "TileSelection":
+        """The tiles that hold a pixel of the mask ``[H, W]``."""
+        height, width = pixels.shape
+        rows, columns = tile_grid(width, height)
+        padded = pixels.new_zeros(rows * TILE_PIXELS, columns * TILE_PIXELS)
+        padded[:height, :width] = pixels
+        return cls(padded.reshape(rows, TILE_PIXELS, columns, TILE_PIXELS).any(3).any(1), width, height)
+
     def pixels(self) -> Tensor:
         """Mask ``[H, W]`` of the pixels in the selected tiles; the same tensor in every call."""
         return self._pixels
@@ -42,6 +51,15 @@ class TileSelection:
     def _pixels(self) -> Tensor:
         rows = self.mask.repeat_interleave(TILE_PIXELS, 0)
         return rows.repeat_interleave(TILE_PIXELS, 1)[: self.height, : self.width]
+
+    def choose(self, inside: Tensor, outside: Tensor) -> Tensor:
+        """A picture ``[H, W, 3]``: ``inside`` in the selected tiles, ``outside`` elsewhere."""
+        return torch.where(self._samples, inside, outside)
+
+    @cached_property
+    def _samples(self) -> Tensor:
+        """Mask ``[H, W, 3]``: a mask that is broadcast over the channels takes two to three times as long."""
+        return torch.stack([self._pixels] * 3, dim=-1)
 
     def count_pixels(self) -> int:
         """Number of pixels in the selected tiles."""

@@ -159,6 +159,20 @@ def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewp
     return torch.cat(found, dim=1)
 
 
+def picture_and_weights(
+    rasterize: Rasterize,
+    gaussians: Gaussians,
+    viewport: Viewport,
+    maps: Tensor,
+    *,
+    background: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """See ``kernels.operations.PictureAndWeights``: one after the other, with any rasteriser."""
+    with torch.no_grad():
+        image = rasterize(gaussians, viewport, background=background).image
+    return image, blending_weights(rasterize, gaussians, viewport, maps)
+
+
 def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:
     """Mask ``[n]`` of the boxes (pixels) that contain a pixel centre of ``tiles``, or no pixel centre at all."""
     width, height = tiles.width, tiles.height

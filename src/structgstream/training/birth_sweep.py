@@ -148,8 +148,8 @@ class Sweep:
         """Of a rendering ``[H, W, 3]`` within the focus; None for a view without one."""
         picture, focus = view.colors, self.focuses.get(view.index)
         if image is not None and focus is not None:
-            inside = focus.tiles.pixels()[..., None]
-            picture = torch.where(inside, apply_camera_color(image, self.moving.camera_color, view.index), picture)
+            drawn = apply_camera_color(image, self.moving.camera_color, view.index)
+            picture = focus.tiles.choose(drawn, picture)
         return view_residual(picture.clamp(0.0, 1.0), view, floor=self.floor, config=self.config)
 
     def depth_map(self, view: View) -> Tensor:

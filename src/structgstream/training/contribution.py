@@ -22,7 +22,7 @@ def contributions(scene: Scene, cameras: Sequence[Camera], *, scale: float, back
     for camera in cameras:
         small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         generated = scene.structured(small, backend).gaussians
-        maps = torch.ones(small.height, small.width, 2, device=total.device)
+        maps = torch.ones(small.height, small.width, 1, device=total.device)
         weights = backend.blending_weights(generated, small.viewport(generated.means), maps)[:, 0]
         total.index_add_(0, generated.ids // scene.anchors.offsets_per_anchor, weights)
     return total / total.mean().clamp(min=1e-12)

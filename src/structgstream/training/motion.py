@@ -21,9 +21,17 @@ from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, Granularity, fields_of, parameters_of
 from structgstream.training.flow_maps import USUAL_FLOW, FlowConfig
-from structgstream.training.observation import MotionEvidence, flow_evidence, gather_maps, mover_centers, sum_by_mover
+from structgstream.training.observation import (
+    MotionEvidence,
+    flow_evidence,
+    mover_centers,
+    movers_of,
+    slot_count,
+    sum_by_mover,
+    weigh_maps,
+)
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
-from structgstream.training.residuals import ResidualFloor, apply_camera_color, rendering_residual
+from structgstream.training.residuals import ResidualFloor, apply_camera_color, picture_residual
 from structgstream.training.trust import CLEAR_SHIFT, ViewChange, is_scene_cut, suspects, trusted_views
 from structgstream.training.views import View, area_mean, blackened, mean_of_counting
 
@@ -248,29 +256,39 @@ def _view_evidence(
     size = (small.camera.height, small.camera.width)
     counting = torch.ones(size).to(gaussians.means) if small.mask is None else small.mask.to(gaussians.means)
     enlarged = view.camera.height * view.camera.width / counting.numel()
+    coverage = gaussians.means.new_zeros(slot_count(scene))
     if change is None:
-        covered = enlarged * gather_maps(gaussians, scene, small.camera, counting[..., None], backend)
+        covered = enlarged * weigh_maps(gaussians, small.camera, counting[..., None], backend)
+        coverage[gaussians.ids] = covered[:, 0]
         none = torch.zeros_like(ease, dtype=torch.bool)
-        return _ViewEvidence(none, none, covered[:, 0], covered, ViewChange(None, 0.0, identical=False))
+        return _ViewEvidence(none, none, coverage, covered, ViewChange(None, 0.0, identical=False))
     part = area_mean(change.changed[None, None].to(gaussians.means), size)
     difference = float(part.mean() if view.mask is None else mean_of_counting(change.changed.float(), view.mask))
-    wrong_share = 0.0
-    if floor is not None and view.index in floor.maps and config.residual_threshold > 0.0:
-        missing = rendering_residual(gaussians, small, scene, backend)
-        wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
-        wrong_share = float(mean_of_counting(wrong, small.mask))
-        part = torch.maximum(part, max_pool2d(wrong[None, None], 3, stride=1, padding=1))
-    maps = [counting[..., None], (part[0, 0] * counting)[..., None]]
+    part = part[0, 0]
+    maps = [counting[..., None], (part * counting)[..., None]]
     if change.flow is not None:
         maps.append(change.flow)
-    sums = gather_maps(gaussians, scene, small.camera, torch.cat(maps, dim=-1), backend)
+    viewport, background = small.camera.viewport(gaussians.means), scene.background(small.camera)
+    drawn, sums = backend.picture_and_weights(gaussians, viewport, torch.cat(maps, dim=-1), background=background)
+    wrong_share = 0.0
+    if floor is not None and view.index in floor.maps and config.residual_threshold > 0.0:
+        missing = picture_residual(drawn, small, scene)
+        wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
+        wrong_share = float(mean_of_counting(wrong, small.mask))
+        around = max_pool2d(wrong[None, None], 3, stride=1, padding=1)[0, 0]
+        beyond = (torch.maximum(part, around) - part) * counting
+        # The picture had to be drawn first; the few pixels in question are weighed by themselves.
+        sums[:, 1:2] += weigh_maps(gaussians, small.camera, beyond[..., None], backend)
+        part = torch.maximum(part, around)
     sums *= enlarged
-    total, inside = sum_by_mover(sums[:, :2], scene).unbind(1)
+    coverage[gaussians.ids] = sums[:, 0]
+    of_movers = sum_by_mover(sums, movers_of(gaussians, scene), scene)
+    total, inside = of_movers[:, 0], of_movers[:, 1]
     return _ViewEvidence(
         seen=total > config.least_pixels,
         votes=(inside > config.least_pixels * ease) & (inside > config.least_share * ease * total),
-        coverage=sums[:, 0],
-        flows=sum_by_mover(sums[:, [2, 3, 4, 0, 5, 6, 7]], scene) if change.flow is not None else total,
+        coverage=coverage,
+        flows=of_movers[:, [2, 3, 4, 0, 5, 6, 7]] if change.flow is not None else total,
         change=ViewChange(difference, wrong_share, identical=change.identical),
-        changed=part[0, 0] > 0.0,
+        changed=part > 0.0,
     )

@@ -19,10 +19,17 @@ from structgstream.scene.scene import Scene
 from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.lifting import LiftConfig, LiftedMotion, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
-from structgstream.training.observation import flow_evidence, gather_maps, mover_centers, sum_by_mover
+from structgstream.training.observation import (
+    flow_evidence,
+    mover_centers,
+    movers_of,
+    slot_count,
+    sum_by_mover,
+    weigh_maps,
+)
 from structgstream.training.partition import Partition, focus_views
 from structgstream.training.residuals import apply_camera_color
-from structgstream.training.views import View
+from structgstream.training.views import View, blackened
 
 
 @dataclass(frozen=True)
@@ -134,7 +141,7 @@ def residual_motion(
     """
     seen = [view for view in views if view.index in focuses]
     folded = moving.with_folded_appearance()
-    sums, coverage = [], moving.anchors.positions.new_zeros(())
+    sums, coverage = [], moving.anchors.positions.new_zeros(slot_count(moving))
     with torch.no_grad():
         for view in seen:
             focus, small = focuses[view.index], view.reduced(scale)
@@ -143,15 +150,15 @@ def residual_motion(
             picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
             inside = focus.tiles.pixels() if view.mask is None else focus.tiles.pixels() & view.mask
             # Outside the tiles nothing was drawn: there the picture replaces the rendering.
-            picture = torch.where(inside[..., None], picture, view.image)
+            picture = focus.tiles.choose(blackened(picture, view.mask), view.image)
             size = (small.camera.height, small.camera.width)
             counting = torch.ones(size) if small.mask is None else small.mask
             flow = flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend)
-            maps = [flow, counting[..., None].to(image), small.colors]
-            found = gather_maps(gaussians, folded, small.camera, torch.cat(maps, dim=-1), backend, still=focus.still)
+            maps = torch.cat([flow, counting[..., None].to(image), small.colors], dim=-1)
+            found = weigh_maps(gaussians, small.camera, maps, backend, still=focus.still)
             found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
-            sums.append(sum_by_mover(found, folded))
-            coverage = coverage + found[:, 3]
+            sums.append(sum_by_mover(found, movers_of(gaussians, folded), folded))
+            coverage[gaussians.ids] += found[:, 3]
     nothing = torch.zeros(len(moving.anchors) + len(moving.free), 3).to(moving.anchors.positions)
     if not seen:
         return LiftedMotion(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))

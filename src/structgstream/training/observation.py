@@ -39,30 +39,20 @@ class MotionEvidence:
         return MotionEvidence(self.weights[:, movers], self.flows[:, movers], self.colors[movers])
 
 
-def gather_maps(
-    gaussians: Gaussians,
-    scene: Scene,
-    camera: Camera,
-    maps: Tensor,
-    backend: Backend,
-    *,
-    still: Gaussians | None = None,
+def weigh_maps(
+    gaussians: Gaussians, camera: Camera, maps: Tensor, backend: Backend, *, still: Gaussians | None = None
 ) -> Tensor:
-    """Sums of ``maps`` ``[h, w, C]`` over the pixels by blending weight, by id (Note [Ids]): ``[M * K + F, C]``.
+    """Sums of ``maps`` ``[h, w, C]`` over the pixels by blending weight, of each Gaussian: ``[N, C]``.
 
     Args:
-        gaussians: of ``scene`` for the camera.
-        scene: defines the ids.
+        gaussians: for the camera.
         camera: of the maps' size.
         maps: to sum.
         backend: the compute back-end.
         still: further Gaussians, which only take part in occlusion.
     """
     drawn = gaussians if still is None else concatenate(gaussians, still)
-    found = backend.blending_weights(drawn, camera.viewport(drawn.means), maps)
-    sums = found.new_zeros(slot_count(scene), maps.shape[-1])
-    sums[gaussians.ids] = found[: len(gaussians)]
-    return sums
+    return backend.blending_weights(drawn, camera.viewport(drawn.means), maps)[: len(gaussians)]
 
 
 def slot_count(scene: Scene) -> int:
@@ -70,10 +60,16 @@ def slot_count(scene: Scene) -> int:
     return len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
 
 
-def sum_by_mover(sums: Tensor, scene: Scene) -> Tensor:
-    """Sums by id ``[M * K + F, C]`` as sums by mover ``[M + F, C]``."""
+def movers_of(gaussians: Gaussians, scene: Scene) -> Tensor:
+    """Row ``[N]`` of each Gaussian's mover (Note [Movers])."""
     m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
-    return torch.cat([sums[: m * k].reshape(m, k, sums.shape[1]).sum(1), sums[m * k :]])
+    return torch.where(gaussians.ids < m * k, gaussians.ids // k, gaussians.ids - m * k + m)
+
+
+def sum_by_mover(sums: Tensor, movers: Tensor, scene: Scene) -> Tensor:
+    """Sums ``[N, C]`` of Gaussians as sums of movers, ``[M + F, C]``; ``movers`` as of :func:`movers_of`."""
+    found = sums.new_zeros(len(scene.anchors) + len(scene.free), sums.shape[1])
+    return found.index_add_(0, movers, sums)
 
 
 def flow_evidence(sums: Sequence[Tensor], *, least_pixels: float, most_pixels: float) -> MotionEvidence:

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.birth_sweep import Missing, Sweep, missing_share
 from structgstream.training.births import BirthConfig, Births, blamed_mask
-from structgstream.training.observation import gather_maps
+from structgstream.training.observation import weigh_maps
 from structgstream.training.partition import Partition
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View
@@ -125,11 +126,14 @@ def _blamed_mask(
         focus, camera = focuses.get(view.index), view.camera
         if focus is None:
             continue
-        wrong_pixels = entry.residual.wrong.to(entry.residual.missing_share)
-        counting = torch.ones_like(wrong_pixels) if view.mask is None else view.mask.to(wrong_pixels)
-        maps = torch.stack([counting, wrong_pixels], dim=-1)
-        sums = gather_maps(moving.gaussians(camera, backend), moving, camera, maps, backend, still=focus.still)
-        of_free = sums[len(sums) - len(moving.free) :]
+        # Elsewhere free Gaussians cover nothing: maps that are zero there cost nothing.
+        free = moving.free_gaussians()
+        reached = backend.rasterize(free, camera.viewport(free.means)).alpha > 0.0
+        counting = reached if view.mask is None else reached & view.mask
+        maps = torch.stack([counting, counting & entry.residual.wrong], dim=-1).to(entry.residual.missing_share)
+        gaussians = moving.with_free_gaussians(moving.structured(camera, backend, tiles=TileSelection.of(reached)))
+        sums = weigh_maps(gaussians, camera, maps, backend, still=focus.still)
+        of_free = sums[len(sums) - len(moving.free) :]  # Free Gaussians are the last, and all there.
         coverage.append(of_free[:, 0])
         wrong.append(of_free[:, 1])
     return blamed_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, config=config)

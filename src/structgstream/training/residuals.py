@@ -74,7 +74,12 @@ def residual(picture: Tensor, image: Tensor, mask: Tensor | None = None) -> Tens
 def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
     """The :func:`residual` of drawing ``gaussians``, those of ``scene``, for ``view``."""
     rendering = draw(gaussians, view.camera, backend, background=scene.background(view.camera))
-    return residual(apply_camera_color(rendering.image, scene.camera_color, view.index), view.image, view.mask)
+    return picture_residual(rendering.image, view, scene)
+
+
+def picture_residual(drawn: Tensor, view: View, scene: Scene) -> Tensor:
+    """The :func:`residual` of ``drawn``, a rendering of ``scene`` for ``view`` without colour correction."""
+    return residual(apply_camera_color(drawn, scene.camera_color, view.index), view.image, view.mask)
 
 
 def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> float:

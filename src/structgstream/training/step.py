@@ -61,19 +61,23 @@ class ViewLoss(Loss):
 
     def squared_error(self, view: View) -> Tensor:
         """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels that count."""
-        rendered, picture = self.rendering.image, view.image
-        masks = [] if self.focus is None else [self.focus.tiles.pixels()]
-        masks += [] if view.mask is None else [view.mask]
-        inside = None if not masks else masks[0] if len(masks) == 1 else masks[0] & masks[1]
+        rendered = self.rendering.image
+        tiles = None if self.focus is None else self.focus.tiles
+        masks = [view.mask, None if tiles is None else tiles.pixels()]
+        inside = [mask for mask in masks if mask is not None]
         with torch.no_grad():
-            # On a GPU the host would have to wait for the number of pixels.
-            if inside is not None and rendered.device.type == "cpu":
-                rendered, picture, inside = rendered[inside], picture[inside], None
-            corrected = (rendered * self.gains + self.biases).clamp_(0.0, 1.0)
-            squares = (corrected - picture.to(corrected) / 255.0).square()
-            if inside is None:
-                return squares.sum() / max(squares.numel(), 1)
-            return (squares.sum(-1) * inside).sum() / (3.0 * inside.sum().clamp(min=1.0))
+            # By rows instead of pixels of three numbers, which takes a sixth of the time.
+            width = rendered.shape[1]
+            corrected = rendered.flatten(1) * self.gains.repeat(width) + self.biases.repeat(width)
+            corrected = blackened(corrected.clamp_(0.0, 1.0).reshape(rendered.shape), view.mask)
+            truth = view.colors
+            if tiles is not None:
+                corrected = tiles.choose(corrected, truth)
+            total = (corrected - truth).square_().sum()
+            if not inside:
+                return total / max(truth.numel(), 1)
+            # The number of pixels stays a tensor: on a GPU the host would have to wait for it.
+            return total / (3.0 * torch.stack(inside).all(0).sum().clamp(min=1.0))
 
 
 @dataclass(frozen=True)

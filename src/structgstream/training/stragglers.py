@@ -18,7 +18,7 @@ from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig, blamed_mask, view_residual
 from structgstream.training.neighbours import nearest
-from structgstream.training.observation import gather_maps, sum_by_mover
+from structgstream.training.observation import movers_of, sum_by_mover, weigh_maps
 from structgstream.training.residuals import ResidualFloor, apply_camera_color
 from structgstream.training.rounding import pixel_size
 from structgstream.training.views import View
@@ -107,7 +107,8 @@ def _wrong_anchors(
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
         gaussians = folded.gaussians(small.camera, backend)
         maps = torch.stack([counting, pixels], dim=-1)
-        sums = sum_by_mover(gather_maps(gaussians, folded, small.camera, maps, backend, still=focus.still), folded)
+        of_gaussians = weigh_maps(gaussians, small.camera, maps, backend, still=focus.still)
+        sums = sum_by_mover(of_gaussians, movers_of(gaussians, folded), folded)
         coverage.append(sums[: len(moving.anchors), 0])
         wrong.append(sums[: len(moving.anchors), 1])
     if not coverage:

@@ -18,18 +18,26 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.scene import Scene
 from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.lifting import LiftConfig, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
 from structgstream.training.motion_start import with_displacements
-from structgstream.training.observation import MotionEvidence, flow_evidence, mover_centers, slot_count
+from structgstream.training.observation import (
+    MotionEvidence,
+    flow_evidence,
+    mover_centers,
+    movers_of,
+    slot_count,
+    sum_by_mover,
+    weigh_maps,
+)
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
 from structgstream.training.residuals import apply_camera_color
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.trust import ViewChange, trusted_views
-from structgstream.training.views import View, area_mean, reduced, training_views
+from structgstream.training.views import View, area_mean, blackened, reduced, training_views
 
 
 @dataclass(frozen=True)
@@ -191,19 +199,20 @@ class _Seen:
 
 def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> _Seen:
     backend, motion = tracker.backend, tracker.motion
-    tiles = _changed_tiles(change.changed)
+    tiles = TileSelection.of(change.changed)
     gaussians = scene.with_free_gaussians(scene.structured(view.camera, backend, tiles=tiles))
     small = view.reduced(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
     inside = area_mean(_counting(tiles, view)[None, None].float(), size)[0, 0]
     part = area_mean(change.changed[None, None].float(), size)[0, 0]
     assert change.flow is not None, "estimated for all that are tracked with"
-    # In the order of the evidence, then the changed part.
-    maps = torch.cat([change.flow[..., :3], inside[..., None], change.flow[..., 3:], part[..., None]], dim=-1)
-    movers = _movers_of(gaussians, scene)
-    sums = backend.blending_weights(gaussians, small.camera.viewport(gaussians.means), maps)
+    # In the order of the evidence, then the changed part. All are zero outside the tiles, which then cost nothing.
+    colors = change.flow[..., 3:] * inside[..., None]
+    maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
+    movers = movers_of(gaussians, scene)
+    sums = weigh_maps(gaussians, small.camera, maps, backend)
     sums *= _enlarged(tracker, view, size)
-    moved = _by_mover(sums, movers, scene)
+    moved = sum_by_mover(sums, movers, scene)
     total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, identical=change.identical)
@@ -221,27 +230,15 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     counting = _counting(seen.tiles, view)
     # Outside the tiles nothing was drawn: there the picture replaces the rendering.
     rendered = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-    picture = torch.where(counting[..., None], rendered, view.image)
+    picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.reduced(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
     flow = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
-    maps = torch.cat([flow, inside[..., None], small.colors], dim=-1)
-    sums = backend.blending_weights(moved, small.camera.viewport(moved.means), maps)
+    maps = torch.cat([flow, inside[..., None], small.colors * inside[..., None]], dim=-1)
+    sums = weigh_maps(moved, small.camera, maps, backend)
     sums *= _enlarged(tracker, view, size)
-    return _by_mover(sums, seen.movers, scene)
-
-
-def _movers_of(gaussians: Gaussians, scene: Scene) -> Tensor:
-    """Row of each Gaussian's mover (Note [Movers])."""
-    m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
-    return torch.where(gaussians.ids < m * k, gaussians.ids // k, gaussians.ids - m * k + m)
-
-
-def _by_mover(sums: Tensor, movers: Tensor, scene: Scene) -> Tensor:
-    """Sums ``[N, C]`` of Gaussians as sums of their movers, ``[M + F, C]``; in the order of the Gaussians."""
-    found = sums.new_zeros(len(scene.anchors) + len(scene.free), sums.shape[1])
-    return found.index_add_(0, movers, sums)
+    return sum_by_mover(sums, seen.movers, scene)
 
 
 def _coverage(seen: Sequence[_Seen], scene: Scene) -> Tensor:
@@ -264,13 +261,3 @@ def _enlarged(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
 def _counting(tiles: TileSelection, view: View) -> Tensor:
     """Mask ``[H, W]`` of the pixels in the tiles that count."""
     return tiles.pixels() if view.mask is None else tiles.pixels() & view.mask
-
-
-def _changed_tiles(changed: Tensor) -> TileSelection:
-    """The tiles with changed pixels of the mask ``[H, W]``."""
-    height, width = changed.shape
-    rows, columns = tile_grid(width, height)
-    padded = changed.new_zeros(rows * TILE_PIXELS, columns * TILE_PIXELS)
-    padded[:height, :width] = changed
-    hit = padded.reshape(rows, TILE_PIXELS, columns, TILE_PIXELS).any(3).any(1)
-    return TileSelection(hit, width, height)
