@@ -15,7 +15,19 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Read once, when torch loads OpenMP.
 
-NAMES = ("raster", "ssim", "decode", "adam", "entropy", "compact", "iteration", "frame0", "online", "render")
+NAMES = (
+    "raster",
+    "ssim",
+    "decode",
+    "adam",
+    "planes",
+    "entropy",
+    "compact",
+    "iteration",
+    "frame0",
+    "online",
+    "render",
+)
 
 
 def parsed(arguments: list[str] | None = None) -> argparse.Namespace:

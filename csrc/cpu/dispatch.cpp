@@ -36,6 +36,7 @@
         double, int);                                                                                                 \
     void lift_flow(const FlowLift&, int);                                                                             \
     void plane_scores(const PlaneSweep&);                                                                             \
+    double change_bits(const float*, const float*, int64_t, float, float*);                                           \
     }
 
 SGS_DECLARE(baseline)
@@ -323,6 +324,10 @@ void sgs_anchors_backward(
     const sgs_anchors* anchors, const sgs_selection* selection, const sgs_gaussians* drawn,
     const sgs_gaussian_gradients* from, const sgs_anchor_gradients* to, int threads) {
     SGS_DISPATCH(anchors_backward(*anchors, *selection, *drawn, *from, *to, threads))
+}
+
+double sgs_change_bits(const float* values, const float* before, int64_t count, float step, float* gradient) {
+    SGS_DISPATCH(change_bits(values, before, count, step, gradient))
 }
 
 void sgs_adam_step(

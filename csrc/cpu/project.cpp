@@ -89,20 +89,6 @@ struct Footprint {
     }
 };
 
-// log2 of x in [2^-126, 1]: x = m 2^e with m in [sqrt(1/2), sqrt(2)), and log m = 2 atanh((m - 1) / (m + 1)).
-inline vf log_two(vf x) {
-    const vi shifted = (vi)x - 0x3f3504f3;
-    const vi exponent = shifted >> 23;
-    const vf m = (vf)((shifted & 0x007fffff) + 0x3f3504f3);
-    const vf t = (m - 1.0f) / (m + 1.0f), tt = t * t;
-    vf p = splat(1.0f / 9.0f);
-    p = p * tt + 1.0f / 7.0f;
-    p = p * tt + 1.0f / 5.0f;
-    p = p * tt + 1.0f / 3.0f;
-    p = p * tt + 1.0f;
-    return __builtin_convertvector(exponent, vf) + (2.0f * kLog2E) * t * p;
-}
-
 inline vi ceiling(vf x) {
     const vi towards_zero = __builtin_convertvector(x, vi);
     return towards_zero - (x > __builtin_convertvector(towards_zero, vf));  // a true comparison is minus one

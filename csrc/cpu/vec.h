@@ -75,6 +75,20 @@ inline vf exponential(vf x) {
     return (vf)((vi)p + ((vi)rounded << 23));  // the low bits of `rounded` hold n; its own exponent is shifted out
 }
 
+// log2 of a normal positive x = m 2^e with m in [sqrt(1/2), sqrt(2)), and log m = 2 atanh((m - 1) / (m + 1)).
+inline vf log_two(vf x) {
+    const vi shifted = (vi)x - 0x3f3504f3;
+    const vi exponent = shifted >> 23;
+    const vf m = (vf)((shifted & 0x007fffff) + 0x3f3504f3);
+    const vf t = (m - 1.0f) / (m + 1.0f), tt = t * t;
+    vf p = splat(1.0f / 9.0f);
+    p = p * tt + 1.0f / 7.0f;
+    p = p * tt + 1.0f / 5.0f;
+    p = p * tt + 1.0f / 3.0f;
+    p = p * tt + 1.0f;
+    return __builtin_convertvector(exponent, vf) + 2.88539008f * t * p;
+}
+
 inline vf sigmoid(vf x) { return splat(1.0f) / (1.0f + exponential(-x)); }
 
 // tanh with full relative precision near zero, where the sign of an opacity decides what is drawn.

@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 4
+#define SGS_ABI_VERSION 5
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -133,6 +133,9 @@ void sgs_excess_backward(
 double sgs_neighbour_difference(
     const float* values, const int64_t* neighbours, const float* shares, int64_t count, int64_t each, float slack,
     float* gradient);
+
+/* Sum of log2(1 + |values - before| / step) over `count` numbers, returned, and its gradient by the values. */
+double sgs_change_bits(const float* values, const float* before, int64_t count, float step, float* gradient);
 
 /* Adam, in place. rows: null, or `count` row numbers (int64) of `width` numbers each. */
 void sgs_adam_step(

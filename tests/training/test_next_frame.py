@@ -204,5 +204,5 @@ def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
 
 def test_prices_are_added_to_the_loss() -> None:
     plain = hooks_of(started())
-    priced = replace(plain, bit_price=cast(Any, SimpleNamespace(price=lambda values: torch.tensor(0.5))))
+    priced = replace(plain, bit_price=cast(Any, SimpleNamespace(price=lambda values, backend: torch.tensor(0.5))))
     torch.testing.assert_close(priced.loss(1, VIEWS[0]).total, plain.loss(1, VIEWS[0]).total + 0.5)

@@ -5,8 +5,11 @@ import pytest
 import torch
 
 from rigs import random_scene
+from structgstream.kernels.backend import reference_backend
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.price import BitPrice
+
+BACKEND = reference_backend()
 
 
 def test_leaving_a_bin_has_a_price() -> None:
@@ -14,14 +17,16 @@ def test_leaving_a_bin_has_a_price() -> None:
     steps = {"anchor_positions": 0.5, "offset_scales": 0.25, "covariance_mlp": 0.1}
     bit_price = BitPrice.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
     assert bit_price is not None
-    assert bit_price.price(parameters.values).item() == 0.0
+    assert bit_price.price(parameters.values, BACKEND).item() == 0.0
     values = dict(parameters.values)
     values["anchor_positions"] = values["anchor_positions"].detach().clone()
     values["anchor_positions"][2, 1] -= 0.5
     values["offset_scales"] = values["offset_scales"].detach().clone()
     values["offset_scales"][7, 0] += 0.75
-    assert bit_price.price(values).item() == pytest.approx(0.5 * (1.0 + 2.0) / 8000, rel=1e-4)
-    price = bit_price.price({**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1})
+    assert bit_price.price(values, BACKEND).item() == pytest.approx(0.5 * (1.0 + 2.0) / 8000, rel=1e-4)
+    price = bit_price.price(
+        {**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1}, BACKEND
+    )
     (gradient,) = torch.autograd.grad(price, [parameters.values["anchor_positions"]])
     assert (gradient > 0).all(), "it pulls back"
 
@@ -38,9 +43,9 @@ def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
     values: dict = {name: value.detach()[keep] for name, value in parameters.values.items() if name in steps}
     values["free_means"] = torch.cat([values["free_means"], old[:3].detach() + 7.0])
     values["free_colors"] = torch.cat([values["free_colors"], values["free_colors"][:3]])
-    assert bit_price.price(values).item() == 0.0
+    assert bit_price.price(values, BACKEND).item() == 0.0
     values["free_means"][2, 1] += 1.5  # Two bits.
-    assert bit_price.price(values).item() == pytest.approx(2.0 / 8000, rel=1e-4)
+    assert bit_price.price(values, BACKEND).item() == pytest.approx(2.0 / 8000, rel=1e-4)
 
 
 def test_the_gradient_of_the_price_is_that_of_its_formula() -> None:
@@ -48,7 +53,9 @@ def test_the_gradient_of_the_price_is_that_of_its_formula() -> None:
     before, change = torch.rand(7, 3, generator=generator), torch.rand(7, 3, generator=generator) - 0.5
     change[2] = 0.0
     value = (before + change).requires_grad_()
-    price = BitPrice(8000.0, {"anchor_positions": before}, {"anchor_positions": 0.1}).price({"anchor_positions": value})
+    price = BitPrice(8000.0, {"anchor_positions": before}, {"anchor_positions": 0.1}).price(
+        {"anchor_positions": value}, BACKEND
+    )
     formula = torch.log2(1.0 + (value - before).abs() / 0.1).sum()
     torch.testing.assert_close(price, formula)
     expected, found = (torch.autograd.grad(total, value)[0] for total in (formula, price))

@@ -18,6 +18,7 @@ from structgstream.kernels.operations import (
     L1SSIM,
     AdamStep,
     BlendingWeights,
+    ChangeBits,
     ChangedPixels,
     ConfidentFlow,
     Excess,
@@ -54,6 +55,7 @@ class Backend:
     volume: Volume
     excess: Excess
     neighbour_difference: NeighbourDifference
+    change_bits: ChangeBits
     changed_pixels: ChangedPixels
     confident_flow: ConfidentFlow
     lift: Lift
@@ -68,6 +70,7 @@ def reference_backend() -> Backend:
     from structgstream.kernels import (
         reference_adam,
         reference_anchors,
+        reference_bits,
         reference_change,
         reference_excess,
         reference_flow,
@@ -90,6 +93,7 @@ def reference_backend() -> Backend:
         volume=reference_volume.volume,
         excess=reference_excess.excess,
         neighbour_difference=reference_neighbours.neighbour_difference,
+        change_bits=reference_bits.change_bits,
         changed_pixels=reference_change.changed_pixels,
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
@@ -109,6 +113,7 @@ def cpu_backend() -> Backend:
     from structgstream.kernels import (
         cpu_adam,
         cpu_anchors,
+        cpu_bits,
         cpu_change,
         cpu_excess,
         cpu_flow,
@@ -133,6 +138,7 @@ def cpu_backend() -> Backend:
         volume=cpu_volume.volume,
         excess=cpu_excess.excess,
         neighbour_difference=cpu_neighbours.neighbour_difference,
+        change_bits=cpu_bits.change_bits,
         changed_pixels=cpu_change.changed_pixels,
         confident_flow=cpu_flow.confident_flow,
         lift=cpu_lift.lift,
@@ -162,6 +168,7 @@ def cuda_backend() -> Backend:
         cuda_ssim,
         cuda_sweep,
         reference_anchors,
+        reference_bits,
         reference_change,
         reference_excess,
         reference_flow,
@@ -191,6 +198,7 @@ def cuda_backend() -> Backend:
         volume=reference_volume.volume,
         excess=reference_excess.excess,
         neighbour_difference=reference_neighbours.neighbour_difference,
+        change_bits=reference_bits.change_bits,
         changed_pixels=reference_change.changed_pixels,
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,

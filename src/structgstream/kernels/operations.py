@@ -139,6 +139,18 @@ class NeighbourDifference(Protocol):
     def __call__(self, values: Tensor, neighbours: Tensor, shares: Tensor, *, slack: float) -> Tensor: ...
 
 
+class ChangeBits(Protocol):
+    """Sum ``[]`` of log2(1 + |values - before| / step) over all numbers of all tensors; gradients flow to ``values``.
+
+    Args:
+        values: any shapes.
+        before: of the same shapes, without gradient.
+        steps: one for each tensor.
+    """
+
+    def __call__(self, values: Sequence[Tensor], before: Sequence[Tensor], steps: Sequence[float]) -> Tensor: ...
+
+
 class ChangedPixels(Protocol):
     """Dilated mask ``[H, W]`` of the pixels that changed between two pictures ``[H, W, 3]`` uint8.
 

@@ -44,6 +44,7 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_excess": ("d", "ppllf"),
     "sgs_excess_backward": ("v", "ppllffpp"),
     "sgs_neighbour_difference": ("d", "pppllfp"),
+    "sgs_change_bits": ("d", "pplfp"),
     "sgs_adam_step": ("v", "ppppplldldddi"),
     "sgs_rans_encode": ("i", "pplpliippp"),
     "sgs_rans_decode": ("i", "plpiplplip"),

@@ -93,29 +93,21 @@ def _boxes(mask: Mask) -> list[Box]:
     padded = np.zeros((rows * CONTEXT_PIXELS, columns * CONTEXT_PIXELS), bool)
     padded[: mask.shape[0], : mask.shape[1]] = mask
     cells = padded.reshape(rows, CONTEXT_PIXELS, columns, CONTEXT_PIXELS).max((1, 3))
-    found = [_pixels(box, mask) for box in _parts(_dilated(cells))]
+    found = [_pixels(box, mask) for box in _parts(cells)]
     if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
         return one
     return [box for box in found if min(span.stop - span.start for span in box) >= 2 * CONTEXT_PIXELS]
 
 
-def _dilated(cells: Mask) -> Mask:
-    """``cells`` and the eight around each."""
-    height, width = cells.shape
-    around = np.zeros((height + 2, width + 2), bool)
-    for row in range(3):
-        for column in range(3):
-            around[row : row + height, column : column + width] |= cells
-    return around[1:-1, 1:-1]
-
-
 def _parts(cells: Mask) -> list[tuple[int, int, int, int]]:
-    """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells``."""
+    """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells`` and the eight
+    cells around each."""
     try:
         import cv2
     except ImportError:
         raise MissingExtraError("cv2", "capture") from None
-    _, _, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
+    grown = cv2.dilate(cells.astype(np.uint8), np.ones((3, 3), np.uint8))
+    _, _, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
     boxes = np.asarray(stats)[1:, :4].tolist()  # The first is what is no part.
     left = [(top, top + height, first, first + width) for first, top, width, height in boxes]
     done: list[tuple[int, int, int, int]] = []

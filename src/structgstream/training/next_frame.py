@@ -129,7 +129,7 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             loss = with_term(loss, "coherence", difference, weight=self.coherence.weight)
         if self.bit_price is None:
             return loss
-        return replace(loss, total=loss.total + self.bit_price.price(values))
+        return replace(loss, total=loss.total + self.bit_price.price(values, self.backend))
 
     def _drawn_now(self, focus: Focus | None, sample: View) -> tuple[Focus | None, bool]:
         """``focus``, in most visits of a view without the tiles in which nothing has changed; and whether the loss can

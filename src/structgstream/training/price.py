@@ -1,50 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rate term of the loss: a price on changing bins since the last frame (Note [Bins])."""
 
-# torch's operations on lists of tensors have a leading underscore; its own optimisers are built on them.
-# pyright: reportPrivateImportUsage=false
-
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from structgstream.kernels.backend import Backend
 from structgstream.scene.state import ParameterName
 from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 
 _BITS_PER_KB: Final = 8000
-
-
-class _Bits(torch.autograd.Function):
-    """Sums ``[F]`` of log2(1 + |value - before| / step) of F fields; autograd's own graph of it takes twice the time.
-
-    Operations are on lists of tensors, which on a GPU is one launch for all fields.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, before: list[Tensor], steps: list[float], *values: Tensor) -> Tensor:
-        differences = torch._foreach_sub(values, before)
-        ratios = torch._foreach_abs(differences)
-        torch._foreach_div_(ratios, steps)
-        torch._foreach_add_(ratios, 1.0)
-        ctx.save_for_backward(*differences, *ratios)
-        ctx.steps = steps
-        return torch.stack([bits.sum() for bits in torch._foreach_log2(ratios)])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        count = len(ctx.steps)
-        differences, ratios = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
-        found = torch._foreach_sign(differences)
-        torch._foreach_div_(found, ratios)
-        for gradient, of_bits, step in zip(found, grads[0].unbind(), ctx.steps, strict=True):
-            gradient.mul_(of_bits / (step * math.log(2.0)))
-        return None, None, *found
 
 
 @dataclass(frozen=True)
@@ -86,11 +53,11 @@ class BitPrice:
         }
         return replace(self, before=before)
 
-    def price(self, values: Mapping[ParameterName, Tensor]) -> Tensor:
+    def price(self, values: Mapping[ParameterName, Tensor], backend: Backend) -> Tensor:
         """Weighted sum of log2(1 + distance in bins), in kilobytes."""
         priced = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
-        bits = _Bits.apply([self.before[name] for name in self.steps], [*self.steps.values()], *priced)
-        return self.weight / _BITS_PER_KB * bits.sum()  # type: ignore[union-attr]
+        before = [self.before[name] for name in self.steps]
+        return self.weight / _BITS_PER_KB * backend.change_bits(priced, before, [*self.steps.values()])
 
 
 def _first_rows(value: Tensor, count: int) -> Tensor:
