@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 5
+#define SGS_ABI_VERSION 6
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -63,6 +63,17 @@ void sgs_l1_ssim_backward(
 int sgs_changed_pixels(
     const uint8_t* before, const uint8_t* now, int height, int width, float threshold, int reach, uint8_t* changed,
     int threads);
+
+/* A rendering [height,width,3] and what it is compared with (kernels/reference_residual.py): picture u8 [reduced_height,
+ * reduced_width, 3]; gains and biases [3] or null; tiles, a byte each, and outside u8 [height,width,3], which is shown in those
+ * that are zero, or both null; mask, a byte for each pixel of the picture, or null. */
+struct sgs_residual {
+    const float *rendering, *gains, *biases;
+    const uint8_t *picture, *tiles, *outside, *mask;
+    int height, width, reduced_height, reduced_width;
+};
+/* Out: found [reduced_height, reduced_width]. Returns 0, or 1 where memory does not suffice. */
+int sgs_picture_residual(const struct sgs_residual* residual, float* found);
 
 /* Flow where it agrees with the flow back (kernels/reference_flow.py). flow and back [H,W,2], mask [H,W] one byte each or
  * null. Out: maps [3,H,W]. */

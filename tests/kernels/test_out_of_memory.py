@@ -12,7 +12,7 @@ import torch
 from splats import splats_of, viewport_of
 from structgstream.codec.entropy import decisions, rans
 from structgstream.errors import OutOfMemoryError
-from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_planes, cpu_raster
+from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_planes, cpu_raster, cpu_residual
 from structgstream.kernels._load import native_reason
 from structgstream.kernels.anchor_types import Anchors
 from structgstream.kernels.motion_types import Neighbors, ViewFlows
@@ -55,6 +55,12 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         "sgs_plane_scores",
         1,
         lambda: cpu_planes.plane_scores(Z(8, 8), [Z(8, 8)], Z(1, 1, 3, 3), window=3, noise=0.1),
+    ),
+    "residual": (
+        cpu_residual,
+        "sgs_picture_residual",
+        1,
+        lambda: cpu_residual.picture_residual(Z(8, 8, 3), Z(8, 8, 3).byte()),
     ),
     "lift": (
         cpu_lift,

@@ -44,21 +44,26 @@ def spoiled(view: View) -> torch.Tensor:
     return picture
 
 
+def compared(picture: torch.Tensor, view: View, *, config: BirthConfig, floor: ResidualFloor | None) -> ViewResidual:
+    color = CameraColor.identity(view.index + 1)
+    return view_residual(picture, view, color, floor=floor, config=config, backend=reference_backend())
+
+
 def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:
     view = VIEWS[1]
-    none = view_residual(view.colors, view, floor=None, config=CONFIG)
+    none = compared(view.colors, view, floor=None, config=CONFIG)
     assert not none.wrong.any()
     assert not none.missing_share.any()
-    found = view_residual(spoiled(view), view, floor=None, config=CONFIG)
+    found = compared(spoiled(view), view, floor=None, config=CONFIG)
     inner = (view.colors[20:32, 30:42] - 0.5).abs().mean(-1) > 0.2  # grey has no opposite
     assert found.wrong[20:32, 30:42][inner].all()
     assert not found.missing_share[:15].any()
     floor = ResidualFloor(1.0, {view.index: torch.full((64, 96), 1.0)})
-    assert not view_residual(spoiled(view), view, floor=floor, config=CONFIG).missing_share.any()
+    assert not compared(spoiled(view), view, floor=floor, config=CONFIG).missing_share.any()
 
 
 def test_pictures_are_looked_at_in_the_width_that_is_asked_for() -> None:
-    found = view_residual(VIEWS[0].colors, VIEWS[0], floor=None, config=replace(CONFIG, picture_width=48))
+    found = compared(VIEWS[0].colors, VIEWS[0], floor=None, config=replace(CONFIG, picture_width=48))
     assert (found.view.camera.width, found.view.camera.height) == (48, 32)
     assert found.missing_share.shape == (32, 48)
 
@@ -83,15 +88,15 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     floor = ResidualFloor(1.0, {v.index: torch.zeros(64, 96) for v in views})
 
     def born(last: ViewResidual) -> int:
-        found = [view_residual(without[v.index].clamp(0, 1), v, floor=floor, config=config) for v in views[:-1]]
+        found = [compared(without[v.index].clamp(0, 1), v, floor=floor, config=config) for v in views[:-1]]
         return len(sweep_births([*found, last], depths, color, first_birth=0, config=config, backend=backend).free)
 
     last = views[-1]
     silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))
     masked = replace(last, mask=torch.zeros(64, 96, dtype=torch.bool), image=torch.zeros_like(last.image))
     unknown = replace(floor, maps={index: m for index, m in floor.maps.items() if index != last.index})
-    absent = view_residual(without[last.index].clamp(0, 1), last, floor=unknown, config=config)
-    seen = view_residual(without[last.index].clamp(0, 1), masked, floor=floor, config=config)
+    absent = compared(without[last.index].clamp(0, 1), last, floor=unknown, config=config)
+    seen = compared(without[last.index].clamp(0, 1), masked, floor=floor, config=config)
     assert not absent.missing_share.any()
     assert not seen.missing_share.any()
     assert born(absent) == born(seen) > born(silent)

@@ -26,6 +26,7 @@ from structgstream.kernels.operations import (
     Lift,
     NeighbourDifference,
     PictureAndWeights,
+    PictureResidual,
     PlaneScores,
     Rasterize,
     Sweep,
@@ -57,6 +58,7 @@ class Backend:
     neighbour_difference: NeighbourDifference
     change_bits: ChangeBits
     changed_pixels: ChangedPixels
+    picture_residual: PictureResidual
     confident_flow: ConfidentFlow
     lift: Lift
     sweep: Sweep
@@ -78,6 +80,7 @@ def reference_backend() -> Backend:
         reference_neighbours,
         reference_planes,
         reference_raster,
+        reference_residual,
         reference_ssim,
         reference_sweep,
         reference_volume,
@@ -95,6 +98,7 @@ def reference_backend() -> Backend:
         neighbour_difference=reference_neighbours.neighbour_difference,
         change_bits=reference_bits.change_bits,
         changed_pixels=reference_change.changed_pixels,
+        picture_residual=reference_residual.picture_residual,
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep,
@@ -121,6 +125,7 @@ def cpu_backend() -> Backend:
         cpu_neighbours,
         cpu_planes,
         cpu_raster,
+        cpu_residual,
         cpu_ssim,
         cpu_sweep,
         cpu_volume,
@@ -140,6 +145,7 @@ def cpu_backend() -> Backend:
         neighbour_difference=cpu_neighbours.neighbour_difference,
         change_bits=cpu_bits.change_bits,
         changed_pixels=cpu_change.changed_pixels,
+        picture_residual=cpu_residual.picture_residual,
         confident_flow=cpu_flow.confident_flow,
         lift=cpu_lift.lift,
         sweep=cpu_sweep.sweep,
@@ -175,6 +181,7 @@ def cuda_backend() -> Backend:
         reference_lift,
         reference_neighbours,
         reference_raster,
+        reference_residual,
         reference_ssim,
         reference_sweep,
         reference_volume,
@@ -200,6 +207,7 @@ def cuda_backend() -> Backend:
         neighbour_difference=reference_neighbours.neighbour_difference,
         change_bits=reference_bits.change_bits,
         changed_pixels=reference_change.changed_pixels,
+        picture_residual=reference_residual.picture_residual,
         confident_flow=reference_flow.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep if library is None else partial(cuda_sweep.sweep, library),

@@ -167,6 +167,36 @@ class ChangedPixels(Protocol):
     def __call__(self, before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor: ...
 
 
+class PictureResidual(Protocol):
+    """Mean absolute difference ``[h, w]`` of a rendering to a picture, over channels and the 3 x 3 pixels around each
+    that exist, in 0 ... 1; without graph.
+
+    The rendering is compared as its camera would have recorded it: ``gains * rendering + biases``, clamped to 0 ... 1,
+    and averaged down to the picture's size.
+
+    Args:
+        rendering: ``[H, W, 3]``.
+        picture: ``[h, w, 3]`` uint8, not larger than the rendering.
+        gains: ``[3]``; one when None.
+        biases: ``[3]``; given with ``gains``.
+        tiles: outside of these tiles of the rendering ``outside`` takes its place.
+        outside: ``[H, W, 3]`` uint8; given with ``tiles``.
+        mask: ``[h, w]`` bool; pixels where it is False do not differ.
+    """
+
+    def __call__(
+        self,
+        rendering: Tensor,
+        picture: Tensor,
+        *,
+        gains: Tensor | None = None,
+        biases: Tensor | None = None,
+        tiles: TileSelection | None = None,
+        outside: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> Tensor: ...
+
+
 class ConfidentFlow(Protocol):
     """Maps ``[3, H, W]`` of c, c flow_x and c flow_y, where c is 1 if flow there and back agree (forward-backward
     consistency, Sundaram et al., 2010), else 0.

@@ -31,6 +31,7 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_l1_ssim": ("v", "pppiippppppi"),
     "sgs_l1_ssim_backward": ("v", "pppiippppffpi"),
     "sgs_changed_pixels": ("i", "ppiifipi"),
+    "sgs_picture_residual": ("i", "pp"),
     "sgs_confident_flow": ("v", "pppiiffpi"),
     "sgs_lift_flow": ("i", "ppppppppplliifpppi"),
     "sgs_sweep": ("v", "piippliifppi"),

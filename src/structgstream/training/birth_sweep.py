@@ -18,7 +18,7 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig, Births, ViewResidual, sweep_births, view_residual
 from structgstream.training.partition import changed_tiles
-from structgstream.training.residuals import ResidualFloor, apply_camera_color
+from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, mean_of_counting
 
 LEAST_COVERAGE = 0.5
@@ -146,11 +146,16 @@ class Sweep:
 
     def _residual(self, view: View, image: Tensor | None) -> ViewResidual:
         """Of a rendering ``[H, W, 3]`` within the focus; None for a view without one."""
-        picture, focus = view.colors, self.focuses.get(view.index)
-        if image is not None and focus is not None:
-            drawn = apply_camera_color(image, self.moving.camera_color, view.index)
-            picture = focus.tiles.choose(drawn, picture)
-        return view_residual(picture.clamp(0.0, 1.0), view, floor=self.floor, config=self.config)
+        focus = self.focuses.get(view.index)
+        return view_residual(
+            None if focus is None else image,
+            view,
+            self.moving.camera_color,
+            floor=self.floor,
+            config=self.config,
+            backend=self.backend,
+            tiles=None if focus is None else focus.tiles,
+        )
 
     def depth_map(self, view: View) -> Tensor:
         """Mean depth along z ``[h, w]`` of both parts drawn together; infinite where coverage is low.

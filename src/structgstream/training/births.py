@@ -18,10 +18,11 @@ from torch.nn.functional import interpolate
 from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.motion_types import SweepView
+from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
-from structgstream.training.residuals import ResidualFloor, box_mean, residual
-from structgstream.training.views import View, area_mean
+from structgstream.training.residuals import ResidualFloor, box_mean
+from structgstream.training.views import View
 
 MASK_PIXELS = 5
 HIT_VOXELS = 1.8
@@ -114,19 +115,47 @@ class ViewResidual:
     missing_share: Tensor
 
 
-def view_residual(picture: Tensor, view: View, *, floor: ResidualFloor | None, config: BirthConfig) -> ViewResidual:
-    """Compare a colour-corrected rendering, ``[H, W, 3]`` in 0 ... 1, with the picture of ``view``."""
+def view_residual(
+    drawn: Tensor | None,
+    view: View,
+    color: CameraColor,
+    *,
+    floor: ResidualFloor | None,
+    config: BirthConfig,
+    backend: Backend,
+    tiles: TileSelection | None = None,
+) -> ViewResidual:
+    """Compare a rendering ``[H, W, 3]`` with the picture of ``view``.
+
+    Args:
+        drawn: the rendering; None for one that is the picture itself.
+        view: in full size.
+        color: the colour correction of the cameras.
+        floor: residuals of frame 0; None for none.
+        config: the rules.
+        backend: the compute back-end.
+        tiles: the tiles that were drawn; elsewhere it is the picture. None for all.
+    """
     scale = min(1.0, config.picture_width / view.camera.width)
     small = view.reduced(scale)
-    size = (small.camera.height, small.camera.width)
-    seen = area_mean(picture.permute(2, 0, 1)[None], size)[0].permute(1, 2, 0)
-    off = residual(seen, small.image, small.mask)
+    if drawn is None or (floor is not None and view.index not in floor.maps):
+        # Absent from frame 0: nothing here is known to be new.
+        none = torch.zeros(small.image.shape[:2], device=small.image.device)
+        nothing = torch.zeros_like(none, dtype=torch.bool)
+        known = small if drawn is None else View(small.index, small.camera, small.image, nothing)
+        return ViewResidual(known, nothing, none)
+    off = backend.picture_residual(
+        drawn,
+        small.image,
+        gains=color.gains[view.index],
+        biases=color.biases[view.index],
+        tiles=tiles,
+        outside=None if tiles is None else view.image,
+        mask=small.mask,
+    )
     limit = off.new_full((), config.missing_threshold)
-    if floor is not None and view.index not in floor.maps:  # Absent from frame 0: nothing here is known to be new.
-        nothing = torch.zeros_like(off, dtype=torch.bool)
-        return ViewResidual(View(small.index, small.camera, small.image, nothing), nothing, torch.zeros_like(off))
     if floor is not None:
-        limit = limit + interpolate(floor.maps[view.index][None, None], size=size, mode="bilinear")[0, 0]
+        limit = limit + interpolate(floor.maps[view.index][None, None], size=off.shape, mode="bilinear")[0, 0]
     missing = box_mean((off > limit).float(), MASK_PIXELS)
     return ViewResidual(small, off > config.residual_threshold, missing if small.mask is None else missing * small.mask)
 

@@ -31,7 +31,7 @@ from structgstream.training.observation import (
     weigh_maps,
 )
 from structgstream.training.picture_change import PictureChange, detect_picture_changes
-from structgstream.training.residuals import ResidualFloor, apply_camera_color, picture_residual
+from structgstream.training.residuals import ResidualFloor, apply_camera_color, residual
 from structgstream.training.trust import CLEAR_SHIFT, ViewChange, is_scene_cut, suspects, trusted_views
 from structgstream.training.views import View, area_mean, blackened, mean_of_counting
 
@@ -272,7 +272,7 @@ def _view_evidence(
     drawn, sums = backend.picture_and_weights(gaussians, viewport, torch.cat(maps, dim=-1), background=background)
     wrong_share = 0.0
     if floor is not None and view.index in floor.maps and config.residual_threshold > 0.0:
-        missing = picture_residual(drawn, small, scene)
+        missing = residual(drawn, small, scene.camera_color, backend)
         wrong = (missing > config.residual_threshold + floor.maps[view.index]).to(part)
         wrong_share = float(mean_of_counting(wrong, small.mask))
         around = max_pool2d(wrong[None, None], 3, stride=1, padding=1)[0, 0]

@@ -16,9 +16,8 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.views import View, blackened
+from structgstream.training.views import View
 
-SMOOTHED_PIXELS = 3
 FLOOR_PIXELS = 5
 """Side, in pixels, of the square over which the floor takes the maximum residual."""
 
@@ -64,22 +63,17 @@ def _sum_around(values: Tensor, dim: int, reach: int) -> Tensor:
     return total
 
 
-def residual(picture: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean absolute difference ``[H, W]`` of ``picture`` ``[H, W, 3]`` in 0 ... 1 to ``image`` (uint8), over channels
-    and 3 x 3 pixels; 0 where ``mask`` is False, where ``image`` is black."""
-    found = box_mean((blackened(picture, mask) - image.to(picture) / 255.0).abs().mean(-1), SMOOTHED_PIXELS)
-    return found if mask is None else found * mask
-
-
 def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: Backend) -> Tensor:
     """The :func:`residual` of drawing ``gaussians``, those of ``scene``, for ``view``."""
     rendering = draw(gaussians, view.camera, backend, background=scene.background(view.camera))
-    return picture_residual(rendering.image, view, scene)
+    return residual(rendering.image, view, scene.camera_color, backend)
 
 
-def picture_residual(drawn: Tensor, view: View, scene: Scene) -> Tensor:
-    """The :func:`residual` of ``drawn``, a rendering of ``scene`` for ``view`` without colour correction."""
-    return residual(apply_camera_color(drawn, scene.camera_color, view.index), view.image, view.mask)
+def residual(drawn: Tensor, view: View, color: CameraColor, backend: Backend) -> Tensor:
+    """Mean absolute difference ``[H, W]`` of a rendering ``[H, W, 3]`` to the picture of ``view``, over channels and
+    3 x 3 pixels, after the correction ``color`` of its camera; 0 where pixels do not count."""
+    gains, biases = color.gains[view.index], color.biases[view.index]
+    return backend.picture_residual(drawn, view.image, gains=gains, biases=biases, mask=view.mask)
 
 
 def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> float:

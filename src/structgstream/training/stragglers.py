@@ -19,7 +19,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.births import BirthConfig, blamed_mask, view_residual
 from structgstream.training.neighbours import nearest
 from structgstream.training.observation import movers_of, sum_by_mover, weigh_maps
-from structgstream.training.residuals import ResidualFloor, apply_camera_color
+from structgstream.training.residuals import ResidualFloor
 from structgstream.training.rounding import pixel_size
 from structgstream.training.views import View
 
@@ -100,10 +100,9 @@ def _wrong_anchors(
         focus = focuses.get(view.index)
         if focus is None:
             continue
-        picture = apply_camera_color(focus.picture, moving.camera_color, view.index)
-        found = view_residual(picture, view, floor=floor, config=births)
+        found = view_residual(focus.picture, view, moving.camera_color, floor=floor, config=births, backend=backend)
         small = found.view
-        pixels = found.wrong.to(picture)
+        pixels = found.wrong.to(focus.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
         gaussians = folded.gaussians(small.camera, backend)
         maps = torch.stack([counting, pixels], dim=-1)
