@@ -40,7 +40,7 @@ class MotionStartConfig:
     """Displace movers by optical flow (paper: False, everything starts at its last position)."""
     rounds: int = 2
     """1: flow between pictures only; 2: also from the rendering to the pictures."""
-    views: int = 14
+    views: int = 12
     """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
     every second or third, in turn."""
     flow: FlowConfig = FlowConfig()
