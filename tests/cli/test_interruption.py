@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
@@ -19,8 +20,11 @@ def press() -> None:
 
 
 @pytest.fixture(autouse=True)
-def as_before() -> None:
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+def as_in_a_terminal() -> Iterator[None]:
+    """A shell ignores Ctrl-C in what it runs in the background, which tests may be."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def untouched() -> bool:
