@@ -122,8 +122,10 @@ struct Statistics {
     Statistics(const PlaneSweep& sweep, const Size& size, Scratch& scratch)
         : grey(size.count()), mean(size.count()), variance(size.count()) {
         std::fill_n(grey.get(), size.count(), 0.0f);
-        for (int row = 0; row < size.height; ++row)
-            std::copy_n(sweep.picture + static_cast<size_t>(row) * size.width, size.width, grey.get() + static_cast<size_t>(row) * size.stride);
+        for (int row = 0; row < size.height; ++row) {
+            const float* const from = sweep.picture + static_cast<size_t>(row) * size.width;
+            std::copy_n(from, size.width, grey.get() + static_cast<size_t>(row) * size.stride);
+        }
         float* const squares = scratch.across.get() + size.count();
         for (int row = 0; row < size.height; ++row) {
             const size_t first = static_cast<size_t>(row) * size.stride;

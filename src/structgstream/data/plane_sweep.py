@@ -22,6 +22,8 @@ from structgstream.data.matching import back_project, inside, load_cv2, project
 from structgstream.data.plane_homographies import plane_homographies
 from structgstream.kernels.backend import processor_backend
 
+FloatImage = NDArray[np.float32]
+
 
 @dataclass(frozen=True)
 class SweepConfig:
@@ -50,8 +52,6 @@ class SweepConfig:
     views: int = 2
     level_planes: bool = False
 
-
-FloatImage = NDArray[np.float32]
 
 # Small windows for texture and outlines, then large ones, on pictures reduced until their noise averages out, for
 # surfaces with little texture.

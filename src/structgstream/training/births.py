@@ -139,7 +139,7 @@ def view_residual(
     scale = min(1.0, config.picture_width / view.camera.width)
     small = view.reduced(scale)
     if drawn is None or (floor is not None and view.index not in floor.maps):
-        # Absent from frame 0: nothing here is known to be new.
+        # Of a camera that was absent from frame 0 nothing is known to be new.
         none = torch.zeros(small.image.shape[:2], device=small.image.device)
         nothing = torch.zeros_like(none, dtype=torch.bool)
         known = small if drawn is None else View(small.index, small.camera, small.image, nothing)
