@@ -3,7 +3,9 @@
 //
 // A vector is a small block of pixels (4 x 4, 4 x 2 or 2 x 2). Backward replays forward front to back: it keeps
 // R = the remaining part of the pixel's colour (behind), dotted with the pixel's gradient, so that
-// dL/dalpha = T q - R / (1 - alpha) with q = color . gradient, and needs only the finished image.
+// dL/dalpha = T q - R / (1 - alpha) with q = color . gradient, and needs only the finished image. Splats that less than
+// kMinGradientTransmittance of a pixel's light reaches get neither gradient nor weight from it; they are drawn, as
+// opaque ones would show a hole without what the last light meets.
 
 #include <algorithm>
 #include <cstring>
@@ -92,17 +94,17 @@ inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int lef
     return found;
 }
 
-// One splat over one block of pixels whose transmittance is T. Positive T is live; a pixel that has stopped keeps its
-// transmittance with a minus sign.
+// One splat over one block of pixels whose transmittance is T. T above `least`, zero or more, is live; a pixel that has
+// stopped keeps its transmittance with a minus sign.
 struct Coverage {
     vf dx, dy, alpha, after;  // after: the transmittance behind the splat, stored where none has stopped
     mask used, stopped;
     bool any_stopped;
 
-    [[gnu::always_inline]] bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T) {
+    [[gnu::always_inline]] bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T, float least) {
         dx = lanes.x + (left - s.x), dy = lanes.y + (top - s.y);
         const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
-        used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(0.0f)));
+        used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(least)));
         if (!any(used)) return false;
         alpha = keep(used, smallest(power_of_two(power), splat(kMaxAlpha)));
         after = T * (1.0f - alpha);
@@ -116,16 +118,17 @@ struct Coverage {
     }
 };
 
-// How much light still passes each pixel of a tile. A block whose pixels have all stopped loses its bit in `live`.
+// How much light still passes each pixel of a tile. A block without a live pixel loses its bit in `live`.
 struct Front {
     alignas(kAlignment) float T[kTilePixels];
     uint64_t live = ~uint64_t{0} >> (64 - kBlocks);
-    Front() {
+    const float least;
+    explicit Front(float least = 0.0f) : least(least) {
         for (float& t : T) t = 1.0f;
     }
     [[gnu::always_inline]] void pass(int block, const Coverage& c) {
         store(T + block * kLanes, c.after);
-        if (c.any_stopped && !any(above(c.after, splat(0.0f)))) live &= ~(uint64_t{1} << block);
+        if ((c.any_stopped || least > 0.0f) && !any(above(c.after, splat(least)))) live &= ~(uint64_t{1} << block);
     }
 };
 
@@ -191,7 +194,7 @@ template <typename Visit>
         const int block = __builtin_ctzll(rest), at = block * kLanes;
         const vf before = load(front.T + at);
         Coverage c;
-        if (!c.of(s, lanes, tile.lefts[block], tile.tops[block], before)) continue;
+        if (!c.of(s, lanes, tile.lefts[block], tile.tops[block], before, front.least)) continue;
         visit(at, before, c);
         front.pass(block, c);
     }
@@ -229,7 +232,7 @@ void blend_backward(
     const BlockCentres centres;
     const int width = raster.camera.width;
     alignas(kAlignment) float rest[kTilePixels];
-    Front front;
+    Front front(kMinGradientTransmittance);
     alignas(kAlignment) float gradient[3][kTilePixels], color[3][kTilePixels];
     alignas(kAlignment) float grad_coverage[1][kTilePixels] = {}, coverage[1][kTilePixels];
     gather<3>(grad_image, width, tile, gradient);
@@ -308,7 +311,7 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
     alignas(kAlignment) float values[Maps][kTilePixels] = {};
     alignas(kAlignment) float color[3][kTilePixels];
     if (kDraws) std::memset(color, 0, sizeof color);
-    Front front;
+    Front front(kDraws ? 0.0f : kMinGradientTransmittance);
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int at) {
 #pragma GCC unroll 8
         for (int k = 0; k < Maps; ++k) values[k][at] = maps[pixel * stride + k];
@@ -325,8 +328,9 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
         for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
             hit = true;
             const vf weight = c.alpha * before;
+            const vf lit = kDraws ? keep(above(before, splat(kMinGradientTransmittance)), weight) : weight;
 #pragma GCC unroll 8
-            for (int k = 0; k < Maps; ++k) m[k] += weight * load(values[k] + at);
+            for (int k = 0; k < Maps; ++k) m[k] += lit * load(values[k] + at);
             for (int k = 0; k < 3 && kDraws; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
         });
         if (hit) {

@@ -14,6 +14,7 @@ constexpr float kLowPass = 0.3f;                   // square pixels
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMinTransmittance = 1e-4f;
+constexpr float kMinGradientTransmittance = 1.0f / 255.0f;
 constexpr float kLog2MinAlpha = -7.99435344f;      // log2(1 / 255)
 
 struct Pinhole {

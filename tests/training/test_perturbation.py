@@ -5,7 +5,13 @@ import pytest
 import torch
 
 from structgstream.gaussians import Gaussians
-from structgstream.training.perturbation import Perturbation, PerturbationConfig, perturbation_at, perturbed_center
+from structgstream.training.perturbation import (
+    Perturbation,
+    PerturbationConfig,
+    RandomNumbers,
+    perturbation_at,
+    perturbed_center,
+)
 
 COUNT = 20_000
 
@@ -21,8 +27,31 @@ def gaussians() -> Gaussians:
     )
 
 
+def numbers(seed: int = 0, *, length: int = 1 << 18) -> RandomNumbers:
+    return RandomNumbers(torch.Generator().manual_seed(seed), torch.device("cpu"), length=length)
+
+
+def test_random_numbers_differ_from_reading_to_reading() -> None:
+    drawn = numbers()
+    first, second = drawn.normal(COUNT), drawn.normal(COUNT)
+    assert first.shape == (COUNT, 3)
+    assert abs(torch.corrcoef(torch.stack([first.flatten(), second.flatten()]))[0, 1]) < 0.02
+    shares = drawn.uniform(COUNT)
+    assert 0.0 <= shares.min() < 0.01
+    assert 0.99 < shares.max() < 1.0
+    assert shares.mean().item() == pytest.approx(0.5, abs=0.01)
+
+
+def test_more_random_numbers_than_a_table_holds() -> None:
+    drawn = numbers(length=10)
+    assert drawn.uniform(4).shape == (4,)
+    many = drawn.normal(COUNT)
+    assert many.unique().numel() > 2.9 * COUNT
+    assert many.std().item() == pytest.approx(1.0, abs=0.02)
+
+
 def perturbed(config: PerturbationConfig, *, strength: float = 1.0, seed: int = 0) -> Gaussians:
-    return Perturbation(config, torch.Generator().manual_seed(seed), strength=strength)(gaussians())
+    return Perturbation(config, numbers(seed), strength=strength)(gaussians())
 
 
 @pytest.mark.parametrize("strength", [1.0, 0.5])
@@ -39,7 +68,7 @@ def test_a_share_is_left_out_and_the_mean_stays(strength: float) -> None:
 def test_opacities_stay_below_one() -> None:
     whole = gaussians()
     config = PerturbationConfig(dropped_share=0.9)
-    found = Perturbation(config, torch.Generator(), strength=1.0)(whole)
+    found = Perturbation(config, numbers(), strength=1.0)(whole)
     assert found.opacities.max() < 1.0
 
 
@@ -65,12 +94,12 @@ def test_it_fades_and_ends() -> None:
     config = PerturbationConfig(dropped_share=0.4, until_share=0.5)
     shares = []
     for iteration in (1, 25, 49):
-        found = perturbation_at(iteration, 100, config, torch.Generator().manual_seed(0))
+        found = perturbation_at(iteration, 100, config, numbers())
         assert found is not None
         shares.append((found(gaussians()).opacities == 0).float().mean().item())
     assert shares == pytest.approx([0.4 * 0.98, 0.4 * 0.5, 0.4 * 0.02], abs=0.01)
-    assert perturbation_at(50, 100, config, torch.Generator()) is None
-    assert perturbation_at(1, 100, PerturbationConfig(), torch.Generator()) is None
+    assert perturbation_at(50, 100, config, numbers()) is None
+    assert perturbation_at(1, 100, PerturbationConfig(), numbers()) is None
 
 
 def centers(config: PerturbationConfig, *, iteration: int) -> torch.Tensor:

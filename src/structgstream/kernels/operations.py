@@ -33,6 +33,9 @@ from structgstream.kernels.raster_types import RasterOutput, TileSelection
 class Rasterize(Protocol):
     """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
+    A Gaussian that less than 1/255 of a pixel's light reaches is drawn there, and gets no gradient from the pixel; with
+    gsplat (``cuda``) it does.
+
     Args:
         gaussians: to draw; their ids are not read.
         viewport: the camera.
@@ -60,6 +63,8 @@ class Rasterize(Protocol):
 
 class BlendingWeights(Protocol):
     """Sums ``[N, C]`` over the pixels of each Gaussian's blending weight times each map, without graph.
+
+    Weights are the gradients of ``Rasterize`` by colour: those of Gaussians that hardly any light reaches are zero.
 
     Args:
         gaussians: to draw; their colours and ids are not read.

@@ -3,7 +3,8 @@
 
 Definition (as gsplat 1.5): perspective projection of the covariance with the point clamped to 1.3 times the field of
 view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to
-back by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5.
+back by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5. Gaussians that less than 1/255
+of a pixel's light reaches are drawn there, and get no gradient from it.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -21,6 +22,7 @@ LOW_PASS_PIXELS = 0.3
 MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
+MIN_GRADIENT_TRANSMITTANCE = 1.0 / 255.0
 BOX_SLACK_PIXELS = 0.01
 
 
@@ -80,8 +82,10 @@ def rasterize(
     tiles: TileSelection | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
+    least_transmittance: float | None = None,
 ) -> RasterOutput:
-    """See ``kernels.operations.Rasterize``."""
+    """See ``kernels.operations.Rasterize``; ``least_transmittance`` is that of gradients, 1/255 when None."""
+    least = MIN_GRADIENT_TRANSMITTANCE if least_transmittance is None else least_transmittance
     gaussians, screen_offsets = detach_untrained(gaussians, screen_offsets, trained)
     projected = _project(gaussians, viewport, screen_offsets)
     radii = gaussians.means.new_zeros(len(gaussians), dtype=torch.float32)
@@ -99,7 +103,7 @@ def rasterize(
         for left in range(0, viewport.width, TILE_PIXELS):
             right = min(left + TILE_PIXELS, viewport.width)
             here = in_band[(low[in_band, 0] < right) & (high[in_band, 0] > left)]
-            image, alpha = _tile(projected, here, gaussians, range(left, right), range(top, bottom))
+            image, alpha = _tile(projected, here, gaussians, range(left, right), range(top, bottom), least)
             row.append(image + (1.0 - alpha)[..., None] * back)
             row_alpha.append(alpha)
         bands.append(torch.cat(row, dim=1))
@@ -186,9 +190,12 @@ def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Ten
 
 
 def _tile(
-    projected: _Projected, here: Tensor, gaussians: Gaussians, columns: range, rows: range
+    projected: _Projected, here: Tensor, gaussians: Gaussians, columns: range, rows: range, least: float
 ) -> tuple[Tensor, Tensor]:
-    """Blend the Gaussians ``here``, ordered by depth, over one tile: ``[h, w, 3]`` and coverage ``[h, w]``."""
+    """Blend the Gaussians ``here``, ordered by depth, over one tile: ``[h, w, 3]`` and coverage ``[h, w]``.
+
+    Those that less than ``least`` of a pixel's light reaches get no gradient from it.
+    """
     like, opacities, colors = projected.means2d, gaussians.opacities, gaussians.colors
     if here.numel() == 0:
         return colors.new_zeros(len(rows), len(columns), 3), colors.new_zeros(len(rows), len(columns))
@@ -201,9 +208,17 @@ def _tile(
     drawn = projected.rows[here]
     alpha = opacities[drawn, None, None] * power.exp()
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0.0)
+    faint = _before((1.0 - alpha.detach()).cumprod(0)) <= least
+    alpha = torch.where(faint, alpha.detach(), alpha)
     after = (1.0 - alpha).cumprod(0)
     # Transmittance decreases monotonically, so masking below the limit equals stopping there.
     blended = after.detach() > MIN_TRANSMITTANCE
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    weights = torch.where(blended, alpha * before, 0.0)
-    return torch.einsum("nhw,nc->hwc", weights, colors[drawn]), weights.sum(0)
+    weights = torch.where(blended, alpha * _before(after), 0.0)
+    lit = torch.einsum("nhw,nc->hwc", torch.where(faint, 0.0, weights), colors[drawn])
+    rest = torch.einsum("nhw,nc->hwc", torch.where(faint, weights, 0.0), colors[drawn].detach())
+    return lit + rest, weights.sum(0)
+
+
+def _before(after: Tensor) -> Tensor:
+    """Transmittance ``[n, h, w]`` in front of each Gaussian from that behind it."""
+    return torch.cat([torch.ones_like(after[:1]), after[:-1]])

@@ -20,7 +20,7 @@ from structgstream.training.losses import LossWeights
 from structgstream.training.optim import Adam, LearningRate, constant
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
-from structgstream.training.perturbation import PerturbationConfig, perturbation_at, perturbed_center
+from structgstream.training.perturbation import PerturbationConfig, RandomNumbers, perturbation_at, perturbed_center
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import seeded_scene
 from structgstream.training.solidity import SolidityConfig, depth_spread
@@ -132,6 +132,7 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     views: list[View]
     extent: float
     generator: torch.Generator
+    numbers: RandomNumbers
     watch: Stopwatch
     last_pass: LastPass
 
@@ -152,7 +153,7 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
             voxel_size=config.voxel_size,
             track_screen=self.densifier.collects(iteration),
             watch=self.watch,
-            perturbation=perturbation_at(iteration, config.iterations, config.disturbance, generator),
+            perturbation=perturbation_at(iteration, config.iterations, config.disturbance, self.numbers),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
             seen_from=perturbed_center(
                 sample.camera.viewport(scene.anchors.positions).center,
@@ -266,8 +267,9 @@ def _fit(
     adam = Adam(backend, parameters.values)
     densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
     last_pass = LastPass(config.iterations - len(views))
+    numbers = RandomNumbers(generator, backend.device)
     hooks = _FirstFrameHooks(
-        config, backend, template, parameters, adam, densifier, views, extent, generator, watch, last_pass
+        config, backend, template, parameters, adam, densifier, views, extent, generator, numbers, watch, last_pass
     )
     samples = coarse_to_fine(views, config.stages(done=done), generator=generator)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from structgstream.gaussians import Gaussians
 
+TABLE_LENGTH = 1 << 21
+"""Of a table of random numbers; it is a few times what an iteration reads."""
+
 
 @dataclass(frozen=True)
 class PerturbationConfig:
@@ -29,34 +32,64 @@ class PerturbationConfig:
     """Share of ``view_noise`` left at the last iteration, decreasing linearly; 1: constant."""
 
 
+class RandomNumbers:
+    """Random numbers that are read from random places of tables: to draw them anew takes a thirtieth of frame 0.
+
+    Args:
+        generator: of the tables and of the places.
+        device: of the numbers.
+        length: of a table. It grows where more are read at once.
+    """
+
+    def __init__(self, generator: torch.Generator, device: torch.device, *, length: int = TABLE_LENGTH) -> None:
+        self._generator = generator
+        self._device = device
+        self._length = length
+        self._tables: dict[str, Tensor] = {}
+
+    def uniform(self, count: int) -> Tensor:
+        """``[count]`` in [0, 1)."""
+        return self._read("uniform", count)
+
+    def normal(self, count: int) -> Tensor:
+        """``[count, 3]`` of mean 0 and deviation 1."""
+        return self._read("normal", 3 * count).reshape(count, 3)
+
+    def _read(self, name: str, count: int) -> Tensor:
+        table = self._tables.get(name)
+        if table is None or len(table) < 2 * count:
+            draw = torch.rand if name == "uniform" else torch.randn
+            length = max(self._length, 2 * count)
+            table = self._tables[name] = draw(length, generator=self._generator).to(self._device)
+        first = int(torch.randint(len(table) - count + 1, (), generator=self._generator))
+        return table[first : first + count]
+
+
 class Perturbation:
     """Perturbs the Gaussians of one iteration.
 
     Args:
         config: amounts of dropout and noise.
-        generator: of the random numbers.
+        numbers: to perturb with.
         strength: factor on the amounts, 0 to 1.
     """
 
-    def __init__(self, config: PerturbationConfig, generator: torch.Generator, *, strength: float) -> None:
+    def __init__(self, config: PerturbationConfig, numbers: RandomNumbers, *, strength: float) -> None:
         self._config = config
-        self._generator = generator
+        self._numbers = numbers
         self._strength = strength
 
     def __call__(self, gaussians: Gaussians) -> Gaussians:
         dropped, noise = (self._strength * x for x in (self._config.dropped_share, self._config.noise_scales))
         opacities, means = gaussians.opacities, gaussians.means
         if dropped > 0.0:
-            kept = (self._drawn(len(gaussians), opacities) >= dropped).to(opacities)
+            kept = (self._numbers.uniform(len(gaussians)) >= dropped).to(opacities)
             opacities = (opacities * kept / (1.0 - dropped)).clamp(max=0.999)
         if noise > 0.0:
-            shift = torch.randn(means.shape, generator=self._generator).to(means)
             # Isotropic noise by the mean scale: following each Gaussian's rotation is not worth its cost.
-            means = means + noise * gaussians.scales.detach().mean(1, keepdim=True) * shift
+            sizes = gaussians.scales.detach().mean(1, keepdim=True)
+            means = means + noise * sizes * self._numbers.normal(len(gaussians)).to(means)
         return replace(gaussians, opacities=opacities, means=means)
-
-    def _drawn(self, count: int, like: Tensor) -> Tensor:
-        return torch.rand(count, generator=self._generator).to(like)
 
 
 def perturbed_center(
@@ -87,10 +120,10 @@ def perturbed_center(
 
 
 def perturbation_at(
-    iteration: int, iterations: int, config: PerturbationConfig, generator: torch.Generator
+    iteration: int, iterations: int, config: PerturbationConfig, numbers: RandomNumbers
 ) -> Perturbation | None:
     """The perturbation of ``iteration`` of ``iterations``; None for none."""
     strength = 1.0 - iteration / max(1.0, iterations * config.until_share)
     if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
         return None
-    return Perturbation(config, generator, strength=strength)
+    return Perturbation(config, numbers, strength=strength)
