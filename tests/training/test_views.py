@@ -74,6 +74,17 @@ def test_reduction_averages_areas_and_keeps_the_camera() -> None:
     assert torch.allclose(small.camera.K[:2], camera.K[:2] * 0.5)
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.5, 0.25, 0.7])
+def test_bytes_are_averaged_as_torch_does(scale: float) -> None:
+    rig, generator = arc_rig(), torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (32, 48, 3), generator=generator, dtype=torch.uint8)
+    size = (round(32 * scale), round(48 * scale))
+    expected = torch.nn.functional.interpolate(image.permute(2, 0, 1)[None].float(), size=size, mode="area")
+    found = reduced(View(0, rig["cam01"], image), scale).image
+    assert (found.dtype, found.shape) == (torch.uint8, (*size, 3))
+    assert (found - expected[0].permute(1, 2, 0)).abs().max() <= 0.5 + 1e-4
+
+
 @pytest.mark.parametrize("size", [(36, 64), (27, 48), (18, 32), (12, 64), (11, 47), (35, 63), (36, 7), (1, 1)])
 def test_areas_are_averaged_as_torch_does(size: tuple[int, int]) -> None:
     planes = torch.rand(1, 3, 36, 64, generator=torch.Generator().manual_seed(1))

@@ -52,7 +52,7 @@ class Track:
     after: Annotated[Path | None, tyro.conf.arg(metavar="SEGMENT", help_behavior_hint="")] = None
     """Begin at the end of this finished group, where things are as it has fitted them: starts for the groups after it,
     without what tracking lost before."""
-    cameras: int = 30
+    cameras: int = 14
     """Most cameras to track with in a frame; of more, every second or third, in turn."""
     device: Device = "auto"
     """Compute back-end."""

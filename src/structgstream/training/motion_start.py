@@ -29,7 +29,7 @@ from structgstream.training.observation import (
 )
 from structgstream.training.partition import Partition, focus_views
 from structgstream.training.residuals import apply_camera_color
-from structgstream.training.views import View, blackened
+from structgstream.training.views import View, as_picture, blackened
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def residual_motion(
             focus, small = focuses[view.index], view.reduced(scale)
             gaussians = folded.gaussians(view.camera, backend)
             image = apply_camera_color(focus.picture, moving.camera_color, view.index)
-            picture = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+            picture = as_picture(image)
             inside = focus.tiles.pixels() if view.mask is None else focus.tiles.pixels() & view.mask
             # Outside the tiles nothing was drawn: there the picture replaces the rendering.
             picture = focus.tiles.choose(blackened(picture, view.mask), view.image)

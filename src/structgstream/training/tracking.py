@@ -3,9 +3,9 @@
 
 What carries a sequential run through large motion is its motion start (``motion_start``), not its iterations. Tracking
 is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed, and sums of flow at
-a quarter of the size. Flow from the last pictures to these displaces the movers, then flow from the rendering to these,
-which bounds drift, because renderings do not forget what things look like. Gaussians are generated once a camera and
-frame.
+a quarter of the size. Flow from the last pictures to these displaces the movers, then flow from the rendering to these
+in a part of those cameras, which bounds drift, because renderings do not forget what things look like. A few cameras in
+every frame do that better than all in every second or third. Gaussians are generated once a camera and frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ from structgstream.training.picture_change import PictureChange, detect_picture_
 from structgstream.training.residuals import apply_camera_color
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.trust import ViewChange, trusted_views
-from structgstream.training.views import View, area_mean, blackened, reduced, training_views
+from structgstream.training.views import View, area_mean, as_picture, blackened, reduced, training_views
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TrackConfig:
 
     scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
-    cameras: int = 30
+    cameras: int = 14
     """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
@@ -54,8 +54,8 @@ class TrackConfig:
     """How flow is searched."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
-    correct_every: int = 2
-    """Flow from the rendering in every frame of so many."""
+    rendered_every: int = 2
+    """Flow from the rendering in every so-manieth of these cameras, in turn; 0: in none."""
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,16 @@ class Tracker:
     rig: CameraRig
     backend: Backend
 
+    def stride(self, cameras: int) -> int:
+        """Every so-manieth of ``cameras`` cameras is used in a frame."""
+        return -(-cameras // max(self.config.cameras, 2))
+
     def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
         """The reduced pictures of ``frame`` and what changed since those before, independent of the scene."""
         views = [reduced(view, self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
         if before is None:
             return TrackPictures(frame.index, views)
-        stride = -(-len(views) // max(self.config.cameras, 2))
+        stride = self.stride(len(views))
         chosen = [n for n in range(len(views)) if n % stride == frame.index % stride]
         taken = [views[n] for n in chosen]
         found = detect_picture_changes(
@@ -159,7 +163,9 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             if not seen:
                 return Tracked(past.scene, velocities, watch.seconds)
             votes = torch.stack([entry.votes for entry in seen]).sum(0)
-            movers = (votes >= tracker.motion.least_views).nonzero()[:, 0]
+            # What moved goes on as long as one camera sees it: not all that see it are used in every frame.
+            goes_on = (past.velocities != 0).any(1) & (votes > 0)
+            movers = ((votes >= tracker.motion.least_views) | goes_on).nonzero()[:, 0]
         with watch.stage("flow between pictures"):
             views = [entry.view for entry in seen]
             evidence = _evidence([entry.flows[movers] for entry in seen])
@@ -167,14 +173,16 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             priors, lift = tracker.config.prior * past.velocities[movers], tracker.lift
             found = lift_motion(evidence, centers[movers], priors, views, config=lift, backend=tracker.backend)
             velocities[movers] = found.displacements
-        if len(movers) and pictures.index % tracker.config.correct_every == 0:
+        if len(movers) and (every := tracker.config.rendered_every):
             with watch.stage("flow from the rendering"):
-                flows = [_rendered_flow(tracker, scene, entry, velocities)[movers] for entry in seen]
+                turn = pictures.index // tracker.stride(len(pictures.views))
+                part = [entry for n, entry in enumerate(seen) if (n + turn) % every == 0] or seen
+                flows = [_rendered_flow(tracker, scene, entry, velocities)[movers] for entry in part]
                 again = lift_motion(
                     _evidence(flows),
                     (centers + velocities)[movers],
                     torch.zeros_like(priors),
-                    views,
+                    [entry.view for entry in part],
                     config=lift,
                     backend=tracker.backend,
                 )
@@ -229,7 +237,7 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     image = apply_camera_color(drawn.image, scene.camera_color, view.index)
     counting = _counting(seen.tiles, view)
     # Outside the tiles nothing was drawn: there the picture replaces the rendering.
-    rendered = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    rendered = as_picture(image)
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.reduced(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)

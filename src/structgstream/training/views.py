@@ -84,14 +84,35 @@ def mean_of_counting(values: Tensor, mask: Tensor | None) -> Tensor:
 def reduced(view: View, scale: float) -> View:
     """The view with its picture reduced by ``scale`` (area average) and its camera resized."""
     width, height = (max(1, round(size * scale)) for size in (view.camera.width, view.camera.height))
-    pixels = view.image.permute(2, 0, 1)[None].float()
-    small = area_mean(pixels, (height, width))
-    image = small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
+    image = _reduced_picture(view.image, (height, width))
     camera = view.camera.resized(width, height)
     if view.mask is None:
         return View(view.index, camera, image)
     mask = area_mean(view.mask[None, None].float(), (height, width))[0, 0] > 1.0 - 1e-4
     return View(view.index, camera, blackened(image, mask), mask)
+
+
+def as_picture(image: Tensor) -> Tensor:
+    """A rendering ``[H, W, 3]`` in 0 ... 1 as bytes; what is beyond is clamped."""
+    # In place: a new tensor for each step takes six times as long.
+    return image.clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+
+
+def _reduced_picture(picture: Tensor, size: tuple[int, int]) -> Tensor:
+    """The bytes ``[H, W, 3]`` averaged down to ``size``, h and w."""
+    height, width = picture.shape[:2]
+    factor = height // size[0]
+    if factor > MOST_PHASES or (size[0] * factor, size[1] * factor) != (height, width):
+        small = area_mean(picture.permute(2, 0, 1)[None].float(), size)
+        return small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
+    # Whole blocks of pixels: sums of integers, in an eighth of the time.
+    rows, total = picture.to(torch.int16), torch.zeros((), dtype=torch.int16, device=picture.device)
+    for first in range(factor):
+        total = total + rows[first::factor]
+    rows, total = total, torch.zeros((), dtype=torch.int16, device=picture.device)
+    for first in range(factor):
+        total = total + rows[:, first::factor]
+    return (total.float() / factor**2).round().to(torch.uint8)
 
 
 def area_mean(planes: Tensor, size: tuple[int, int]) -> Tensor:
