@@ -105,7 +105,9 @@ def test_blend_weights_sum_to_the_coverage(scene: Scene) -> None:
     gaussians = scene.gaussians(CAMERAS[0], BACKEND)
     weights = blend_weights(gaussians, CAMERAS[0], BACKEND)
     assert weights.min() >= 0
-    torch.testing.assert_close(weights.sum(), render(scene, CAMERAS[0], BACKEND).alpha.sum(), rtol=1e-4, atol=1e-3)
+    # Gaussians that less than 1/255 of the light reaches have no weight.
+    coverage = render(scene, CAMERAS[0], BACKEND).alpha.sum()
+    assert (1.0 - 1.0 / 255.0) * coverage < weights.sum() < 1.0001 * coverage
     blend = bake(scene, CAMERAS, BACKEND, baking=BakingConfig(weight="blend"))
     assert distance(blend, scene) > 25
 
