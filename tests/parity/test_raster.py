@@ -127,6 +127,24 @@ def test_cpu(isa: int, background: Tensor | None) -> None:
 
 
 @native
+@pytest.mark.parametrize("rasterize", [reference, cpu_raster.rasterize], ids=["reference", "cpu"])
+def test_what_hardly_any_light_reaches_is_drawn_without_gradient(isa: int, rasterize) -> None:
+    """The first of three walls lets a thousandth of the light through."""
+    _, quats, scales, _, _, _ = (value[:3].float() for value in gaussians())
+    view = camera(torch.float32)
+    depths = torch.tensor([[0.0, 0.0, depth] for depth in (2.0, 3.0, 4.0)])
+    means = (depths - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]
+    colors = torch.tensor([[0.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 0.0]])
+    leaves = [x.clone().requires_grad_() for x in (means, quats, scales + 50.0, torch.tensor([1.0, 0.8, 0.8]), colors)]
+    drawn = rasterize(splats_of(*leaves), view)
+    assert drawn.image[HEIGHT // 2, WIDTH // 2, 1].item() == pytest.approx(0.08, rel=0.01)
+    gradients = torch.autograd.grad(drawn.image.square().sum() + drawn.alpha.sum() + drawn.image.sum(), leaves)
+    assert gradients[4][0].any()
+    for name, gradient in zip(NAMES, gradients):
+        assert not gradient[1:].any(), name
+
+
+@native
 @pytest.mark.parametrize("faint", [False, True])
 def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
     """Blocks of pixels are chosen by a splat's ellipse: needles at every angle touch the corners of most."""

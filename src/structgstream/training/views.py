@@ -106,12 +106,12 @@ def _reduced_picture(picture: Tensor, size: tuple[int, int]) -> Tensor:
         small = area_mean(picture.permute(2, 0, 1)[None].float(), size)
         return small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
     # Whole blocks of pixels: sums of integers, in an eighth of the time.
-    rows, total = picture.to(torch.int16), torch.zeros((), dtype=torch.int16, device=picture.device)
+    rows = torch.zeros(size[0], width, 3, dtype=torch.int16, device=picture.device)
     for first in range(factor):
-        total = total + rows[first::factor]
-    rows, total = total, torch.zeros((), dtype=torch.int16, device=picture.device)
+        rows += picture[first::factor]
+    total = torch.zeros(*size, 3, dtype=torch.int16, device=picture.device)
     for first in range(factor):
-        total = total + rows[:, first::factor]
+        total += rows[:, first::factor]
     return (total.float() / factor**2).round().to(torch.uint8)
 
 
