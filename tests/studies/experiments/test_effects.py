@@ -41,6 +41,8 @@ def test_what_the_switches_are() -> None:
     assert ROWS[BETTER_FIRST].config == replace(RIG, initial=COMPACT.initial, denoising=COMPACT.denoising)
     calm = ROWS["compact-without-disturbance"].config
     assert calm.initial == replace(COMPACT.initial, disturbance=RIG.initial.disturbance)
+    plain = ROWS["compact-paper-losses"].config.initial.losses
+    assert (plain.l1, plain.ssim) == (RIG.initial.losses.l1, RIG.initial.losses.ssim) == (1.0, 0.2)
     many = ROWS["compact-offsets"].config.initial
     assert (many.offsets_per_anchor, many.all_drawn) == (RIG.initial.offsets_per_anchor, False)
     assert COMPACT.initial.all_drawn

@@ -7,8 +7,10 @@ from dataclasses import replace
 from structgstream.errors import ConfigError
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
+from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
 from structgstream.training.online import OnlineConfig
+from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.rounding import RoundingConfig
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
@@ -20,7 +22,8 @@ WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode with the compact stream's frame 0."""
-DISTURBANCE_FIELDS = ("initial.disturbance.dropped_share", "initial.disturbance.noise_scales")
+DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales", "until_share"))
+LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
 EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
 """Values of switches that are off in the whole preset."""
@@ -105,9 +108,12 @@ class _Rows:
 
 def _of_frame_0(rows: _Rows) -> None:
     full = rows.full
-    undisturbed = replace(full.initial.disturbance, dropped_share=0.0, noise_scales=0.0)
-    calm = replace(full, initial=replace(full.initial, disturbance=undisturbed))
+    calm = replace(full, initial=replace(full.initial, disturbance=PerturbationConfig()))
     rows.row("without-disturbance", "frame 0 w/o dropout and perturbation", calm, *DISTURBANCE_FIELDS)
+    paper = LossWeights()
+    losses = replace(full.initial.losses, l1=paper.l1, ssim=paper.ssim)
+    absolute = replace(full, initial=replace(full.initial, losses=losses))
+    rows.row("paper-losses", "frame 0 by the paper's weights of L1 and SSIM", absolute, *LOSS_FIELDS)
     lively = replace(full, initial=replace(full.initial, offsets_per_anchor=PAPER_OFFSETS, all_drawn=False))
     title = f"{PAPER_OFFSETS} Gaussians an anchor, of which about half are never drawn"
     rows.row("offsets", title, lively, *OFFSET_FIELDS)
