@@ -15,6 +15,7 @@ TINY_RIG = replace(
     initial=replace(
         TINY.initial,
         seed_voxels=1,
+        losses=RIG.initial.losses,
         disturbance=RIG.initial.disturbance,
         solidity=RIG.initial.solidity,
         free_space=RIG.initial.free_space,
