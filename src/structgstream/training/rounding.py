@@ -77,7 +77,7 @@ class RoundingConfig:
     """Root mean square error that quantizing frame 0 may add to the pictures, in 8-bit levels."""
     first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
     """Step of the MLPs' weights in frame 0."""
-    rate_weight: float = field(default=7e-5, metadata=_NO_STEP)
+    rate_weight: float = field(default=7.5e-5, metadata=_NO_STEP)
     """What a kilobyte of changes adds to the loss."""
     free_priced: bool = field(default=False, metadata=_NO_STEP)
     """Whether bits of free Gaussians that existed in the last frame are priced too."""
