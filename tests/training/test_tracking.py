@@ -71,6 +71,17 @@ def test_cameras_are_taken_in_turn_and_the_change_is_told() -> None:
     assert second.changed_share > 0.05
 
 
+def test_pictures_of_the_size_of_the_stream_are_not_copied() -> None:
+    scenery = world()
+    frame = scenery.frames[0]
+    views = tracker(scenery).pictures(frame, None).views
+    assert [view.image.data_ptr() for view in views] == [
+        frame.images[scenery.rig.training[view.index]].ctypes.data for view in views
+    ]
+    small = tracker(scenery, replace(CONFIG, scale=0.5)).pictures(frame, None).views
+    assert [tuple(view.image.shape) for view in small] == [(48, 64, 3)] * len(views)
+
+
 def test_half_of_the_cameras_in_turn_follow_what_all_do() -> None:
     scenery = world()
     truth, errors = (FRAMES - 1) * SPEED, []

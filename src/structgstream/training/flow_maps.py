@@ -92,7 +92,9 @@ def _boxes(mask: Mask) -> list[Box]:
     rows, columns = (-(-length // CONTEXT_PIXELS) for length in mask.shape)
     padded = np.zeros((rows * CONTEXT_PIXELS, columns * CONTEXT_PIXELS), bool)
     padded[: mask.shape[0], : mask.shape[1]] = mask
-    cells = padded.reshape(rows, CONTEXT_PIXELS, columns, CONTEXT_PIXELS).max((1, 3))
+    # First down the columns, whose steps are long: NumPy takes ten times as long for both at once.
+    high = padded.reshape(rows, CONTEXT_PIXELS, -1).any(1)
+    cells = high.reshape(rows, columns, CONTEXT_PIXELS).any(2)
     found = [_pixels(box, mask) for box in _parts(cells)]
     if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
         return one

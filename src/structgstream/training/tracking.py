@@ -37,7 +37,7 @@ from structgstream.training.picture_change import PictureChange, detect_picture_
 from structgstream.training.residuals import apply_camera_color
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.trust import ViewChange, trusted_views
-from structgstream.training.views import View, area_mean, as_picture, blackened, reduced, training_views
+from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Tracker:
 
     def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
         """The reduced pictures of ``frame`` and what changed since those before, independent of the scene."""
-        views = [reduced(view, self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
+        views = [view.reduced(self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
         if before is None:
             return TrackPictures(frame.index, views)
         stride = self.stride(len(views))
