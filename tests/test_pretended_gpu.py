@@ -54,7 +54,7 @@ def test_two_devices_that_meet_are_found() -> None:
         there, here = torch.ones(3, device=DEVICE), torch.ones(3)
         assert (there.device, (there + 1.0).cpu().tolist()) == (DEVICE, [2.0, 2.0, 2.0])
         with pytest.raises(RuntimeError, match="two devices"):
-            there + here
+            torch.add(there, here)
         with pytest.raises(RuntimeError, match="two devices"):
             here[torch.tensor([0, 2], device=DEVICE)]
         with pytest.raises(TypeError, match="no numpy array"):
