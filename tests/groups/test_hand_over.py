@@ -106,6 +106,30 @@ def test_what_moves_at_the_border_is_the_groups_own() -> None:
     assert torch.equal(shown.anchors.positions[~LEFT], before.anchors.positions[~LEFT])
 
 
+def test_what_is_withdrawn_is_the_groups_own() -> None:
+    own = two_heaps()
+    before = shifted(own, ~NONE, 5)
+    hand_over = HandOver(before, own, NONE, steps=STEPS)
+    one = torch.arange(2 * SIDE) == 2 * SIDE - 1
+    assert (hand_over.handed, hand_over.withdraw(LEFT), hand_over.withdraw(LEFT), hand_over.withdraw(one)) == (
+        2 * SIDE,
+        SIDE,
+        0,
+        1,
+    )
+    expected = torch.where((LEFT | one)[:, None], own.anchors.positions, before.anchors.positions)
+    assert torch.equal(hand_over.first.anchors.positions, expected)
+    assert torch.equal(hand_over.scene(own).anchors.positions, expected)
+    assert hand_over.handed == SIDE - 1
+
+
+def test_an_anchor_between_those_withdrawn_is_withdrawn() -> None:
+    own = two_heaps()
+    hand_over = HandOver(shifted(own, ~NONE, 5), own, NONE, steps=STEPS)
+    some = LEFT & (torch.arange(2 * SIDE) % 2 == 0)
+    assert SIDE // 2 < hand_over.withdraw(some) <= SIDE
+
+
 def test_differences_halve_besides_where_the_group_moves() -> None:
     own = two_heaps()
     hand_over = HandOver(shifted(own, ~NONE, -48), own, NONE, steps=STEPS)

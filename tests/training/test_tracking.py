@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from backends import quickest_backend
@@ -80,6 +81,12 @@ def test_pictures_of_the_size_of_the_stream_are_not_copied() -> None:
     ]
     small = tracker(scenery, replace(CONFIG, scale=0.5)).pictures(frame, None).views
     assert [tuple(view.image.shape) for view in small] == [(48, 64, 3)] * len(views)
+
+
+@pytest.mark.parametrize(("cameras", "stride"), [(2, 1), (10, 1), (11, 2), (12, 2), (27, 2), (28, 2), (30, 3)])
+def test_half_of_a_rig_is_used_in_a_frame_but_not_of_a_small_one(cameras: int, stride: int) -> None:
+    assert tracker(world(), replace(CONFIG, cameras=None)).stride(cameras) == stride
+    assert tracker(world(), replace(CONFIG, cameras=cameras)).stride(cameras) == 1
 
 
 def test_half_of_the_cameras_in_turn_follow_what_all_do() -> None:

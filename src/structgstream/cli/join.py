@@ -3,14 +3,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, parse_options
+from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
+
+if TYPE_CHECKING:
+    from structgstream.groups.handing import Border
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Join:
 
 
 def main(arguments: list[str]) -> None:
-    """Writes the file and prints its size."""
+    """Writes the file, and prints what was handed over and its size."""
     options = parse_options(Join, "join", arguments=arguments)
     output = options.output
     if not options.segments:
@@ -49,7 +53,17 @@ def main(arguments: list[str]) -> None:
     from structgstream.kernels.backend import select_backend
 
     backend = None if options.plain or len(options.segments) < 2 else select_backend(options.device)
-    frames = join_segments(options.segments, output, check=options.check, backend=backend)
+    console = Console()
+    frames = join_segments(
+        options.segments, output, check=options.check, backend=backend, on_border=lambda border: _tell(border, console)
+    )
     what = "1 frame" if frames == 1 else f"{frames} frames"
-    text = f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}"
-    Console().print(text, highlight=False, markup=False, soft_wrap=True)
+    say(console, f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}")
+
+
+def _tell(border: "Border", console: Console) -> None:
+    say(
+        console,
+        f"Border at frame {border.frame}: {border.handed:,} anchors keep their values of the frame before; "
+        f"{border.withdrawn:,} do not, as two fits side by side would show there.",
+    )

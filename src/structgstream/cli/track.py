@@ -52,8 +52,9 @@ class Track:
     after: Annotated[Path | None, tyro.conf.arg(metavar="SEGMENT", help_behavior_hint="")] = None
     """Begin at the end of this finished group, where things are as it has fitted them: starts for the groups after it,
     without what tracking lost before."""
-    cameras: int = 14
-    """Most cameras to track with in a frame; of more, every second or third, in turn."""
+    cameras: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Most cameras to track with in a frame; of more, every second or third, in turn. Default: half of the rig, from 6
+    to 14."""
     device: Device = "auto"
     """Compute back-end."""
     overwrite: bool = False
@@ -79,7 +80,7 @@ def main(arguments: list[str]) -> None:
     with usage_errors():
         if not options.odd or length < 1:
             check_length(length, key_interval=base.key_interval)
-    if options.cameras < 2:
+    if options.cameras is not None and options.cameras < 2:
         raise UsageError(f"--cameras must be at least 2, got {options.cameras}.")
     source = open_for(base.header, options.scene, frames=options.frames)
     backend = select_backend(options.device)

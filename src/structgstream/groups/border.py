@@ -17,6 +17,11 @@ CAMERAS = 9
 """Training cameras, at equal distances in the rig, for which the frames around a border are drawn."""
 
 
+def border_cameras(rig: CameraRig) -> tuple[str, ...]:
+    """Names of the cameras for which the frames around a border are drawn."""
+    return rig.training[:: max(1, len(rig.training) // CAMERAS)]
+
+
 def moving_at_border(
     before: Scene,
     first: Scene,
@@ -40,7 +45,7 @@ def moving_at_border(
         earlier: the last but one frame of the group before; None if it has no other.
         second: the second frame of the group; None if it has no other.
     """
-    names = rig.training[:: max(1, len(rig.training) // CAMERAS)]
+    names = border_cameras(rig)
     config = MotionConfig(enabled=True, picture_scale=0.5)
     views = _drawn(first, names, rig, backend)
     changes = detect_changes(views, _drawn(before, names, rig, backend), config=config, backend=backend)

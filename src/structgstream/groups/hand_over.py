@@ -10,6 +10,8 @@ fade: to zero in the frames after the border, in equal steps, so that no step is
 in which the anchor or most of its neighbours change, where motion hides that. They are bins (Note [Bins]), hence exact;
 most are of one or two, so each value is rounded by a threshold of its own, else all of these would go in one frame.
 
+A mixture of the two fits may show what neither does (``mixture``): there nothing is handed over (``withdraw``).
+
 Free Gaussians cannot be paired, and are the group's own: what is new is there at once. The light
 (``training/light.py``), which each group follows by itself, is that of the frame before and goes over in equal steps: a
 jump of it would show everywhere.
@@ -31,6 +33,10 @@ MOVING_SHARE = 0.6
 """An anchor is in motion if this share of its neighbours, or more, is."""
 FADE_FRAMES = 5
 """Frames after that of the border in which differences fade."""
+WITHDRAWN_NEIGHBOURS = 16
+"""Anchors, itself included, with which one is withdrawn."""
+WITHDRAWN_SHARE = 0.3
+"""An anchor is withdrawn if this share of its neighbours, or more, shows as a mixture."""
 _GOLDEN = 0.6180339887498949
 
 
@@ -62,13 +68,44 @@ class HandOver:
             if name in steps and (difference := _bins(then[name] - now[name], steps[name])).any():
                 self._light[name], self._steps[name] = difference, steps[name]
 
+    @property
+    def handed(self) -> int:
+        """Number of anchors that have values of the frame before."""
+        return int(self._handed().sum())
+
+    @property
+    def first(self) -> Scene:
+        """The group's first frame as it is handed over."""
+        return self._shown(self._last)
+
+    def withdraw(self, mask: Tensor) -> int:
+        """Hands the anchors in the mask ``[M]``, and those between them, not over; returns how many were. It has to be
+        called before :meth:`scene`."""
+        share = mask[self._neighbours[:, :WITHDRAWN_NEIGHBOURS]].float().mean(1)
+        withdrawn = mask | (share >= WITHDRAWN_SHARE)
+        count = int((withdrawn & self._handed()).sum())
+        for name, difference in self._differences.items():
+            self._differences[name] = torch.where(withdrawn[:, None], 0, difference)
+        return count
+
     def scene(self, found: Scene) -> Scene:
         """A frame of the stream instead of the group's own, ``found``; frames are given in order."""
         self._advance(found)
+        shown = self._shown(found)
+        self._last, self._left_frames = found, max(0, self._left_frames - 1)
+        return shown
+
+    def _handed(self) -> Tensor:
+        """Mask ``[M]`` of the anchors that differ from the group's own."""
+        found = torch.zeros(len(self._neighbours), dtype=torch.bool)
+        for difference in self._differences.values():
+            found |= difference.any(1)
+        return found
+
+    def _shown(self, found: Scene) -> Scene:
         state = state_of(found)
         for name, step in self._steps.items():
             state[name] = (_bins(state[name], step) + self._faded(name)) * step
-        self._last, self._left_frames = found, max(0, self._left_frames - 1)
         return scene_of(state, distance_input=found.distance_input)
 
     def _advance(self, found: Scene) -> None:

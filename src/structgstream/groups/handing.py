@@ -2,7 +2,8 @@
 """The packets of groups one after the other, each coded again after what stands still was handed over to it."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 
 from structgstream.codec.container.payload import parse_packet
@@ -12,6 +13,7 @@ from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.groups.border import moving_at_border
 from structgstream.groups.hand_over import HandOver
+from structgstream.groups.mixture import visible_mixtures
 from structgstream.groups.segment_file import Segment
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
@@ -19,6 +21,23 @@ from structgstream.scene.state import on_device
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _KINDS = {record: kind for kind, record in _TYPES.items()}
+WITHDRAWING_ROUNDS = 3
+"""What is withdrawn changes the mixture around it, which is looked at again."""
+
+
+@dataclass(frozen=True)
+class Border:
+    """What happened where a group begins.
+
+    Args:
+        frame: the group's first frame.
+        handed: number of anchors with values of the frame before.
+        withdrawn: number of those that would have had them, had the mixture not shown.
+    """
+
+    frame: int
+    handed: int
+    withdrawn: int
 
 
 class Handing:
@@ -27,13 +46,17 @@ class Handing:
     Args:
         header: of the stream.
         backend: the compute back-end, which draws the frames around borders.
+        on_border: called for each border, in order.
     """
 
-    def __init__(self, header: StreamHeader, backend: Backend) -> None:
+    def __init__(
+        self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], None] | None = None
+    ) -> None:
         self._header = header
         self._backend = backend
         self._rig = header.similarity.rig(header.rig)
         self._shown: deque[Scene] = deque(maxlen=2)
+        self._on_border = on_border or (lambda border: None)
 
     def records(self, segment: Segment) -> Iterator[bytes]:
         """The records of the packets of ``segment``; those of the first group are its own.
@@ -48,7 +71,7 @@ class Handing:
             return
         frames = self._decoded(segment)
         begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
-        hand_over = self._begin([scene for _, scene in begun])
+        hand_over = self._begin(begun[0][0].index, [scene for _, scene in begun])
         encoder = SceneEncoder(self._header)
         for packet, scene in chain(begun, frames):
             shown = scene if hand_over is None else hand_over.scene(scene)
@@ -56,7 +79,7 @@ class Handing:
             self._shown.append(made.reconstruction)
             yield packed(_TYPES[packet.kind], made.packet.payload)
 
-    def _begin(self, begun: list[Scene]) -> HandOver | None:
+    def _begin(self, frame: int, begun: list[Scene]) -> HandOver | None:
         """The hand-over to a group from its first one or two frames; None where everything changes."""
         device = self._backend.device
         *earlier, before = (on_device(scene, device) for scene in self._shown)
@@ -70,8 +93,14 @@ class Handing:
             second=second[0] if second else None,
         )
         if moving is None:
+            self._on_border(Border(frame, 0, 0))
             return None
-        return HandOver(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps)
+        hand_over, withdrawn = HandOver(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps), 0
+        for _ in range(WITHDRAWING_ROUNDS):
+            mixed = on_device(hand_over.first, device)
+            withdrawn += hand_over.withdraw(visible_mixtures(mixed, before, first, self._rig, self._backend).cpu())
+        self._on_border(Border(frame, hand_over.handed, withdrawn))
+        return hand_over
 
     def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
         decoder = SceneDecoder(self._header)

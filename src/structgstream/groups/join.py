@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments put together to one stream file, with or without a hand-over at their borders."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import BinaryIO
@@ -12,14 +12,21 @@ from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError
-from structgstream.groups.handing import Handing
+from structgstream.groups.handing import Border, Handing
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.kernels.backend import Backend
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.whole_files import whole_file
 
 
-def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False, backend: Backend | None = None) -> int:
+def join_segments(
+    paths: Sequence[Path],
+    output: Path,
+    *,
+    check: bool = False,
+    backend: Backend | None = None,
+    on_border: Callable[[Border], None] | None = None,
+) -> int:
     """Writes the stream of these segments, in order of their frames, and returns how many frames it has.
 
     ``output`` is replaced only by a whole stream. One segment is in memory at a time, and of it one packet.
@@ -31,6 +38,7 @@ def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False, b
         output: the stream file.
         check: decode every frame of the result, and check the births of free Gaussians.
         backend: the compute back-end of the hand-over, which draws the frames around borders; None for a plain copy.
+        on_border: called for each hand-over, in order.
 
     Raises:
         StreamError: a segment is damaged or not finished, or frames are missing, or there twice.
@@ -41,7 +49,7 @@ def join_segments(paths: Sequence[Path], output: Path, *, check: bool = False, b
     with whole_file(output) as file:
         written = _Written(file)
         written.add(segments[0][1])
-        handing = None if backend is None else Handing(_header(segments[0][1]), backend)
+        handing = None if backend is None else Handing(_header(segments[0][1]), backend, on_border=on_border)
         for path, _, _ in segments:
             written.segment(path, handing)
         file.write(pack_index(written.entries, file.tell()))

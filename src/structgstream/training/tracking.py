@@ -39,6 +39,9 @@ from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.trust import ViewChange, trusted_views
 from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
 
+FEWEST_HALVED, MOST_CAMERAS = 6, 14
+"""Half of a rig's cameras are used in a frame if that is at least the first, and at most the second number."""
+
 
 @dataclass(frozen=True)
 class TrackConfig:
@@ -46,8 +49,9 @@ class TrackConfig:
 
     scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
-    cameras: int = 14
-    """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn."""
+    cameras: int | None = None
+    """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn. None: half of them
+    (:data:`FEWEST_HALVED`, :data:`MOST_CAMERAS`)."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
     flow: FlowConfig = FlowConfig(apart=True)
@@ -99,7 +103,10 @@ class Tracker:
 
     def stride(self, cameras: int) -> int:
         """Every so-manieth of ``cameras`` cameras is used in a frame."""
-        return -(-cameras // max(self.config.cameras, 2))
+        half = -(-cameras // 2)
+        usual = min(half if half >= FEWEST_HALVED else cameras, MOST_CAMERAS)
+        most = usual if self.config.cameras is None else self.config.cameras
+        return -(-cameras // max(most, 2))
 
     def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
         """The reduced pictures of ``frame`` and what changed since those before, independent of the scene."""

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where anchors of two fits side by side show what neither fit shows.
+
+A hand-over mixes the values of the frame before with the group's own. On a plain body that moves, or where one fit has
+a free Gaussian and the other has anchors, the mixture is wrong although nothing there seems to change.
+"""
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.groups.border import border_cameras
+from structgstream.kernels.backend import Backend
+from structgstream.scene.render import render
+from structgstream.scene.scene import Scene
+from structgstream.training.observation import movers_of, sum_by_mover, weigh_maps
+from structgstream.training.views import area_mean
+
+TOLERANCE = 3.0 / 255.0
+"""A pixel may be so far outside of what the two fits show. With less, more flickers for nothing
+(docs/groups-measured.md)."""
+LEAST_EXCESS = 1.0 / 255.0
+"""Mean distance beyond it, over the pixels that an anchor covers, from which on the anchor shows."""
+LEAST_PIXELS = 0.5
+"""What covers less does not count."""
+_SCALE = 0.5
+
+
+def visible_mixtures(mixed: Scene, before: Scene, first: Scene, rig: CameraRig, backend: Backend) -> Tensor:
+    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels which are neither as in ``before`` nor in ``first``.
+
+    A pixel may have any colour between those of the two.
+
+    Args:
+        mixed: the group's first frame with what is handed over.
+        before: the last frame of the group before.
+        first: the group's own first frame.
+        rig: in the units of the scene.
+        backend: the compute back-end.
+    """
+    folded, count = mixed.with_folded_appearance(), len(mixed.anchors)
+    sums = torch.zeros(count, 2).to(mixed.anchors.positions)
+    with torch.no_grad():
+        for name in border_cameras(rig):
+            camera = rig[name]
+            small = camera.resized(round(camera.width * _SCALE), round(camera.height * _SCALE))
+            excess = area_mean(_excess(mixed, before, first, camera, backend)[None, None], (small.height, small.width))
+            gaussians = folded.gaussians(small, backend)
+            maps = torch.stack([torch.ones_like(excess[0, 0]), excess[0, 0]], dim=-1)
+            of_gaussians = weigh_maps(gaussians, small, maps, backend)
+            sums += sum_by_mover(of_gaussians, movers_of(gaussians, folded), folded)[:count]
+    covered = sums[:, 0]
+    return (covered > LEAST_PIXELS) & (sums[:, 1] > LEAST_EXCESS * covered)
+
+
+def _excess(mixed: Scene, before: Scene, first: Scene, camera: Camera, backend: Backend) -> Tensor:
+    """How far each pixel of ``mixed`` is beyond the tolerance, ``[H, W]``, mean over channels."""
+    then, own, shown = (render(scene, camera, backend).image.clamp(0.0, 1.0) for scene in (before, first, mixed))
+    allowed = shown.clamp(torch.minimum(then, own), torch.maximum(then, own))
+    return ((shown - allowed).abs().mean(-1) - TOLERANCE).clamp(min=0.0)

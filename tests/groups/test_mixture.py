@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Anchors show as a mixture where a picture is as in neither of two frames."""
+
+from dataclasses import replace
+
+import pytest
+from torch import Tensor
+
+from backends import quickest_backend
+from clip_groups import made
+from structgstream.cameras import CameraRig
+from structgstream.groups.base import GroupBase
+from structgstream.groups.mixture import visible_mixtures
+from structgstream.scene.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def base() -> tuple[Scene, CameraRig]:
+    found = GroupBase.read(made().header)
+    return found.scene(), found.header.similarity.rig(found.header.rig)
+
+
+def middle(scene: Scene) -> Tensor:
+    """The tenth of the anchors that is nearest to their centre."""
+    apart = (scene.anchors.positions - scene.anchors.positions.median(0).values).norm(dim=1)
+    return apart < apart.quantile(0.1)
+
+
+def displaced(scene: Scene, rows: Tensor, by: float = 0.3) -> Scene:
+    positions = scene.anchors.positions + by * rows[:, None]
+    return replace(scene, anchors=replace(scene.anchors, positions=positions))
+
+
+def test_what_either_frame_shows_is_no_mixture(base: tuple[Scene, CameraRig]) -> None:
+    scene, rig = base
+    backend = quickest_backend()
+    assert not visible_mixtures(scene, scene, scene, rig, backend).any()
+    other = displaced(scene, middle(scene))
+    assert not visible_mixtures(scene, other, scene, rig, backend).any()
+
+
+def test_what_neither_frame_shows_is_found_where_it_is(base: tuple[Scene, CameraRig]) -> None:
+    scene, rig = base
+    there = middle(scene)
+    found = visible_mixtures(displaced(scene, there), scene, scene, rig, quickest_backend())
+    assert found[there].float().mean() > 2.0 * found[~there].float().mean() > 0.0
