@@ -58,7 +58,7 @@ class TrackConfig:
     """How flow is searched."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
-    rendered_every: int = 2
+    rendered_every: int = 3
     """Flow from the rendering in every so-manieth of these cameras, in turn; 0: in none."""
 
 
