@@ -43,7 +43,7 @@ def visible_mixtures(mixed: Scene, before: Scene, first: Scene, rig: CameraRig, 
     with torch.no_grad():
         for name in border_cameras(rig):
             camera = rig[name]
-            small = camera.resized(round(camera.width * _SCALE), round(camera.height * _SCALE))
+            small = camera.resized(*(max(1, round(size * _SCALE)) for size in (camera.width, camera.height)))
             excess = area_mean(_excess(mixed, before, first, camera, backend)[None, None], (small.height, small.width))
             gaussians = folded.gaussians(small, backend)
             maps = torch.stack([torch.ones_like(excess[0, 0]), excess[0, 0]], dim=-1)
