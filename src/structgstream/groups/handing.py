@@ -22,7 +22,7 @@ from structgstream.scene.state import on_device
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _KINDS = {record: kind for kind, record in _TYPES.items()}
 WITHDRAWING_ROUNDS = 3
-"""What is withdrawn changes the mixture around it, which is looked at again."""
+"""At most. What is withdrawn changes the mixture around it, which is looked at again."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,10 @@ class Handing:
         hand_over, withdrawn = HandOver(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps), 0
         for _ in range(WITHDRAWING_ROUNDS):
             mixed = on_device(hand_over.first, device)
-            withdrawn += hand_over.withdraw(visible_mixtures(mixed, before, first, self._rig, self._backend).cpu())
+            more = hand_over.withdraw(visible_mixtures(mixed, before, first, self._rig, self._backend).cpu())
+            if not more:
+                break
+            withdrawn += more
         self._on_border(Border(frame, hand_over.handed, withdrawn))
         return hand_over
 
