@@ -13,7 +13,8 @@ from structgstream.evaluation.report import FrameScores, Report, Scores
 
 FACTS: dict[str, Any] = {
     "metrics": "all", "not_available": {}, "cameras": {"cam[0]": "held out"}, "absent_frames": {}, "masked_share": {},
-    "psnr_first": 31.0, "psnr_last": 30.0, "psnr_worst": 29.5, "drift_db_per_frame": -0.0125, "total_bytes": 5_000_000,
+    "psnr_first": 31.0, "psnr_last": 30.0, "psnr_worst": 29.5, "drift_db_per_frame": -0.0125,
+    "drift_at_equal_shares_db_per_frame": 0.0009, "total_bytes": 5_000_000,
     "header_bytes": 1_000_000, "packet_bytes": 4_000_000, "frames": 4, "megabits_per_second": 240.0,
     "megabits_per_second_with_header": 300.0, "fps": 30.0, "render_fps": 12.34, "decode_and_render_fps": 5.0,
     "field_bytes": {"small": 10, "large": 3_000_000, "none": 0},

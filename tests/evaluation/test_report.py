@@ -2,6 +2,7 @@
 """Means, slopes, the documented keys, and the plot."""
 
 import json
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from structgstream.evaluation.report import (
     mean_scores,
     psnr_trend,
     slope,
+    slope_at_equal_shares,
     write_json,
 )
 
@@ -54,7 +56,7 @@ def small_report() -> Report:
             )
         )
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames) for name in ("left", "right")}
-    facts = psnr_trend([frame.mean.psnr for frame in frames]) | drawing_facts(frames) | {"total_bytes": 5000}
+    facts = psnr_trend(frames) | drawing_facts(frames) | {"total_bytes": 5000}
     return Report(frames, by_camera, mean_scores(frame.mean for frame in frames), facts, {"python": "3"})
 
 
@@ -65,9 +67,44 @@ def test_means_skip_what_is_not_there() -> None:
 
 
 def test_the_course_of_psnr() -> None:
-    assert psnr_trend([30.0, 29.0, 28.5, 29.5])["drop_from_first_db"] == 1.5
+    facts = psnr_trend(small_report().frames)
+    assert (facts["psnr_first"], facts["psnr_last"], facts["psnr_worst"]) == (29.0, 26.0, 26.0)
+    assert facts["drop_from_first_db"] == 3.0
     assert slope([30.0, 29.0, 28.0]) == pytest.approx(-1.0)
     assert slope([30.0]) == 0.0
+
+
+def course(*frames: dict[str, Scores]) -> list[FrameScores]:
+    first = small_report().frames[0]
+    return [
+        replace(first, index=n, cameras=cameras, mean=mean_scores(cameras.values())) for n, cameras in enumerate(frames)
+    ]
+
+
+def mixed(share: float, changed: float = 20.0, still: float = 40.0) -> Scores:
+    """Scores of a picture of which ``share`` has changed."""
+    psnr = -10.0 * math.log10(share * 10.0 ** (-changed / 10.0) + (1.0 - share) * 10.0 ** (-still / 10.0))
+    return replace(GOOD, psnr=psnr, psnr_changed=changed, psnr_still=still, changed_share=share)
+
+
+def test_more_that_moves_is_no_drift_at_equal_shares() -> None:
+    frames = course({"left": GOOD}, *({"left": mixed(0.1 * n)} for n in range(1, 5)))
+    assert slope([frame.mean.psnr for frame in frames if frame.mean]) < -1.0
+    assert slope_at_equal_shares(frames) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_pixels_that_get_worse_are_drift_at_equal_shares() -> None:
+    frames = course(*({"left": mixed(0.1 * n, 20.0 - n, 40.0 - n), "right": GOOD} for n in range(1, 5)))
+    assert slope_at_equal_shares(frames) == pytest.approx(-1.0)
+    assert slope_at_equal_shares(frames[:1]) is None
+
+
+def test_an_equal_share_is_each_camera_s_own() -> None:
+    """A camera that sees more motion keeps seeing more; one that is absent from a frame is not there in it."""
+    both = {"left": mixed(0.1), "right": mixed(0.5, 30.0)}
+    assert slope_at_equal_shares(course(both, both)) == pytest.approx(0.0, abs=1e-9)
+    gone = slope_at_equal_shares(course(both, {"left": mixed(0.1)}))
+    assert gone == pytest.approx((both["left"].psnr - both["right"].psnr) / 2)
 
 
 def test_pictures_a_second_with_and_without_the_decoding() -> None:

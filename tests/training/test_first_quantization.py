@@ -176,3 +176,20 @@ def test_a_scene_that_no_camera_sees() -> None:
     config = RoundingConfig()
     found, _ = quantize_first_frame(other, sensitivity, config=config, voxel_size=VOXEL, steps=STEPS)
     assert all(value.isfinite().all() for value in state_of(found).values())
+
+
+def test_steps_do_not_depend_on_the_number_of_threads() -> None:
+    """All later frames depend on the bits of the steps."""
+    scene = random_scene(30_000, seed=3)
+    scene = replace(scene, free=scene.free.select(torch.zeros(len(scene.free), dtype=torch.bool)))
+    g, state = torch.Generator().manual_seed(2), state_of(scene)
+    worth = {name: torch.rand(state[name].shape, generator=g) for name in SENSITIVITY_FIELDS}
+    used = torch.ones(state["anchor_offsets"].shape[:2], dtype=torch.bool)
+    sensitivity = Sensitivity(worth, torch.eye(scene.anchors.features.shape[1], dtype=torch.float64), used)
+    found = []
+    for threads in (1, 2, 3, 5):
+        torch.set_num_threads(threads)
+        found.append(
+            quantize_first_frame(scene, sensitivity, config=RoundingConfig(), voxel_size=VOXEL, steps=STEPS)[1]
+        )
+    assert all(other == found[0] for other in found)

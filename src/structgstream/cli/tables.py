@@ -116,6 +116,10 @@ def _not_available(report: "Report") -> Table:
     return table
 
 
+def _at_equal_shares(drift: float | None) -> str:
+    return "" if drift is None else f" ({drift:+.3f} if as many pixels had changed in all)"
+
+
 def _facts(report: "Report") -> Table:
     s = report.stream
     table = name_value_table()
@@ -128,7 +132,7 @@ def _facts(report: "Report") -> Table:
     table.add_row(
         "PSNR over time",
         f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
-        f"drift {s['drift_db_per_frame']:+.3f} dB a frame",
+        f"drift {s['drift_db_per_frame']:+.3f} dB a frame{_at_equal_shares(s['drift_at_equal_shares_db_per_frame'])}",
     )
     table.add_row(
         "size",

@@ -123,7 +123,7 @@ def evaluate(
     seen = [name for name in names if any(name in frame.cameras for frame in frames)]
     by_camera = {name: mean_scores(frame.cameras[name] for frame in frames if name in frame.cameras) for name in seen}
     mean = mean_scores(scores for frame in frames for scores in frame.cameras.values())
-    facts = stream_facts(recording, names) | psnr_trend([frame.mean.psnr for frame in frames if frame.mean])
+    facts = stream_facts(recording, names) | psnr_trend(frames)
     left_out = comparison_facts(frames, names, comparison.left_out)
     facts |= left_out
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)

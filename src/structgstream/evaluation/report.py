@@ -123,15 +123,53 @@ def slope(values: Sequence[float]) -> float:
     return float(np.polyfit(np.arange(len(values)), values, 1)[0]) if len(values) > 1 else 0.0
 
 
-def psnr_trend(psnrs: Sequence[float]) -> dict[str, float]:
-    """PSNR over the frames: first, last, worst, slope and the largest drop from the first, in dB."""
+def psnr_trend(frames: Sequence[FrameScores]) -> dict[str, float | None]:
+    """PSNR over the frames: first, last, worst, slope, slope at equal shares, and the largest drop from the first, in
+    dB."""
+    psnrs = [frame.mean.psnr for frame in frames if frame.mean]
     return {
         "psnr_first": psnrs[0],
         "psnr_last": psnrs[-1],
         "psnr_worst": min(psnrs),
         "drift_db_per_frame": slope(psnrs),
+        "drift_at_equal_shares_db_per_frame": slope_at_equal_shares(frames),
         "drop_from_first_db": psnrs[0] - min(psnrs),
     }
+
+
+def slope_at_equal_shares(frames: Sequence[FrameScores]) -> float | None:
+    """Slope of PSNR if the changed pixels of a camera were the same share of its pixels in all frames, namely the mean.
+
+    What moves is harder than what stands still, so PSNR falls as more has moved although neither gets worse. Frames in
+    which no camera has both kinds of pixels are left out; None if fewer than two have.
+    """
+    shares: dict[str, list[float]] = {}
+    for frame in frames:
+        for name, scores in _with_both_kinds(frame).items():
+            shares.setdefault(name, []).append(scores.changed_share)
+    means = {name: float(np.mean(values)) for name, values in shares.items()}
+    course = [
+        float(np.mean([_psnr_at_share(scores, means[name]) for name, scores in found.items()]))
+        for frame in frames
+        if (found := _with_both_kinds(frame))
+    ]
+    return slope(course) if len(course) > 1 else None
+
+
+def _with_both_kinds(frame: FrameScores) -> dict[str, Scores]:
+    return {
+        name: scores
+        for name, scores in frame.cameras.items()
+        if scores.psnr_changed is not None and scores.psnr_still is not None
+    }
+
+
+def _psnr_at_share(scores: Scores, share: float) -> float:
+    """PSNR if the share ``share`` of the pixels were the changed ones."""
+    assert scores.psnr_changed is not None
+    assert scores.psnr_still is not None
+    changed, still = (10.0 ** (-0.1 * psnr) for psnr in (scores.psnr_changed, scores.psnr_still))
+    return float(-10.0 * np.log10(share * changed + (1.0 - share) * still))
 
 
 def drawing_facts(frames: Sequence[FrameScores]) -> dict[str, float]:

@@ -189,7 +189,8 @@ def _quantize_rows(
     """A step, and values ``[M, ...]`` quantized to it times a power of two per row."""
     counted = sensitivities > 0 if counted is None else counted
     flat, rows = sensitivities * counted, tuple(range(1, sensitivities.dim()))
-    mean = float(flat.sum() / counted.sum().clamp(min=1))
+    # In float64: the last bits of a float32 sum depend on the number of threads, and all later frames on the step.
+    mean = float(flat.sum(dtype=torch.float64) / counted.sum().clamp(min=1))
     if not mean > 0.0:
         mean = 1.0
     of_row = flat.sum(rows) / counted.sum(rows).clamp(min=1)
