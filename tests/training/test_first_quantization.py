@@ -183,7 +183,9 @@ def test_steps_do_not_depend_on_the_number_of_threads() -> None:
     scene = random_scene(30_000, seed=3)
     scene = replace(scene, free=scene.free.select(torch.zeros(len(scene.free), dtype=torch.bool)))
     g, state = torch.Generator().manual_seed(2), state_of(scene)
-    worth = {name: torch.rand(state[name].shape, generator=g) for name in SENSITIVITY_FIELDS}
+    worth: dict[FieldName, torch.Tensor] = {
+        name: torch.rand(state[name].shape, generator=g) for name in SENSITIVITY_FIELDS
+    }
     used = torch.ones(state["anchor_offsets"].shape[:2], dtype=torch.bool)
     sensitivity = Sensitivity(worth, torch.eye(scene.anchors.features.shape[1], dtype=torch.float64), used)
     found = []
