@@ -7,7 +7,9 @@ import pytest
 
 from quick_streams import CLIP, QUARTER, error_of
 from structgstream.cli import main
+from structgstream.cli.parallel import WorkerOptions, join_words
 from structgstream.codec.reader import open_stream
+from structgstream.evaluation.environment import usable_cores
 
 GROUPS = ["--frames", "6", "--groups", "2", "--odd", "--executor", "inline"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")
@@ -68,3 +70,21 @@ def test_an_output_that_is_no_parallel_run_is_not_replaced(tmp_path: Path, capsy
         ["parallel", CLIP, "-o", str(tmp_path / "out.sgs"), *GROUPS], capsys, status=1
     )
     assert (tmp_path / "out.sgs").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (WorkerOptions(workers=1, threads=1), ("--workers", "1")),
+        (WorkerOptions("inline"), ("--workers", "1")),
+        (WorkerOptions("ray"), ()),
+    ],
+)
+def test_joining_takes_no_more_processes_than_the_run_has_threads(
+    options: WorkerOptions, words: tuple[str, ...]
+) -> None:
+    assert join_words(options, "cpu") == words
+
+
+def test_joining_takes_all_cores_that_the_workers_have() -> None:
+    assert join_words(WorkerOptions(), "cpu") == ("--workers", str(usable_cores()))

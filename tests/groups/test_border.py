@@ -4,12 +4,13 @@
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from backends import quickest_backend
 from clip_groups import made
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
-from structgstream.groups.border import moving_at_border
+from structgstream.groups.border import draw_border, moving_at_border
 from structgstream.scene.scene import Scene
 
 
@@ -24,6 +25,11 @@ def most_seen(scene: Scene, rig: CameraRig) -> int:
     return int(covered.argmax())
 
 
+def moving(before: Scene, first: Scene, rig: CameraRig, **around: Scene) -> Tensor | None:
+    backend = quickest_backend()
+    return moving_at_border(before, first, draw_border(before, first, rig, backend), rig, backend, **around)
+
+
 def test_what_moved_is_found_and_what_did_not_is_not() -> None:
     base = GroupBase.read(made().header)
     first, rig = base.scene(), base.header.similarity.rig(base.header.rig)
@@ -31,16 +37,16 @@ def test_what_moved_is_found_and_what_did_not_is_not() -> None:
     center = at[most_seen(first, rig)]
     there = (at - center).norm(dim=1) < (at - center).norm(dim=1).quantile(0.1)
     before = replace(first, anchors=replace(first.anchors, positions=at + 0.3 * there[:, None]))
-    found = moving_at_border(first, first, rig, quickest_backend())
+    found = moving(first, first, rig)
     assert found is not None
     assert not found.any()
-    found = moving_at_border(before, first, rig, quickest_backend())
+    found = moving(before, first, rig)
     assert found is not None
     # Pictures of 80x60 show few of the anchors in a heap.
     assert found[there].float().mean() > 3.0 * found[~there].float().mean()
     slowly = replace(first, anchors=replace(first.anchors, positions=at + 1e-4 * there[:, None]))
     for around in ({"second": slowly}, {"earlier": slowly}):
-        found = moving_at_border(first, first, rig, quickest_backend(), **around)
+        found = moving(first, first, rig, **around)
         assert found is not None
         assert torch.equal(found, there)
 
@@ -49,4 +55,4 @@ def test_at_a_cut_nothing_is_handed_over() -> None:
     base = GroupBase.read(made().header)
     first, rig = base.scene(), base.header.similarity.rig(base.header.rig)
     gone = replace(first, anchors=replace(first.anchors, positions=first.anchors.positions + 50.0))
-    assert moving_at_border(gone, first, rig, quickest_backend(), second=first) is None
+    assert moving(gone, first, rig, second=first) is None

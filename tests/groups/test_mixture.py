@@ -10,6 +10,7 @@ from backends import quickest_backend
 from clip_groups import made
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
+from structgstream.groups.border import draw_border
 from structgstream.groups.mixture import visible_mixtures
 from structgstream.scene.scene import Scene
 
@@ -34,13 +35,14 @@ def displaced(scene: Scene, rows: Tensor, by: float = 0.3) -> Scene:
 def test_what_either_frame_shows_is_no_mixture(base: tuple[Scene, CameraRig]) -> None:
     scene, rig = base
     backend = quickest_backend()
-    assert not visible_mixtures(scene, scene, scene, rig, backend).any()
+    assert not visible_mixtures(scene, draw_border(scene, scene, rig, backend), rig, backend).any()
     other = displaced(scene, middle(scene))
-    assert not visible_mixtures(scene, other, scene, rig, backend).any()
+    assert not visible_mixtures(scene, draw_border(other, scene, rig, backend), rig, backend).any()
 
 
 def test_what_neither_frame_shows_is_found_where_it_is(base: tuple[Scene, CameraRig]) -> None:
     scene, rig = base
     there = middle(scene)
-    found = visible_mixtures(displaced(scene, there), scene, scene, rig, quickest_backend())
+    backend = quickest_backend()
+    found = visible_mixtures(displaced(scene, there), draw_border(scene, scene, rig, backend), rig, backend)
     assert found[there].float().mean() > 2.0 * found[~there].float().mean() > 0.0

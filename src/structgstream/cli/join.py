@@ -15,6 +15,7 @@ from structgstream.cli.progress import human_bytes
 
 if TYPE_CHECKING:
     from structgstream.groups.handing import Border
+    from structgstream.kernels.backend import Backend
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Join:
     """Copy the packets of every group as they are, without a hand-over."""
     device: Device = "auto"
     """Compute back-end of the hand-over."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Processes of one thread each that hand over. Default: one a core; a GPU has one."""
     overwrite: bool = False
     """Replace OUT.sgs when it exists."""
 
@@ -55,10 +58,23 @@ def main(arguments: list[str]) -> None:
     backend = None if options.plain or len(options.segments) < 2 else select_backend(options.device)
     console = Console()
     frames = join_segments(
-        options.segments, output, check=options.check, backend=backend, on_border=lambda border: _tell(border, console)
+        options.segments,
+        output,
+        check=options.check,
+        backend=backend,
+        workers=_workers(options.workers, backend),
+        on_border=lambda border: _tell(border, console),
     )
     what = "1 frame" if frames == 1 else f"{frames} frames"
     say(console, f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}")
+
+
+def _workers(asked: int | None, backend: "Backend | None") -> int:
+    from structgstream.evaluation.environment import usable_cores
+
+    if asked is not None or backend is None:
+        return 1 if asked is None else asked
+    return 1 if backend.name == "cuda" else usable_cores()
 
 
 def _tell(border: "Border", console: Console) -> None:

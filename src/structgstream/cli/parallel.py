@@ -145,6 +145,19 @@ def gpus_of(device: Device) -> int:
     return torch.cuda.device_count()
 
 
+def join_words(options: WorkerOptions, device: Device) -> tuple[str, ...]:
+    """As many processes as the workers have threads; where these are elsewhere, or GPUs, what ``join`` takes itself."""
+    from structgstream.evaluation.environment import usable_cores
+    from structgstream.executors.places import shared_out
+
+    if options.executor == "ray" or gpus_of(device):
+        return ()
+    cores = usable_cores()
+    places = shared_out(workers=options.workers, cores=cores, threads=options.threads)
+    threads = 1 if options.executor == "inline" else min(cores, sum(place.threads for place in places))
+    return ("--workers", str(threads))
+
+
 def _job(options: Parallel, rest: list[str]) -> "Job":
     from structgstream.parallel.driver import Job
     from structgstream.parallel.unit import Unit
@@ -166,6 +179,7 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
         tuple(track),
         options.run.track_threads,
         ("--device", options.device),
+        join_words(options.run, options.device),
     )
     return Job(unit, options.output.absolute(), int(options.device == "cuda" or gpus_of(options.device) > 0))
 

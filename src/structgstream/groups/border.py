@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which anchors move where one group ends and the next begins, from renderings of the two alone."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,9 +23,31 @@ def border_cameras(rig: CameraRig) -> tuple[str, ...]:
     return rig.training[:: max(1, len(rig.training) // CAMERAS)]
 
 
+@dataclass(frozen=True)
+class BorderPictures:
+    """The two frames of a border, drawn; at 640 x 360 they take 50 MB.
+
+    Args:
+        before: by name of each of the :func:`border_cameras`, ``[H, W, 3]`` of the last frame of the group before.
+        first: the same of the first frame of the group.
+    """
+
+    before: Mapping[str, Tensor]
+    first: Mapping[str, Tensor]
+
+
+def draw_border(before: Scene, first: Scene, rig: CameraRig, backend: Backend) -> BorderPictures:
+    """Draws the last frame of a group and the first one of the next."""
+    names = border_cameras(rig)
+    with torch.no_grad():
+        then, now = ({name: render(scene, rig[name], backend).image for name in names} for scene in (before, first))
+    return BorderPictures(then, now)
+
+
 def moving_at_border(
     before: Scene,
     first: Scene,
+    pictures: BorderPictures,
     rig: CameraRig,
     backend: Backend,
     *,
@@ -40,15 +63,15 @@ def moving_at_border(
     Args:
         before: the last frame of the group before.
         first: the first frame of the group.
+        pictures: of these two.
         rig: in the units of the scene.
         backend: the compute back-end.
         earlier: the last but one frame of the group before; None if it has no other.
         second: the second frame of the group; None if it has no other.
     """
-    names = border_cameras(rig)
     config = MotionConfig(enabled=True, picture_scale=0.5)
-    views = _drawn(first, names, rig, backend)
-    changes = detect_changes(views, _drawn(before, names, rig, backend), config=config, backend=backend)
+    views, earlier_views = (_as_views(drawn, rig, backend) for drawn in (pictures.first, pictures.before))
+    changes = detect_changes(views, earlier_views, config=config, backend=backend)
     found = segment_motion(first, views, changes, config=config, backend=backend)
     if found.scene_cut:
         return None
@@ -59,9 +82,7 @@ def moving_at_border(
     return moving
 
 
-def _drawn(scene: Scene, names: Sequence[str], rig: CameraRig, backend: Backend) -> list[View]:
-    """Renderings of ``scene`` as if they were pictures of the cameras ``names``."""
-    device = backend.device
-    with torch.no_grad():
-        pictures = [torch.from_numpy(to_8bit_image(render(scene, rig[name], backend).image)) for name in names]
-    return [View(row, rig[name], image.to(device)) for row, (name, image) in enumerate(zip(names, pictures))]
+def _as_views(drawn: Mapping[str, Tensor], rig: CameraRig, backend: Backend) -> list[View]:
+    """Renderings as if they were pictures of their cameras."""
+    pictures = ((name, torch.from_numpy(to_8bit_image(image)).to(backend.device)) for name, image in drawn.items())
+    return [View(row, rig[name], picture) for row, (name, picture) in enumerate(pictures)]

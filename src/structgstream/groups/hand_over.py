@@ -33,6 +33,8 @@ MOVING_SHARE = 0.6
 """An anchor is in motion if this share of its neighbours, or more, is."""
 FADE_FRAMES = 5
 """Frames after that of the border in which differences fade."""
+OWN_FRAMES = FADE_FRAMES + 3
+"""The last two frames of a group of so many are its own: nothing is left of what was handed over."""
 WITHDRAWN_NEIGHBOURS = 16
 """Anchors, itself included, with which one is withdrawn."""
 WITHDRAWN_SHARE = 0.3

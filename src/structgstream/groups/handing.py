@@ -11,7 +11,7 @@ from structgstream.codec.container.records import RecordType, packed, read_recor
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.groups.border import moving_at_border
+from structgstream.groups.border import draw_border, moving_at_border
 from structgstream.groups.hand_over import HandOver
 from structgstream.groups.mixture import visible_mixtures
 from structgstream.groups.segment_file import Segment
@@ -58,6 +58,15 @@ class Handing:
         self._shown: deque[Scene] = deque(maxlen=2)
         self._on_border = on_border or (lambda border: None)
 
+    def follow(self, segment: Segment) -> None:
+        """Begin after a group whose last two frames are shown as they are: the first one, or one of
+        :data:`~structgstream.groups.hand_over.OWN_FRAMES` or more.
+
+        Raises:
+            StreamError: a packet is damaged.
+        """
+        self._shown.extend(scene for _, scene in self._decoded(segment))
+
     def records(self, segment: Segment) -> Iterator[bytes]:
         """The records of the packets of ``segment``; those of the first group are its own.
 
@@ -84,9 +93,11 @@ class Handing:
         device = self._backend.device
         *earlier, before = (on_device(scene, device) for scene in self._shown)
         first, *second = (on_device(scene, device) for scene in begun)
+        pictures = draw_border(before, first, self._rig, self._backend)
         moving = moving_at_border(
             before,
             first,
+            pictures,
             self._rig,
             self._backend,
             earlier=earlier[0] if earlier else None,
@@ -98,7 +109,7 @@ class Handing:
         hand_over, withdrawn = HandOver(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps), 0
         for _ in range(WITHDRAWING_ROUNDS):
             mixed = on_device(hand_over.first, device)
-            more = hand_over.withdraw(visible_mixtures(mixed, before, first, self._rig, self._backend).cpu())
+            more = hand_over.withdraw(visible_mixtures(mixed, pictures, self._rig, self._backend).cpu())
             if not more:
                 break
             withdrawn += more

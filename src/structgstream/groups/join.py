@@ -1,22 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments put together to one stream file, with or without a hand-over at their borders."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 from structgstream.codec.container.index import pack_index
-from structgstream.codec.container.records import PREFIX, read_record
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import open_stream
-from structgstream.errors import ConfigError, StreamError
+from structgstream.errors import ConfigError, StreamError, TaskError
+from structgstream.executors.executor import TaskQueue
+from structgstream.executors.local import LocalEngine
+from structgstream.executors.places import shared_out
 from structgstream.groups.handing import Border, Handing
+from structgstream.groups.handing_run import HandedRun, header_of, run_task, runs_of
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.kernels.backend import Backend
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.whole_files import whole_file
+
+POLL_SECONDS = 0.2
 
 
 def join_segments(
@@ -25,11 +29,13 @@ def join_segments(
     *,
     check: bool = False,
     backend: Backend | None = None,
+    workers: int = 1,
     on_border: Callable[[Border], None] | None = None,
 ) -> int:
     """Writes the stream of these segments, in order of their frames, and returns how many frames it has.
 
-    ``output`` is replaced only by a whole stream. One segment is in memory at a time, and of it one packet.
+    ``output`` is replaced only by a whole stream. One segment is in memory at a time, and of it one packet; with
+    several workers also the packets of some eight groups for each of them. The bytes are the same for any number.
     With a back-end, what stands still at a border is handed over from group to group (``hand_over``), for which packets
     are coded again; otherwise they are copied.
 
@@ -38,25 +44,62 @@ def join_segments(
         output: the stream file.
         check: decode every frame of the result, and check the births of free Gaussians.
         backend: the compute back-end of the hand-over, which draws the frames around borders; None for a plain copy.
+        workers: processes that hand over, each with one thread; one of this process. A GPU has one.
         on_border: called for each hand-over, in order.
 
     Raises:
         StreamError: a segment is damaged or not finished, or frames are missing, or there twice.
-        ConfigError: the segments have different headers, or are of different captures.
+        ConfigError: the segments have different headers, or are of different captures; or several workers for a GPU.
         StorageError: the stream cannot be written.
+        TaskError: a worker failed.
     """
+    if workers < 1 or (workers > 1 and backend is not None and backend.name == "cuda"):
+        raise ConfigError(f"{workers} workers cannot hand over; there is one on a GPU, and one or more on processors.")
     segments = _in_order(paths)
+    ordered = [path for path, _, _ in segments]
+    runs = runs_of([frames for _, _, frames in segments], workers=workers)
     with whole_file(output) as file:
         written = _Written(file)
         written.add(segments[0][1])
-        handing = None if backend is None else Handing(_header(segments[0][1]), backend, on_border=on_border)
-        for path, _, _ in segments:
-            written.segment(path, handing)
+        if backend is not None and workers > 1 and len(runs) > 1:
+            written.segment(ordered[0], None)
+            with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}-") as folder:
+                for run, handed in zip(runs, _handed(ordered, runs, Path(folder), backend, workers)):
+                    written.run(ordered[run.start : run.stop], handed, on_border)
+        else:
+            handing = None if backend is None else Handing(header_of(segments[0][1]), backend, on_border=on_border)
+            for path in ordered:
+                written.segment(path, handing)
         file.write(pack_index(written.entries, file.tell()))
     if check:
         # Free Gaussians that stand still outlive their group when they are handed over.
-        check_births(output, [first for _, _, first in segments] if backend is None else [0])
+        check_births(output, _firsts(segments) if backend is None else [0])
     return len(written.entries)
+
+
+def _firsts(segments: Sequence[tuple[Path, bytes, int]]) -> list[int]:
+    """The first frame of each."""
+    return [sum(frames for _, _, frames in segments[:number]) for number in range(len(segments))]
+
+
+def _handed(
+    paths: Sequence[Path], runs: Sequence[range], folder: Path, backend: Backend, workers: int
+) -> Iterator[HandedRun]:
+    """What comes of each of ``runs``, in order, by so many processes."""
+    outputs = [folder / f"run-{number}" for number in range(len(runs))]
+    done = set[str]()
+    with TaskQueue(LocalEngine(shared_out(workers=workers, cores=workers))) as queue:
+        for run, output in zip(runs, outputs):
+            queue.submit(run_task(paths[run.start - 1 : run.stop], output, device=backend.name))
+        for output in outputs:
+            while output.name not in done:
+                for ending in queue.wait(POLL_SECONDS):
+                    if not ending.done:
+                        said = ending.output.strip().splitlines()[-1:] or [f"status {ending.status}"]
+                        raise TaskError(f"A worker that hands over failed: {said[0]}. Try again with one worker.")
+                    done.add(ending.name)
+            yield HandedRun.read(output)
+            output.unlink()
 
 
 class _Written:
@@ -75,20 +118,28 @@ class _Written:
         found = open_segment(path)
         own = (found.record(number) for number in range(len(found.entries)))
         for (frame, kind, _), record in zip(found.entries, own if handing is None else handing.records(found)):
-            self.entries.append((frame, kind, self._file.tell()))
-            self._file.write(record)
+            self._record(frame, kind, record)
         found.close()
 
+    def run(self, paths: Sequence[Path], handed: HandedRun, on_border: Callable[[Border], None] | None) -> None:
+        """Appends the packets of segments that were handed over together."""
+        records = iter(handed.records)
+        for path in paths:
+            found = open_segment(path)
+            for frame, kind, _ in found.entries:
+                self._record(frame, kind, next(records))
+            found.close()
+        if on_border is not None:
+            for border in handed.borders:
+                on_border(border)
 
-def _header(init: bytes) -> StreamHeader:
-    """The header in the bytes of prefix and init record."""
-    record = read_record(init, PREFIX.size)
-    assert record is not None, "verified when the segment was opened"
-    return unpack_header(record.payload)
+    def _record(self, frame: int, kind: int, record: bytes) -> None:
+        self.entries.append((frame, kind, self._file.tell()))
+        self._file.write(record)
 
 
 def _in_order(paths: Sequence[Path]) -> list[tuple[Path, bytes, int]]:
-    """The segments' paths, beginnings and first frames, in order of their frames, checked."""
+    """The segments' paths, beginnings and numbers of frames, in order of their frames, checked."""
     if not paths:
         raise ConfigError("There is nothing to join; give the segments of one stream.")
     with ExitStack() as stack:
@@ -99,7 +150,7 @@ def _in_order(paths: Sequence[Path]) -> list[tuple[Path, bytes, int]]:
             found.append((path, segment))
         found.sort(key=lambda entry: entry[1].identity.first)
         _check(found)
-        return [(path, segment.init, segment.identity.first) for path, segment in found]
+        return [(path, segment.init, len(segment.entries)) for path, segment in found]
 
 
 def _check(segments: Sequence[tuple[Path, Segment]]) -> None:

@@ -8,8 +8,8 @@ a free Gaussian and the other has anchors, the mixture is wrong although nothing
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
-from structgstream.groups.border import border_cameras
+from structgstream.cameras import CameraRig
+from structgstream.groups.border import BorderPictures
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
@@ -26,25 +26,26 @@ LEAST_PIXELS = 0.5
 _SCALE = 0.5
 
 
-def visible_mixtures(mixed: Scene, before: Scene, first: Scene, rig: CameraRig, backend: Backend) -> Tensor:
-    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels which are neither as in ``before`` nor in ``first``.
+def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, backend: Backend) -> Tensor:
+    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels which are as in neither frame of the border.
 
     A pixel may have any colour between those of the two.
 
     Args:
         mixed: the group's first frame with what is handed over.
-        before: the last frame of the group before.
-        first: the group's own first frame.
+        pictures: of the last frame of the group before, and of the group's own first one.
         rig: in the units of the scene.
         backend: the compute back-end.
     """
     folded, count = mixed.with_folded_appearance(), len(mixed.anchors)
     sums = torch.zeros(count, 2).to(mixed.anchors.positions)
     with torch.no_grad():
-        for name in border_cameras(rig):
+        for name in pictures.first:
             camera = rig[name]
             small = camera.resized(*(max(1, round(size * _SCALE)) for size in (camera.width, camera.height)))
-            excess = area_mean(_excess(mixed, before, first, camera, backend)[None, None], (small.height, small.width))
+            shown = render(mixed, camera, backend).image
+            excess = _excess(shown, pictures.before[name], pictures.first[name])
+            excess = area_mean(excess[None, None], (small.height, small.width))
             gaussians = folded.gaussians(small, backend)
             maps = torch.stack([torch.ones_like(excess[0, 0]), excess[0, 0]], dim=-1)
             of_gaussians = weigh_maps(gaussians, small, maps, backend)
@@ -53,8 +54,8 @@ def visible_mixtures(mixed: Scene, before: Scene, first: Scene, rig: CameraRig, 
     return (covered > LEAST_PIXELS) & (sums[:, 1] > LEAST_EXCESS * covered)
 
 
-def _excess(mixed: Scene, before: Scene, first: Scene, camera: Camera, backend: Backend) -> Tensor:
-    """How far each pixel of ``mixed`` is beyond the tolerance, ``[H, W]``, mean over channels."""
-    then, own, shown = (render(scene, camera, backend).image.clamp(0.0, 1.0) for scene in (before, first, mixed))
+def _excess(mixed: Tensor, before: Tensor, first: Tensor) -> Tensor:
+    """How far each pixel of ``mixed`` ``[H, W, 3]`` is beyond the tolerance, ``[H, W]``, mean over channels."""
+    then, own, shown = (image.clamp(0.0, 1.0) for image in (before, first, mixed))
     allowed = shown.clamp(torch.minimum(then, own), torch.maximum(then, own))
     return ((shown - allowed).abs().mean(-1) - TOLERANCE).clamp(min=0.0)

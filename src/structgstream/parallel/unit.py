@@ -69,6 +69,7 @@ class Unit:
         track: further words for ``track``: length of groups.
         track_threads: of the tracking pass, which all groups wait for; None for those of its place.
         device: further words for all of them: which back-end computes.
+        join: further words for ``join``: how many processes hand over.
         program: what the commands are given to.
         starts: reads a track.
         cut: takes from a track what one group needs.
@@ -80,6 +81,7 @@ class Unit:
     track: tuple[str, ...] = ()
     track_threads: int | None = None
     device: tuple[str, ...] = ()
+    join: tuple[str, ...] = ()
     program: tuple[str, ...] = PROGRAM
     starts: ReadsTrack = field(default=starts_in, compare=False)
     cut: CutsTrack = field(default=cut_track, compare=False)
@@ -107,5 +109,5 @@ class Unit:
     def join_task(self, parts: Parts, groups: Groups, output: Path) -> Task:
         """The stream, of all segments."""
         segments = [str(parts.segment(first, end)) for first, end in groups]
-        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.device)
+        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.device, *self.join)
         return Task(JOIN, command, str(output), parts.log(JOIN))

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Borders that several processes hand over give the bytes that one gives."""
+
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backends import quickest_backend
+from clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
+from structgstream.errors import ConfigError, TaskError
+from structgstream.executors.task import PYTHON, Task
+from structgstream.groups import join
+from structgstream.groups.base import GroupBase
+from structgstream.groups.hand_over import OWN_FRAMES
+from structgstream.groups.handing import Border
+from structgstream.groups.handing_run import MOST_GROUPS, HandedRun, main, runs_of
+from structgstream.groups.join import join_segments
+from structgstream.groups.pictures import open_for
+from structgstream.groups.track_pass import track_capture
+
+FRAMES = 12
+BORDERS = (2, 2 + OWN_FRAMES)
+
+
+@cache
+def long_groups() -> list[Path]:
+    """Groups of 2, of :data:`OWN_FRAMES` and of 2 frames, so that the last border needs nothing of the first."""
+    header = made().header
+    path = header.with_name("long-track")
+    base = GroupBase.read(header)
+    source = open_for(base.header, CAPTURE, frames=FRAMES)
+    with closing(track_capture(path, source, base, OPTIONS, quickest_backend())) as frames:
+        assert sum(1 for _ in frames) > 0
+    of_track = Made(header, path, [])
+    ranges = [(0, BORDERS[0]), (BORDERS[0], BORDERS[1]), (BORDERS[1], FRAMES)]
+    segments = [header.with_name(f"long-{first}.sgs") for first, _ in ranges]
+    for segment, (first, end) in zip(segments, ranges):
+        fit(segment, task(of_track, first, end=end), stop_after=FRAMES)
+    return segments
+
+
+def test_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
+    found = []
+    for workers in (1, 2, 5):
+        path, borders = tmp_path / f"{workers}.sgs", list[Border]()
+        backend = quickest_backend()
+        count = join_segments(
+            long_groups(), path, check=True, backend=backend, workers=workers, on_border=borders.append
+        )
+        assert count == FRAMES
+        assert [border.frame for border in borders] == [*BORDERS]
+        assert borders[0].handed > 0
+        found.append((path.read_bytes(), borders))
+    assert found[1] == found[0]
+    assert found[2] == found[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1.sgs", "2.sgs", "5.sgs"]
+
+
+def test_a_run_tells_its_borders_and_records(tmp_path: Path) -> None:
+    paths, output = made().segments, tmp_path / "run"
+    main([quickest_backend().name, str(output), *map(str, paths)])
+    run = HandedRun.read(output)
+    assert [border.frame for border in run.borders] == [2, 4]
+    whole = tmp_path / "whole.sgs"
+    join_segments(paths, whole, backend=quickest_backend())
+    assert all(record in whole.read_bytes() for record in run.records)
+    assert len(run.records) == 4
+
+
+def test_a_worker_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(paths: list[Path], output: Path, *, device: str) -> Task:
+        return Task(output.name, (PYTHON, "-c", "raise SystemExit('no room')"), str(output))
+
+    monkeypatch.setattr(join, "run_task", failing)
+    with pytest.raises(TaskError, match="no room"):
+        join_segments(long_groups(), tmp_path / "a.sgs", backend=quickest_backend(), workers=2)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_no_worker_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="0 workers"):
+        join_segments(long_groups(), tmp_path / "a.sgs", backend=quickest_backend(), workers=0)
+
+
+@given(st.lists(st.integers(1, 2 * OWN_FRAMES), min_size=1, max_size=60), st.integers(1, 9))
+def test_runs_have_every_group_but_the_first_once_and_begin_after_long_ones(lengths: list[int], workers: int) -> None:
+    runs = runs_of(lengths, workers=workers)
+    assert [number for run in runs for number in run] == [*range(1, len(lengths))]
+    assert all(lengths[run.start - 1] >= OWN_FRAMES for run in runs[1:])
+    if min(lengths) >= OWN_FRAMES:
+        assert max(map(len, runs), default=0) <= MOST_GROUPS
+        assert len(runs) >= min(workers, len(lengths) - 1) // 2
