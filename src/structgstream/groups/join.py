@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments put together to one stream file, with or without a hand-over at their borders."""
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from itertools import accumulate
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 from structgstream.codec.container.index import pack_index
@@ -63,8 +64,8 @@ def join_segments(
         written.add(segments[0][1])
         if backend is not None and workers > 1 and len(runs) > 1:
             written.segment(ordered[0], None)
-            with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}-") as folder:
-                for run, handed in zip(runs, _handed(ordered, runs, Path(folder), backend, workers)):
+            with _folder_of_runs(output) as folder:
+                for run, handed in zip(runs, _handed(ordered, runs, folder, backend, workers)):
                     written.run(ordered[run.start : run.stop], handed, on_border)
         else:
             handing = None if backend is None else Handing(header_of(segments[0][1]), backend, on_border=on_border)
@@ -73,13 +74,21 @@ def join_segments(
         file.write(pack_index(written.entries, file.tell()))
     if check:
         # Free Gaussians that stand still outlive their group when they are handed over.
-        check_births(output, _firsts(segments) if backend is None else [0])
+        ends = accumulate(frames for _, _, frames in segments)
+        check_births(output, [0, *ends][:-1] if backend is None else [0])
     return len(written.entries)
 
 
-def _firsts(segments: Sequence[tuple[Path, bytes, int]]) -> list[int]:
-    """The first frame of each."""
-    return [sum(frames for _, _, frames in segments[:number]) for number in range(len(segments))]
+@contextmanager
+def _folder_of_runs(output: Path) -> Iterator[Path]:
+    """A folder beside ``output`` while runs are handed over; what a killed join has left there is removed."""
+    folder = output.with_name(f"{output.name}.runs")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _handed(
