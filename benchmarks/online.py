@@ -17,7 +17,8 @@ from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import World, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import MOTION, PAPER
-from structgstream.training.online import OnlineConfig, fit_next_frame
+from structgstream.training.online import fit_next_frame
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.result import FitResult
 
 NOISE = 1.0  # Levels of 255: what a good camera leaves after denoising.

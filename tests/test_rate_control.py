@@ -9,7 +9,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
 from structgstream.key_frames import LEAST_FRAMES, KeyFrames
 from structgstream.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
-from structgstream.training.online import OnlineConfig
+from structgstream.training.online_config import OnlineConfig
 
 FPS, KEY_EVERY = 30.0, 30
 

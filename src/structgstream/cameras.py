@@ -59,6 +59,7 @@ class Camera:
     _viewports: dict[tuple[torch.dtype, torch.device], Viewport] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
+    _resized: "dict[tuple[int, int], Camera]" = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewmat", torch.as_tensor(self.viewmat, dtype=torch.float64).cpu())
@@ -97,12 +98,14 @@ class Camera:
         return self._viewports[key]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same camera with its picture resampled to ``width x height`` pixels.
+        """The same camera with its picture resampled to ``width x height`` pixels; cached, as :meth:`viewport` is.
 
         The intrinsics scale with the picture; because a pixel's centre sits at +0.5 no half-pixel shift appears.
         """
-        factors = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=torch.float64)
-        return replace(self, K=self.K * factors, width=width, height=height)
+        if (width, height) not in self._resized:
+            factors = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=torch.float64)
+            self._resized[width, height] = replace(self, K=self.K * factors, width=width, height=height)
+        return self._resized[width, height]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,14 @@ import torch
 from torch import Tensor
 
 
+def row_indices(rows: Tensor) -> Tensor:
+    """Indices ``[n]`` of the rows of a mask ``[N]``; indices as they are.
+
+    Each tensor that is indexed by a mask counts its rows anew, for which the host waits for a GPU.
+    """
+    return rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """Post-activation Gaussians for one camera.
@@ -38,6 +46,7 @@ class Gaussians:
 
     def select(self, rows: Tensor) -> "Gaussians":
         """The rows of a mask ``[N]`` or of indices ``[n]``."""
+        rows = row_indices(rows)
         return Gaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 

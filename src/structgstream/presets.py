@@ -24,7 +24,7 @@ from structgstream.training.light import LightConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
 from structgstream.training.motion_start import MotionStartConfig
-from structgstream.training.online import OnlineConfig
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.optim import LearningRate
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.perturbation import PerturbationConfig

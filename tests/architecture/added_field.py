@@ -15,7 +15,7 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of, with_dynamic_fields
 from structgstream.training.motion import changed_movers
-from structgstream.training.online import OnlineConfig, online_rates
+from structgstream.training.online_config import OnlineConfig, online_rates
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import Parameters, detached, parameters_of_fields
 from structgstream.training.rounding import RoundingConfig

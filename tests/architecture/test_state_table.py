@@ -11,7 +11,7 @@ from pathlib import Path
 
 from structgstream.scene.state import PARAMETERS, STATE_TABLE
 from structgstream.training.initial import InitialRates
-from structgstream.training.online import OnlineRates
+from structgstream.training.online_config import OnlineRates
 from structgstream.training.rounding import RoundingConfig
 
 ROOT = Path(__file__).parents[2]

@@ -104,7 +104,7 @@ def cuda_without_waiting() -> Backend:
 @pytest.mark.parametrize("build", [*BUILDERS, cuda_backend, cuda_without_waiting])
 def test_signatures_are_the_protocols(build: Callable[[], Backend]) -> None:
     backend = build()
-    assert {f.name for f in fields(backend)} == PROTOCOLS.keys() | {"name", "device"}
+    assert {f.name for f in fields(backend)} == PROTOCOLS.keys() | {"name", "device", "recorder"}
     for name, protocol in PROTOCOLS.items():
         wanted = inspect.signature(protocol.__call__)
         found = inspect.signature(getattr(backend, name))

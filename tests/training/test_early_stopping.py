@@ -44,3 +44,10 @@ def test_what_came_before_is_forgotten(again: bool) -> None:
     if again:
         early_stopping.reset()
     assert early_stopping.should_stop != again
+
+
+def test_losses_may_come_in_one_tensor_that_is_written_again() -> None:
+    loss, early_stopping = torch.tensor(1.0), EarlyStopping(0.05, 2)
+    for value in (1.0, 0.5, 0.25):
+        early_stopping.add(0, loss.fill_(value))
+        assert not early_stopping.should_stop

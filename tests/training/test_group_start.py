@@ -12,7 +12,7 @@ from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.group_start import GroupStartConfig, fit_group_start
 from structgstream.training.motion import MotionConfig, detect_changes
 from structgstream.training.motion_start import MotionStartConfig
-from structgstream.training.online import OnlineConfig, OnlineRates
+from structgstream.training.online_config import OnlineConfig, OnlineRates
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.residuals import residual_floor
 from structgstream.training.rounding import RoundingConfig

@@ -12,7 +12,7 @@ from structgstream.kernels.anchor_types import HeadWeights
 from structgstream.presets import COMPACT
 from structgstream.scene.scene import Scene
 from structgstream.training.light import LightConfig, light_reference, with_light_of
-from structgstream.training.online import OnlineConfig
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.views import View, training_views
 from worlds import World, moving_world
 

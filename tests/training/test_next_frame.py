@@ -15,7 +15,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
 from structgstream.training.losses import LossWeights
-from structgstream.training.next_frame import NextFrameHooks, StartingPoint
+from structgstream.training.next_frame import NextFrameHooks, PricedLoss, StartingPoint
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.partition import Partition
@@ -108,12 +108,20 @@ def focused(changed: TileSelection | None) -> StartingPoint:
     return started(focuses=focuses)
 
 
+def iterate(hooks: NextFrameHooks, iteration: int, view: int = 0) -> PricedLoss:
+    """The loss of an iteration that moves nothing, and what follows it."""
+    loss = hooks.loss(iteration, VIEWS[view])
+    hooks.after_step(iteration, VIEWS[view], loss.detached(), None)
+    return loss
+
+
 def pixels_drawn(hooks: NextFrameHooks, *, view: int, visits: int) -> list[int]:
     """The number of pixels that each visit of a view in the focus draws."""
     assert hooks.start.focuses is not None
     focus, found = hooks.start.focuses[VIEWS[view].index], []
     for iteration in range(1, visits + 1):
-        assert hooks.loss(iteration, VIEWS[view]).focus is focus  # Tiles that are not drawn hold their last drawing.
+        loss = iterate(hooks, iteration, view)
+        assert loss.focus is focus  # Tiles that are not drawn hold their last drawing.
         found.append(int((focus.picture.sum(2) > 0).sum()))
         focus.picture.zero_()
     return found
@@ -152,8 +160,7 @@ def test_a_frame_is_patched_once_at_its_iteration() -> None:
     faint = hooks.parameters.values["free_logit_opacities"]
     faint.data[2] = -9.0
     for iteration in (1, 2, 3, 4):
-        loss = hooks.loss(iteration, VIEWS[0])
-        hooks.after_step(iteration, VIEWS[0], loss, None)
+        iterate(hooks, iteration)
         assert hooks.population.pruned == (iteration >= 3)
         assert cast(Decided, hooks.early_stopping).resets == (iteration >= 3)
 
@@ -161,18 +168,18 @@ def test_a_frame_is_patched_once_at_its_iteration() -> None:
 def test_a_frame_whose_free_gaussians_stay_is_not_patched() -> None:
     hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=1, patches=False)
     hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
-    hooks.after_step(1, VIEWS[0], hooks.loss(1, VIEWS[0]), None)
+    iterate(hooks, 1)
     assert hooks.population.pruned == 0
     assert len(hooks.population) == 5
 
 
 def test_a_frame_that_stops_gaining_is_patched_at_once_and_then_ends() -> None:
     hooks = hooks_of(started(), stops=True, patch_at=50)
-    hooks.loss(2, VIEWS[0])
+    iterate(hooks, 2)
     assert hooks.patch_at == 2
     assert not hooks.finished(2)  # Iterations follow for what was born.
     assert hooks.finished(3)
-    hooks.loss(3, VIEWS[1])
+    iterate(hooks, 3, view=1)
     assert hooks.patch_at == 2
 
 
@@ -193,11 +200,11 @@ def test_counts_are_those_of_the_moving_anchors_and_of_all_free_gaussians() -> N
 
 def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
     hooks = hooks_of(started())
-    loss = hooks.loss(1, VIEWS[0])
+    loss = iterate(hooks, 1)
     assert hooks.last_pass.psnr > 30.0  # The pictures are the scene's own.
     with torch.no_grad():
         hooks.parameters.values["anchor_positions"] += 0.1
-    worse = hooks.loss(2, VIEWS[0])
+    worse = iterate(hooks, 2)
     assert worse.total > loss.total
     assert hooks.last_pass.psnr < 30.0
 
@@ -205,4 +212,35 @@ def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
 def test_prices_are_added_to_the_loss() -> None:
     plain = hooks_of(started())
     priced = replace(plain, bit_price=cast(Any, SimpleNamespace(price=lambda values, backend: torch.tensor(0.5))))
-    torch.testing.assert_close(priced.loss(1, VIEWS[0]).total, plain.loss(1, VIEWS[0]).total + 0.5)
+    loss, unpriced = priced.loss(1, VIEWS[0]), plain.loss(1, VIEWS[0]).total
+    torch.testing.assert_close(loss.total, unpriced + 0.5)
+    torch.testing.assert_close(loss.unpriced, unpriced)
+
+
+def test_visits_of_the_same_tiles_repeat_and_the_last_ones_are_not_worth_a_recording() -> None:
+    hooks = replace(hooks_of(focused(selection(1)), rest_every=3), iterations=14)
+    hooks.population.config = replace(hooks.population.config, spawn="off")
+    keys = []
+    for iteration in range(1, 15):  # Seven visits of each of two views.
+        keys.append(hooks.repeats(iteration, VIEWS[(iteration + 1) % 2]))
+        iterate(hooks, iteration, (iteration + 1) % 2)
+    changed, whole = (VIEWS[0].index, True, 0), (VIEWS[0].index, False, 0)
+    assert keys[::2] == [changed, changed, whole, changed, changed, whole, changed]
+    assert replace(hooks, recorded=set()).repeats(14, VIEWS[0]) is None
+    hooks.visits[VIEWS[0].index] = 2  # The next visit is of all tiles, and the one after it three visits later.
+    assert replace(hooks, recorded=set()).repeats(10, VIEWS[0]) is None
+    assert replace(hooks, recorded=set()).repeats(8, VIEWS[0]) == whole
+
+
+def test_nothing_repeats_while_gradients_are_collected_nor_across_rows_that_come_or_go() -> None:
+    hooks = replace(hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3), iterations=99)
+    assert [hooks.repeats(iteration, VIEWS[0]) is None for iteration in (1, 3, 4)] == [True, True, False]
+    hooks.population.config = replace(hooks.population.config, spawn="off")
+    before = hooks.repeats(3, VIEWS[0])
+    assert before is not None
+    iterate(hooks, 3)  # Nothing is faint enough to die.
+    assert hooks.repeats(4, VIEWS[0]) == before
+    hooks.patch_at = 5
+    hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
+    iterate(hooks, 5)
+    assert hooks.repeats(6, VIEWS[0]) not in (None, before)

@@ -14,7 +14,8 @@ from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, sta
 from structgstream.training.coherence import CoherenceConfig
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.motion import MotionConfig
-from structgstream.training.online import OnlineConfig, OnlineRates, fit_next_frame
+from structgstream.training.online import fit_next_frame
+from structgstream.training.online_config import OnlineConfig, OnlineRates
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
 from structgstream.training.result import Step
 from worlds import moving_world, psnr, rendered

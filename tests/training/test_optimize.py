@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from recorders import Repeater
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC
@@ -60,6 +61,13 @@ class Parabola(Hooks[float, Loss]):
         return 3, 4
 
 
+class Repeating(Parabola):
+    """Iterations of a sample repeat, but for those of the last two."""
+
+    def repeats(self, iteration: int, sample: float) -> float | None:
+        return sample if iteration <= 7 else None
+
+
 def run(iterations: int, until: int = 10**9, **stages: int) -> tuple[int, Parabola, list[Step]]:
     adam = Adam(reference_backend(), leaves({"x": torch.zeros(1)}))
     hooks, steps = Parabola(adam, until), []
@@ -78,6 +86,21 @@ def test_each_iteration_takes_a_sample_steps_and_tells_the_hooks() -> None:
     assert after[1] - after[0] == pytest.approx(0.2, rel=0.1)
     assert steps[0] == Step(1, 3, 1.0, 3, 4)
     assert [step.iteration for step in steps] == [1, 2, 3]
+
+
+def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
+    """Rates and the numbers of steps differ from one to the next, and are read when a recording is run."""
+    found = []
+    for recorder in (None, Repeater()):
+        adam = Adam(reference_backend(), {**leaves({"x": torch.zeros(1)}), "fixed": torch.ones(1)})
+        hooks = Repeating(adam)
+        schedule: Schedule[str] = Schedule(9, lambda iteration: {"x": 0.1 * iteration, "fixed": 0.0})
+        optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(CPU), recorder=recorder)
+        found.append([x for what, _, x in hooks.seen if what == "after"])
+        if recorder is not None:
+            assert recorder.replays == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.
+            assert adam.steps["x"] == 9
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
 def test_it_ends_when_the_hooks_say_so() -> None:

@@ -88,3 +88,13 @@ def test_no_more_are_born_than_there_is_room_for_and_the_largest_gradient_comes_
     assert population.spawned == 1
     assert len(population) == int(keep.sum()) + 1 == 3
     assert patch(room=2)[0].spawned == 0
+
+
+def test_rows_stay_where_they_are_if_none_comes_or_goes() -> None:
+    population, _ = patch(room=10)
+    assert population.version == 1
+    population.config = replace(population.config, spawn="off")
+    before = dict(population.parameters.values)
+    assert population.patch(population.views[0]).all()
+    assert population.version == 1
+    assert all(population.parameters.values[name] is before[name] for name in FREE_ROWS)

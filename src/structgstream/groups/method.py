@@ -20,7 +20,8 @@ from structgstream.scene.state import on_device
 from structgstream.struct_gstream import FirstFrame, StructGStream
 from structgstream.training.group_start import GroupStartConfig, fit_group_start
 from structgstream.training.motion_start import with_displacements
-from structgstream.training.online import OnlineConfig, held
+from structgstream.training.online import held
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.result import FitResult
 

@@ -6,13 +6,15 @@ its own implementation of an operation takes another's, stated where the value i
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
 from structgstream.errors import BackendError
+from structgstream.kernels.cuda_graph import GraphMemory, Recorder
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.operations import (
     L1SSIM,
@@ -45,6 +47,7 @@ class Backend:
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
         device: of its tensors.
+        recorder: makes a recorder of iterations (``kernels.cuda_graph``); None where they are run one by one.
     """
 
     name: str
@@ -65,6 +68,7 @@ class Backend:
     plane_scores: PlaneScores
     generate_structured: GenerateStructured
     adam_step: AdamStep
+    recorder: Callable[[], Recorder[Any]] | None = None
 
 
 def reference_backend() -> Backend:
@@ -177,7 +181,6 @@ def cuda_backend() -> Backend:
         reference_bits,
         reference_change,
         reference_excess,
-        reference_flow,
         reference_lift,
         reference_neighbours,
         reference_raster,
@@ -192,6 +195,7 @@ def cuda_backend() -> Backend:
     reason = cuda_reason()
     if reason is not None:
         raise BackendError(reason)
+    processor = processor_backend()
     library, sentence = kernel_library()
     _log.log(logging.WARNING if library is None else logging.INFO, sentence)
     drawing = partial(rasterize, library=library)
@@ -208,14 +212,15 @@ def cuda_backend() -> Backend:
         change_bits=reference_bits.change_bits,
         changed_pixels=reference_change.changed_pixels,
         picture_residual=reference_residual.picture_residual,
-        confident_flow=reference_flow.confident_flow,
+        confident_flow=processor.confident_flow,
         lift=reference_lift.lift,
         sweep=reference_sweep.sweep if library is None else partial(cuda_sweep.sweep, library),
-        plane_scores=processor_backend().plane_scores,
+        plane_scores=processor.plane_scores,
         generate_structured=reference_anchors.generate_structured
         if library is None
         else partial(cuda_generation.generate_structured, library),
         adam_step=cuda_adam.adam_step,
+        recorder=GraphMemory(torch.device("cuda")).recorder,
     )
 
 

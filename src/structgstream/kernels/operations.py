@@ -330,8 +330,8 @@ class AdamStep(Protocol):
         grad: like ``param``.
         exp_avg: first moment, updated in place.
         exp_avg_sq: second moment, updated in place.
-        lr: learning rate.
-        step: number of this step, from 1.
+        lr: learning rate; on a GPU also ``[]`` float32 there, read when the work runs (``cuda_graph``).
+        step: number of this step, from 1; likewise.
         betas: decay of the moments.
         eps: added to the root of the corrected second moment.
         rows: ``[r]`` int64, unique; only these rows (first dimension) are updated. None: all.
@@ -344,8 +344,8 @@ class AdamStep(Protocol):
         exp_avg: Tensor,
         exp_avg_sq: Tensor,
         *,
-        lr: float,
-        step: int,
+        lr: float | Tensor,
+        step: int | Tensor,
         betas: tuple[float, float],
         eps: float,
         rows: Tensor | None = None,

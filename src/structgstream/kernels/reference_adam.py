@@ -10,8 +10,8 @@ def adam_step(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     *,
-    lr: float,
-    step: int,
+    lr: float | Tensor,
+    step: int | Tensor,
     betas: tuple[float, float],
     eps: float,
     rows: Tensor | None = None,
@@ -23,6 +23,7 @@ def adam_step(
         for tensor, value in zip((param, exp_avg, exp_avg_sq), (values[0], values[2], values[3])):
             tensor[rows] = value
         return
+    lr, step = float(lr), int(step)
     exp_avg.mul_(betas[0]).add_(grad, alpha=1.0 - betas[0])
     exp_avg_sq.mul_(betas[1]).addcmul_(grad, grad, value=1.0 - betas[1])
     denominator = (exp_avg_sq / (1.0 - betas[1] ** step)).sqrt_().add_(eps)

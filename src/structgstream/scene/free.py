@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from structgstream.gaussians import row_indices
+
 
 @dataclass(frozen=True)
 class FreeGaussians:
@@ -45,6 +47,7 @@ class FreeGaussians:
 
     def select(self, rows: Tensor) -> "FreeGaussians":
         """The rows of a mask ``[F]`` or of indices ``[f]``."""
+        rows = row_indices(rows)
         return FreeGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def append(self, other: "FreeGaussians") -> "FreeGaussians":

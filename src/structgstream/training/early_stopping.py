@@ -23,10 +23,14 @@ class EarlyStopping:
 
     def add(self, view_index: int, loss: Tensor) -> None:
         """Record the loss ``[]`` of a view, computed before its step."""
-        last, self._last[view_index] = self._last.get(view_index), loss.detach()
+        if self._least_gain <= 0.0:
+            return
+        # A copy, since a recorded iteration writes its losses into the same tensors again.
+        loss = loss.detach().clone()
+        last, self._last[view_index] = self._last.get(view_index), loss
         self._added += 1
         if last is not None:
-            self._gains.append(1.0 - loss.detach() / last.clamp(min=1e-12))
+            self._gains.append(1.0 - loss / last.clamp(min=1e-12))
 
     def reset(self) -> None:
         """Restart the average, after the scene was changed by patching."""

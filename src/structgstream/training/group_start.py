@@ -21,7 +21,8 @@ from structgstream.training.motion import segment_motion
 from structgstream.training.motion_start import flow_views, residual_motion, with_displacements
 from structgstream.training.next_frame import StartingPoint
 from structgstream.training.observation import slot_count
-from structgstream.training.online import FrameFit, OnlineConfig, run_frame_fit
+from structgstream.training.online import FrameFit, run_frame_fit
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.partition import Partition, focus_views
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.picture_change import PictureChange

@@ -8,6 +8,7 @@ corrects errors of earlier frames.
 """
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -120,6 +121,13 @@ def with_displacements(scene: Scene, displacements: Tensor) -> Scene:
     )
 
 
+def _last_drawing(focus: Focus, view: View, scene: Scene) -> Tensor:
+    """The last drawing of a view as its camera would record it, ``[H, W, 3]`` uint8; the view's picture where nothing
+    was drawn."""
+    drawn = as_picture(apply_camera_color(focus.picture, scene.camera_color, view.index))
+    return focus.tiles.choose(blackened(drawn, view.mask), view.image)
+
+
 def residual_motion(
     moving: Scene,
     views: Sequence[View],
@@ -142,21 +150,24 @@ def residual_motion(
     seen = [view for view in views if view.index in focuses]
     folded = moving.with_folded_appearance()
     sums, coverage = [], moving.anchors.positions.new_zeros(slot_count(moving))
-    with torch.no_grad():
-        for view in seen:
+
+    def flow_of(view: View) -> Tensor:
+        picture = _last_drawing(focuses[view.index], view, moving)
+        inside, camera = focuses[view.index].tiles.pixels(), view.reduced(scale).camera
+        inside = inside if view.mask is None else inside & view.mask
+        size = (camera.height, camera.width)
+        return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend)
+
+    threads = torch.get_num_threads()
+    with torch.no_grad(), ThreadPoolExecutor(threads) as pool:
+        flows = pool.map(flow_of, seen) if threads > 1 else map(flow_of, seen)
+        for view, flow in zip(seen, flows, strict=True):
             focus, small = focuses[view.index], view.reduced(scale)
             gaussians = folded.gaussians(view.camera, backend)
-            image = apply_camera_color(focus.picture, moving.camera_color, view.index)
-            picture = as_picture(image)
-            inside = focus.tiles.pixels() if view.mask is None else focus.tiles.pixels() & view.mask
-            # Outside the tiles nothing was drawn: there the picture replaces the rendering.
-            picture = focus.tiles.choose(blackened(picture, view.mask), view.image)
-            size = (small.camera.height, small.camera.width)
-            counting = torch.ones(size) if small.mask is None else small.mask
-            flow = flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend)
-            maps = torch.cat([flow, counting[..., None].to(image), small.colors], dim=-1)
+            counting = torch.ones_like(flow[..., 0]) if small.mask is None else small.mask.to(flow)
+            maps = torch.cat([flow, counting[..., None], small.colors], dim=-1)
             found = weigh_maps(gaussians, small.camera, maps, backend, still=focus.still)
-            found *= view.image.shape[0] * view.image.shape[1] / (size[0] * size[1])
+            found *= view.image.shape[0] * view.image.shape[1] / counting.numel()
             sums.append(sum_by_mover(found, movers_of(gaussians, folded), folded))
             coverage[gaussians.ids] += found[:, 3]
     nothing = torch.zeros(len(moving.anchors) + len(moving.free), 3).to(moving.anchors.positions)

@@ -22,7 +22,8 @@ def nearest(points: Tensor, among: Tensor, count: int) -> tuple[Tensor, Tensor]:
     count = min(count, len(among))
     ranks: Any = list(range(1, count + 1))  # A list, so that the result has two dimensions even for one neighbour.
     tree = KDTree(among.detach().double().numpy(force=True))
-    distances, rows = tree.query(points.detach().double().numpy(force=True), k=ranks)
+    wanted = points.detach().double().numpy(force=True)
+    distances, rows = tree.query(wanted, k=ranks, workers=torch.get_num_threads())
     return torch.from_numpy(rows).to(points.device, torch.int64), torch.from_numpy(distances).to(points)
 
 

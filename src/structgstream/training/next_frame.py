@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Iterations of a frame after the first: loss with the price of bits, patching, early stopping."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -60,8 +60,22 @@ class StartingPoint:
         return self.views if self.focuses is None else [view for view in self.views if view.index in self.focuses]
 
 
+@dataclass(frozen=True)
+class PricedLoss(SceneLoss):
+    """A view's loss with the prices of motion and bits.
+
+    Args:
+        unpriced: ``[]`` the total without the prices.
+    """
+
+    unpriced: Tensor
+
+    def detached(self) -> "PricedLoss":
+        return replace(super().detached(), unpriced=self.unpriced.detach())
+
+
 @dataclass
-class NextFrameHooks(Hooks[View, SceneLoss]):
+class NextFrameHooks(Hooks[View, PricedLoss]):
     """Hooks of a later frame: the loss with the price of bits, patching once, and early stopping.
 
     Args:
@@ -80,6 +94,8 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
         rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
         visits: by view index, how often it was drawn.
         average: gets the leaves of each iteration; None for none.
+        iterations: of the frame, at most; to know which of them are worth recording. 0: none is.
+        recorded: keys that :meth:`repeats` has given.
     """
 
     start: StartingPoint
@@ -97,32 +113,27 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
     rest_every: int = 1
     visits: dict[int, int] = field(default_factory=dict)
     average: MeanOfSteps | None = None
+    iterations: int = 0
+    recorded: set[Hashable] = field(default_factory=set)
 
-    def loss(self, iteration: int, sample: View) -> SceneLoss:
-        patching, focuses = self.population.config, self.start.focuses
-        focus = None if focuses is None else focuses[sample.index]
-        drawn, comparable = self._drawn_now(focus, sample)
+    def loss(self, iteration: int, sample: View) -> PricedLoss:
+        focus = self._focus(sample)
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
             backend=self.backend,
             weights=self.losses,
             voxel_size=0.0,
-            track_screen=patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at,
+            track_screen=self._tracks_screen(iteration),
             watch=self.watch,
-            focus=drawn,
+            focus=replace(focus, tiles=focus.changed) if focus is not None and self._rests(sample) else focus,
             background=None if focus is None else focus.background,
         )
-        loss = replace(loss, focus=focus)  # Tiles that are not drawn now hold their last drawing.
-        if comparable:
-            self.early_stopping.add(sample.index, loss.total)
-        if iteration < self.patch_at and self.early_stopping.should_stop:
-            self.patch_at = iteration
-        loss = self._with_prices(loss)
-        self.last_pass.add(iteration, loss, sample)
-        return loss
+        loss = PricedLoss(**vars(loss), unpriced=loss.total)
+        # Tiles that are not drawn now hold their last drawing.
+        return self._with_prices(replace(loss, focus=focus))
 
-    def _with_prices(self, loss: SceneLoss) -> SceneLoss:
+    def _with_prices(self, loss: PricedLoss) -> PricedLoss:
         values = self.parameters.values
         if self.coherence is not None:
             difference = self.coherence.difference(values["anchor_positions"], self.backend)
@@ -131,23 +142,52 @@ class NextFrameHooks(Hooks[View, SceneLoss]):
             return loss
         return replace(loss, total=loss.total + self.bit_price.price(values, self.backend))
 
-    def _drawn_now(self, focus: Focus | None, sample: View) -> tuple[Focus | None, bool]:
-        """``focus``, in most visits of a view without the tiles in which nothing has changed; and whether the loss can
-        be compared with that of the view's other visits."""
-        if focus is None or focus.changed is None or self.rest_every == 1:
-            return focus, True
-        visit = self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
-        if visit % self.rest_every == 0:
-            return focus, False
-        return replace(focus, tiles=focus.changed), True
+    def _focus(self, sample: View) -> Focus | None:
+        return None if self.start.focuses is None else self.start.focuses[sample.index]
 
-    def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
+    def _alternates(self, sample: View) -> bool:
+        """Whether some visits of the view are without the tiles in which nothing has changed."""
+        focus = self._focus(sample)
+        return focus is not None and focus.changed is not None and self.rest_every > 1
+
+    def _rests(self, sample: View) -> bool:
+        """Whether this visit of the view is without the tiles in which nothing has changed."""
+        return self._alternates(sample) and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
+
+    def _tracks_screen(self, iteration: int) -> bool:
+        patching = self.population.config
+        return patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at
+
+    def repeats(self, iteration: int, sample: View) -> Hashable | None:
+        """Visits of a view that draw the same tiles, until rows of free Gaussians come or go."""
+        focus, alternates, rests = self._focus(sample), self._alternates(sample), self._rests(sample)
+        key = sample.index, rests, self.population.version
+        if key not in self.recorded:
+            # The other visits of a view follow each other; those of all tiles are ``rest_every`` visits apart.
+            visits_left = (self.iterations - iteration) // len(self.start.seen)
+            if self._tracks_screen(iteration) or visits_left < (self.rest_every if alternates and not rests else 1):
+                return None
+            for tiles in () if focus is None else (focus.tiles, focus.changed):
+                if tiles is not None:
+                    tiles.pixels()  # Masks are made at their first use, which must not be part of a recording.
+            self.recorded.add(key)
+        return key
+
+    def after_step(self, iteration: int, sample: View, loss: PricedLoss, screen_gradient: Tensor | None) -> None:
+        # A loss over other tiles than in most visits cannot be compared with theirs.
+        if self._rests(sample) or not self._alternates(sample):
+            self.early_stopping.add(sample.index, loss.unpriced)
+        self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
+        self.last_pass.add(iteration, loss, sample)
+        if iteration < self.patch_at and self.early_stopping.should_stop:
+            self.patch_at = iteration
         if screen_gradient is not None:
             self.population.statistics.add(loss.rendering, screen_gradient)
         if iteration == self.patch_at and self.patches:
             with self.watch.stage("patch"), torch.no_grad():
-                survivors = self.population.patch(sample)
-                self.bit_price = None if self.bit_price is None else self.bit_price.after_pruning(survivors)
+                version, survivors = self.population.version, self.population.patch(sample)
+                if self.bit_price is not None and self.population.version != version:
+                    self.bit_price = self.bit_price.after_pruning(survivors)
             self.early_stopping.reset()
         if self.average is not None:
             self.average.add(iteration, self.parameters.values)

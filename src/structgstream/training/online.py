@@ -10,34 +10,32 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.errors import ConfigError
 from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import run_with_pair_budget
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, ParameterName
-from structgstream.training.births import BirthConfig
-from structgstream.training.coherence import CoherenceConfig, MotionCoherence
+from structgstream.scene.state import ParameterName
+from structgstream.training.coherence import MotionCoherence
 from structgstream.training.early_stopping import EarlyStopping
 from structgstream.training.last_pass import LastPass
-from structgstream.training.light import LightConfig, LightReference, with_light_of
-from structgstream.training.losses import LossWeights
+from structgstream.training.light import LightReference, with_light_of
 from structgstream.training.mean_of_steps import MeanOfSteps
-from structgstream.training.motion import SHARED_FIELDS, MotionConfig, segment_motion
-from structgstream.training.motion_start import MotionStartConfig, estimate_initial_motion, with_displacements
+from structgstream.training.motion import SHARED_FIELDS, segment_motion
+from structgstream.training.motion_start import estimate_initial_motion, with_displacements
 from structgstream.training.next_frame import NextFrameHooks, StartingPoint
 from structgstream.training.observation import slot_count
+from structgstream.training.online_config import OnlineConfig, online_rates
 from structgstream.training.optim import Adam
 from structgstream.training.optimize import Schedule, optimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields, values_of_rows
 from structgstream.training.partition import Partition
-from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
+from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.picture_change import PictureChange
 from structgstream.training.pictures import FramePictures, pictures_of
 from structgstream.training.population import Population
@@ -45,85 +43,9 @@ from structgstream.training.price import BitPrice
 from structgstream.training.renewal import renew_free_gaussians
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener
-from structgstream.training.rounding import RoundingConfig
 from structgstream.training.statistics import GradientStatistics
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, shuffled_views
-
-
-@dataclass(frozen=True)
-class OnlineRates:
-    """Learning rates of online frames (values of the paper, section Implementations), in normalised units."""
-
-    anchor_positions: float = 4e-4
-    offset_scales: float = 5e-3
-    covariance_mlp: float = 4e-3
-    free_means: float = 2e-4
-    free_log_scales: float = 5e-3
-    free_quats: float = 1e-3
-    free_logit_opacities: float = 5e-2
-    free_colors: float = 2.5e-3
-    base_scales: float = 5e-3
-    """This and the following are used only if the field is in the dynamic set (not in the paper)."""
-    anchor_offsets: float = 1e-3
-    anchor_features: float = 2.5e-3
-    appearance: float = 2e-2
-    opacity_mlp: float = 2e-3
-    color_mlp: float = 4e-3
-    final_share: float = 1.0
-    """Learning rates of anchors and MLPs decay log-linearly to this share within a frame (paper: 1, constant)."""
-
-
-@dataclass(frozen=True)
-class OnlineConfig:
-    """Configuration of the frames after the first."""
-
-    iterations: int = 100
-    """Optimisation steps per frame (paper: 100)."""
-    dynamic: frozenset[FieldName] = PAPER_DYNAMIC
-    """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
-    appearance_rank: int = 4
-    """Number of principal components along which features change, if ``appearance`` is dynamic (not in the paper)."""
-    losses: LossWeights = field(default_factory=LossWeights)
-    rates: OnlineRates = field(default_factory=OnlineRates)
-    patching: PatchingConfig = field(default_factory=PatchingConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    start: MotionStartConfig = field(default_factory=MotionStartConfig)
-    """Initial displacements of movers; only with ``motion``."""
-    births: BirthConfig = field(default_factory=BirthConfig)
-    """Births of free Gaussians from geometry, and removal of outliers; only with ``motion``."""
-    coherence: CoherenceConfig = field(default_factory=CoherenceConfig)
-    """The price of moving unlike the neighbours."""
-    motion_prior: float = 0.0
-    """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
-    mean_of_last: float = 0.0
-    """The result is the mean of this share of the iterations, the last ones (paper: 0, the last step)."""
-    light: LightConfig = field(default_factory=LightConfig)
-    """Following the global light by the output biases of F_c."""
-    least_gain: float = 0.0
-    """Early stopping (and early patching): when ``iterations`` steps at the present rate would lower the loss by less
-    than this share (paper: 0, never)."""
-    rounding: RoundingConfig = field(default_factory=RoundingConfig)
-
-    def __post_init__(self) -> None:
-        if self.light.enabled and "color_mlp" not in self.dynamic:
-            raise ConfigError("online.light changes F_c, which packets do not carry; add color_mlp to online.dynamic.")
-
-    @property
-    def trained(self) -> frozenset[FieldName]:
-        """The dynamic fields that optimisation changes: F_c, if it follows the light, is not among them."""
-        return self.dynamic.difference(["color_mlp"]) if self.light.enabled else self.dynamic
-
-
-def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
-    """Learning rate of every parameter after ``share`` (0 to 1) of a frame's iterations."""
-    falling = config.rates.final_share**share
-    rates: dict[ParameterName, float] = {}
-    for row in STATE_TABLE:
-        for parameter in row.parameters:
-            rate = getattr(config.rates, parameter.online_rate) if parameter.online_rate else 0.0
-            rates[parameter.name] = rate if row.granularity == "free" else rate * falling
-    return rates
 
 
 def fit_next_frame(
@@ -252,7 +174,15 @@ class FrameFit:
         hooks = self._hooks(start, iterations)
         schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
         population, last_pass = hooks.population, hooks.last_pass
-        done = optimize(population.adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step)
+        done = optimize(
+            population.adam,
+            samples,
+            schedule,
+            hooks,
+            watch=self.watch,
+            on_step=self.on_step,
+            recorder=None if self.iteration_backend.recorder is None else self.iteration_backend.recorder(),
+        )
         if hooks.average is not None:
             hooks.average.apply(hooks.parameters.values)
         return FitResult(
@@ -300,6 +230,7 @@ class FrameFit:
             backend=self.iteration_backend,
             watch=self.watch,
             rest_every=config.motion.rest_every,
+            iterations=iterations,
             average=MeanOfSteps(math.floor(iterations * (1.0 - config.mean_of_last))) if config.mean_of_last else None,
         )
 

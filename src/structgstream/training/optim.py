@@ -2,7 +2,7 @@
 """Adam over named parameters whose rows come and go."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -58,19 +58,16 @@ class Adam(Generic[Name]):
     eps: float = EPS
     first: dict[Name, Tensor] = field(default_factory=dict)
     second: dict[Name, Tensor] = field(default_factory=dict)
-    steps: dict[Name, int] = field(default_factory=dict)
+    steps: dict[Name, int | Tensor] = field(default_factory=dict)
 
-    def step(self, gradients: Mapping[Name, Tensor], rates: Mapping[Name, float]) -> None:
-        """Update every leaf that has a gradient and a positive learning rate."""
+    def step(self, gradients: Mapping[Name, Tensor], rates: Mapping[Name, float | Tensor]) -> None:
+        """Update every leaf that has a gradient and a positive learning rate; one in a tensor counts as positive."""
         for name, gradient in gradients.items():
             rate = rates[name]
-            if rate <= 0.0:
+            if not isinstance(rate, Tensor) and rate <= 0.0:
                 continue
             value = self.values[name]
-            if name not in self.first:
-                self.first[name] = torch.zeros_like(value, requires_grad=False)
-                self.second[name] = torch.zeros_like(value, requires_grad=False)
-                self.steps[name] = 0
+            self._begin(name)
             self.steps[name] += 1
             self.backend.adam_step(
                 value.detach(),
@@ -82,6 +79,18 @@ class Adam(Generic[Name]):
                 betas=BETAS,
                 eps=self.eps,
             )
+
+    def count_on_device(self, names: Iterable[Name]) -> None:
+        """From now on the numbers of the steps of ``names`` are tensors, so that steps can be recorded."""
+        for name in names:
+            self._begin(name)
+            self.steps[name] = torch.full((), float(self.steps[name]), device=self.values[name].device)
+
+    def _begin(self, name: Name) -> None:
+        if name not in self.first:
+            self.first[name] = torch.zeros_like(self.values[name], requires_grad=False)
+            self.second[name] = torch.zeros_like(self.values[name], requires_grad=False)
+            self.steps[name] = 0
 
     def replace_rows(self, added: Mapping[Name, Tensor], *, keep: Tensor) -> None:
         """In every leaf of ``added`` keep the rows of the mask ``keep`` and append the new rows with zero moments."""

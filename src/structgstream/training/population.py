@@ -40,6 +40,7 @@ class Population:
         generator: of random numbers.
         spawned: number of spawned ones so far.
         pruned: number of pruned ones so far.
+        version: how often rows came or went; between, the tensors stay where they are.
     """
 
     config: PatchingConfig
@@ -54,6 +55,7 @@ class Population:
     generator: torch.Generator
     spawned: int = 0
     pruned: int = 0
+    version: int = 0
 
     def __len__(self) -> int:
         return len(self.parameters.births)
@@ -68,6 +70,9 @@ class Population:
         others = [other for other in self.views if other.index != view.index]
         parents = gaussians_by_id(current, [view, *others], self._parents(keep), self.backend)
         children = spawn_children(parents, first_birth=self._next_birth(), config=self.config, generator=self.generator)
+        if keep.all() and not len(children):
+            return keep
+        self.version += 1
         self.parameters.births = torch.cat([self.parameters.births[keep], children.births])
         self.adam.replace_rows(values_of_rows(children, FREE_ROWS), keep=keep)
         self.spawned, self.pruned = self.spawned + len(children), self.pruned + int((~keep).sum())

@@ -109,7 +109,7 @@ def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:
     Returns:
         None if no camera sees an anchor.
     """
-    sizes = []
+    sizes, positions = [], positions.cpu()  # A GPU would be waited for four times a camera.
     for camera in cameras:
         viewmat, K = camera.viewport(positions)[:2]
         points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]

@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -39,6 +39,11 @@ class Loss:
     def screen_offsets(self) -> Tensor | None:
         """``[N, 2]`` offsets whose gradient is the view-space gradient; None if it is not tracked."""
         return None
+
+    def detached(self) -> Self:
+        """The same numbers without a gradient graph."""
+        terms = {name: term.detach() for name, term in self.terms.items()}
+        return replace(self, total=self.total.detach(), terms=terms)
 
 
 def with_term(loss: LossT, name: str, value: Tensor, *, weight: float) -> LossT:

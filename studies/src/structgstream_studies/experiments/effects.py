@@ -9,7 +9,7 @@ from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
 from structgstream.training.losses import LossWeights
 from structgstream.training.motion import MotionConfig
-from structgstream.training.online import OnlineConfig
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.rounding import RoundingConfig
 from structgstream_studies.experiments.results import Result

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
-from structgstream.training.online import OnlineConfig
+from structgstream.training.online_config import OnlineConfig
 from structgstream.training.patching import PatchingConfig
 
 PaperFigures = Mapping[str, float]

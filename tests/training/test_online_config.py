@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The configuration of later frames, and the rates that follow from it."""
+
+from dataclasses import replace
+
+import pytest
+
+from structgstream.errors import ConfigError
+from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE
+from structgstream.training.light import LightConfig
+from structgstream.training.online_config import OnlineConfig, OnlineRates, online_rates
+
+
+def test_rates_of_anchors_and_mlps_fall_within_a_frame_and_those_of_free_gaussians_stay() -> None:
+    config = OnlineConfig(rates=replace(OnlineRates(), final_share=0.25))
+    first, half, last = (online_rates(config, share) for share in (0.0, 0.5, 1.0))
+    assert first["anchor_positions"] == OnlineRates().anchor_positions
+    assert half["anchor_positions"] == pytest.approx(0.5 * first["anchor_positions"])
+    assert last["anchor_positions"] == pytest.approx(0.25 * first["anchor_positions"])
+    assert last["free_means"] == first["free_means"] == OnlineRates().free_means
+    assert first.keys() == {parameter.name for row in STATE_TABLE for parameter in row.parameters}
+
+
+def test_the_papers_rates_are_constant() -> None:
+    assert online_rates(OnlineConfig(), 0.0) == online_rates(OnlineConfig(), 1.0)
+
+
+def test_following_the_light_needs_its_field_and_takes_it_from_the_optimiser() -> None:
+    light = LightConfig(enabled=True)
+    with pytest.raises(ConfigError, match=r"add color_mlp to online\.dynamic"):
+        OnlineConfig(light=light)
+    config = OnlineConfig(light=light, dynamic=PAPER_DYNAMIC.union(["color_mlp"]))
+    assert config.trained == PAPER_DYNAMIC
+    assert OnlineConfig().trained == PAPER_DYNAMIC
