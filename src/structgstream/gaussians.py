@@ -44,6 +44,10 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def detached(self) -> "Gaussians":
+        """The same Gaussians without a gradient graph."""
+        return Gaussians(**{f.name: getattr(self, f.name).detach() for f in fields(self)})
+
     def select(self, rows: Tensor) -> "Gaussians":
         """The rows of a mask ``[N]`` or of indices ``[n]``."""
         rows = row_indices(rows)

@@ -39,6 +39,21 @@ def test_selected_rows_are_the_references(device: str) -> None:
     assert torch.equal(ours[0][0], param[0])
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_numbers_in_tensors(device: str) -> None:
+    """A recorded step reads its rate and its number when it runs."""
+    param, gradient = torch.randn(9, 4, device=device), torch.randn(9, 4, device=device)
+    exact = steps(cuda_adam, param, [gradient, gradient])
+    found = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
+    rate, number = torch.tensor(OPTIONS["lr"], device=device), torch.zeros((), device=device)
+    for _ in range(2):
+        number += 1
+        options = {**OPTIONS, "lr": rate}
+        cuda_adam.adam_step(found[0], gradient, found[1], found[2], step=number, **options)
+    for a, b in zip(found, exact, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+
+
 def test_nothing_to_move() -> None:
     assert steps(cuda_adam, torch.zeros(0, 3), [torch.zeros(0, 3)])[0].shape == (0, 3)
 

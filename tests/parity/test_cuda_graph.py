@@ -84,7 +84,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
             backend=backend,
             seed=0,
             before=world.frames[0],
-            steps=config.rounding.steps(0.01),
+            steps={str(name): step for name, step in config.rounding.steps(0.01).items()},
         )
         for backend in (recorded, single)
     ]

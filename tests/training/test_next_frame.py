@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What happens around each iteration of a later frame."""
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -125,6 +125,23 @@ def pixels_drawn(hooks: NextFrameHooks, *, view: int, visits: int) -> list[int]:
         found.append(int((focus.picture.sum(2) > 0).sum()))
         focus.picture.zero_()
     return found
+
+
+def tensors(value: Any) -> list[torch.Tensor]:
+    """All tensors in a loss."""
+    if isinstance(value, torch.Tensor):
+        return [value]
+    if isinstance(value, dict):
+        return [tensor for part in value.values() for tensor in tensors(part)]
+    return [tensor for f in fields(value) for tensor in tensors(getattr(value, f.name))] if is_dataclass(value) else []
+
+
+def test_nothing_of_a_loss_keeps_its_graph_once_the_step_is_taken() -> None:
+    """What would be kept alive binds the next recording to another stream of the GPU."""
+    loss = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4))).loss(1, VIEWS[0])
+    assert sum(tensor.requires_grad for tensor in tensors(loss)) > 9
+    assert not any(tensor.requires_grad for tensor in tensors(loss.detached()))
+    assert len(tensors(loss.detached())) > 15
 
 
 def test_views_that_do_not_show_what_moves_are_not_seen() -> None:

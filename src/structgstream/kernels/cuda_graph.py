@@ -9,6 +9,7 @@ learning rate, from a tensor that is written in between. Recording runs nothing;
 replay writes anew.
 """
 
+import warnings
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import Any, Generic, Protocol, TypeVar
@@ -69,7 +70,9 @@ def _captured(stream: torch.cuda.Stream, pool: Any, work: Callable[[], Result]) 
         try:
             result = work()
         except BaseException:
-            with suppress(RuntimeError):  # The recording is spoilt; what spoilt it is the error to tell.
+            # The recording is spoilt, or empty; what spoilt it is the error to tell.
+            with suppress(RuntimeError), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
                 graph.capture_end()
             raise
         graph.capture_end()

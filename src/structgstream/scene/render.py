@@ -36,6 +36,10 @@ class Rendering:
     gaussians: Gaussians
     screen_offsets: Tensor | None
 
+    def detached(self) -> "Rendering":
+        """The same rendering without a gradient graph."""
+        return Rendering(self.image.detach(), self.alpha.detach(), self.radii, self.gaussians.detached(), None)
+
 
 def draw(
     gaussians: Gaussians,

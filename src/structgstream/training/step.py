@@ -41,7 +41,8 @@ class Loss:
         return None
 
     def detached(self) -> Self:
-        """The same numbers without a gradient graph."""
+        """The same loss without a gradient graph, of which nothing may stay alive when the next one is recorded: torch
+        keeps what gathers a leaf's gradients, and on which stream, as long as any graph has it."""
         terms = {name: term.detach() for name, term in self.terms.items()}
         return replace(self, total=self.total.detach(), terms=terms)
 
@@ -64,6 +65,12 @@ class ViewLoss(Loss):
     def screen_offsets(self) -> Tensor | None:
         """``[N, 2]`` of the drawn Gaussians, pixels; None if they were not tracked."""
         return self.rendering.screen_offsets
+
+    def detached(self) -> Self:
+        found = super().detached()
+        return replace(
+            found, rendering=self.rendering.detached(), gains=self.gains.detach(), biases=self.biases.detach()
+        )
 
     def squared_error(self, view: View) -> Tensor:
         """Mean squared error ``[]`` of the clamped rendering against the picture, over the drawn pixels that count."""
@@ -94,6 +101,10 @@ class SceneLoss(ViewLoss):
 
     structured: StructuredGaussians
     unperturbed: Gaussians
+
+    def detached(self) -> Self:
+        structured = replace(self.structured, gaussians=self.structured.gaussians.detached())
+        return replace(super().detached(), structured=structured, unperturbed=self.unperturbed.detached())
 
 
 def picture_loss(
