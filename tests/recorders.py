@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorder without a GPU: work is done again instead of queued again, with the arguments of its recording."""
+"""A recorder without a GPU: work is done again instead of queued again, with the arguments of its recording.
 
-from collections.abc import Callable, Hashable
+As with CUDA graphs that share memory, a result lasts until the next replay: then it is not a number.
+"""
+
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -10,7 +13,7 @@ from torch import Tensor
 
 
 class Repeater:
-    """As a CUDA graph does, it writes every time into the tensors of its first result.
+    """As a CUDA graph does, it writes every time into the tensors of its first result, and over those of others.
 
     Args:
         replays: keys in the order of their replays.
@@ -31,22 +34,24 @@ class Repeater:
     def replay(self, key: Hashable) -> Any:
         self.replays.append(key)
         result = self._work[key]()
+        now = [value.clone() for value in _numbers(result)]
         with torch.no_grad():
-            _write(self._results.setdefault(key, result), result)
+            for earlier in self._results.values():
+                for tensor in _numbers(earlier):
+                    tensor.fill_(torch.nan)
+            for into, value in zip(_numbers(self._results.setdefault(key, result)), now, strict=True):
+                into.copy_(value)
         return self._results[key]
 
 
-def _write(into: Any, values: Any) -> None:
-    """Copies tensors of the same places; those that share memory keep their numbers."""
-    if isinstance(into, Tensor):
-        into.copy_(values)
-    elif isinstance(into, dict):
-        for name, value in into.items():
-            _write(value, values[name])
-    elif isinstance(into, tuple):
-        for value, new in zip(into, values, strict=True):
-            _write(value, new)
-    elif is_dataclass(into):
-        for f in fields(into):
-            if f.name in ("total", "unpriced", "terms", "rendering", "image"):
-                _write(getattr(into, f.name), getattr(values, f.name))
+def _numbers(value: Any) -> Iterator[Tensor]:
+    """The tensors ``[]`` of a result."""
+    if isinstance(value, Tensor):
+        if value.dim() == 0:
+            yield value
+    elif isinstance(value, dict | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(part)
+    elif is_dataclass(value):
+        for f in fields(value):
+            yield from _numbers(getattr(value, f.name))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Doctor says what is there, what is not, and what mends it."""
 
+import importlib.metadata
 import json
 from pathlib import Path
 
@@ -34,3 +35,17 @@ def test_what_is_missing_comes_with_its_cure(monkeypatch: pytest.MonkeyPatch) ->
     advice = {entry["name"]: entry["advice"] for entry in found["packages"]}
     assert "pip install 'structgstream[capture]'" in advice["av"]
     assert "pip install 'structgstream[report]'" in advice["matplotlib"]
+
+
+def test_a_package_that_was_copied_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, missing = doctor.diagnose(), importlib.metadata.PackageNotFoundError
+    there = {entry["name"] for entry in found["packages"] if entry["version"]}
+
+    def no_metadata(name: str) -> str:
+        raise missing(name)
+
+    monkeypatch.setattr(doctor, "environment", lambda: found["environment"])
+    monkeypatch.setattr(importlib.metadata, "version", no_metadata)
+    versions = {entry["name"]: entry["version"] for entry in doctor.diagnose()["packages"]}
+    assert there
+    assert versions == {name: "without a version" if name in there else None for name in versions}

@@ -76,10 +76,20 @@ def diagnose() -> dict[str, Any]:
     ]
     packages = []
     for module, distribution, extra, purpose in OPTIONAL:
-        version = importlib.metadata.version(distribution) if importlib.util.find_spec(module) else None
+        version = _version(module, distribution)
         advice = "" if version else f"; get it with: pip install 'structgstream[{extra}]'"
         packages.append({"name": module, "version": version, "extra": extra, "purpose": purpose, "advice": advice})
     return {"environment": environment(), "backends": backends, "packages": packages}
+
+
+def _version(module: str, distribution: str) -> str | None:
+    """The version of a module; None if it is not there."""
+    if importlib.util.find_spec(module) is None:
+        return None
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:  # Copied, not installed.
+        return "without a version"
 
 
 def _table(names: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:

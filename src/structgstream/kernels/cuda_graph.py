@@ -6,7 +6,8 @@ Note [Recorded work]
 A graph repeats the same kernels on the same memory. So recorded work must not wait for the GPU, must not take its
 shapes from numbers (``kernels.backend.nonblocking``), and reads what differs from one time to the next, such as a
 learning rate, from a tensor that is written in between. Recording runs nothing; the results are tensors that each
-replay writes anew.
+replay writes anew. Recordings share their memory: what one of them needs for a moment may be another's result, so that
+a result lasts until the next replay of any.
 """
 
 import warnings
@@ -31,7 +32,7 @@ class Recorder(Protocol[Result]):
         ...
 
     def replay(self, key: Hashable) -> Result:
-        """Run what was recorded under ``key``; gives the result of the recording, with new numbers in its tensors."""
+        """Run what was recorded under ``key``; its result lasts until the next replay of any key."""
         ...
 
 

@@ -26,7 +26,8 @@ class LastPass:
         """Record a view's result, replacing its earlier one."""
         if iteration > self._after:
             self._squared_errors[view.index] = loss.squared_error(view)
-            self._terms[view.index] = {name: value.detach() for name, value in loss.terms.items()}
+            # Copies: the next recorded iteration writes over the tensors of this one.
+            self._terms[view.index] = {name: value.detach().clone() for name, value in loss.terms.items()}
 
     @property
     def psnr(self) -> float:
