@@ -44,7 +44,6 @@ def test_a_package_that_was_copied_has_no_version(monkeypatch: pytest.MonkeyPatc
     def no_metadata(name: str) -> str:
         raise missing(name)
 
-    monkeypatch.setattr(doctor, "environment", lambda: found["environment"])
     monkeypatch.setattr(importlib.metadata, "version", no_metadata)
     versions = {entry["name"]: entry["version"] for entry in doctor.diagnose()["packages"]}
     assert there
