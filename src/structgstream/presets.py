@@ -320,6 +320,20 @@ COMPACT = replace(
 dynamic. Frame 0 starts from few seeds and grows where gradients are large, with dropout and perturbation against
 overfitting, the depth regulariser, an environment, and means of eight frames where they stand still."""
 
+FINE = replace(
+    COMPACT,
+    initial=replace(
+        COMPACT.initial,
+        iterations=5200,
+        schedule_iterations=5200,
+        coarse_iterations=3400,
+        medium_iterations=1000,
+        growth=replace(COMPACT.initial.growth, stop=4400, room_until=3200),
+    ),
+    online=replace(COMPACT.online, iterations=280),
+)
+"""As COMPACT with twice the iterations, for a GPU or for patience."""
+
 FAST = replace(
     COMPACT,
     initial=replace(
@@ -362,6 +376,7 @@ PRESETS: dict[str, StreamConfig] = {
     "rig": RIG,
     "motion": MOTION,
     "compact": COMPACT,
+    "fine": FINE,
     "fast": FAST,
     "tiny": TINY,
 }

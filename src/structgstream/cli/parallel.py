@@ -74,7 +74,7 @@ class Parallel:
     odd: bool = False
     """Allow an N that is no multiple of the key interval; each group then costs a key packet more."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """compact (default), fast, or tiny; fields of the configuration are options as of reconstruct."""
+    """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
     """0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
     device: Device = "auto"

@@ -66,7 +66,7 @@ class Plan:
     length: Annotated[int | None, tyro.conf.arg(metavar="FRAMES", help_behavior_hint="")] = None
     """Plan for so many frames instead of the capture's."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """compact (default), fast, or tiny; fields of the configuration are options as of reconstruct."""
+    """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
     device: Device = "auto"
     """Compute back-end of the probe."""
     json: JsonPath = None
