@@ -11,6 +11,7 @@ import torch
 from structgstream.cli import doctor
 from structgstream.kernels import _nvcc, backend, cuda, reference_anchors, reference_ssim
 from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.prototypes import CUDA_PROTOTYPES
 
 
@@ -26,6 +27,9 @@ def test_own_operations_are_the_kernels_or_it_says_why_not(
         found = backend.cuda_backend()
     assert found.name == "cuda"
     assert found.device == torch.device("cuda")
+    assert found.recorder is not None
+    assert backend.nonblocking(found, PairBudget.of(1, torch.device("cpu"))).recorder is found.recorder
+    assert backend.reference_backend().recorder is None
     assert (found.l1_ssim is reference_ssim.l1_ssim) is not compiled
     assert (found.generate_structured is reference_anchors.generate_structured) is not compiled
     assert [(record.levelno, record.getMessage()) for record in caplog.records] == [

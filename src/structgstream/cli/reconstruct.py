@@ -70,7 +70,8 @@ class Reconstruct:
     """The stream file to write; with --sink segments, a folder."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default: small packets), fine (compact with twice the iterations), fast (compact in minutes), rig (the
-    paper on any rig), motion (as rig, trains only movers), paper-n3dv, paper-meetroom, paper-immersive, tiny (tests)."""
+    paper on any rig), motion (as rig, trains only movers), paper-n3dv, paper-meetroom, paper-immersive, tiny (for
+    tests)."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
     """Compact streams only: 0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
     mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
