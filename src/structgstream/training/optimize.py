@@ -48,7 +48,8 @@ class Hooks(ABC, Generic[SampleT, LossT]):
 
     @abstractmethod
     def loss(self, iteration: int, sample: SampleT) -> LossT:
-        """The loss of a sample, which usually is a view of the frame."""
+        """The loss of a sample, which usually is a view of the frame; what else there is to do belongs in
+        :meth:`after_step`, since this may be recorded."""
 
     def after_step(self, iteration: int, sample: SampleT, loss: LossT, screen_gradient: Tensor | None) -> None:
         """Called after the step: statistics, spawning, pruning.
