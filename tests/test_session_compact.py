@@ -222,4 +222,9 @@ def test_the_preset() -> None:
     assert COMPACT.codec == "compact"
     assert COMPACT.online.motion.enabled
     assert COMPACT.online.dynamic == PAPER_DYNAMIC - {"covariance_mlp"} | {"base_scales", "appearance", "color_mlp"}
-    assert {name for name, config in PRESETS.items() if config.codec == "compact"} == {"compact", "fast", "tiny"}
+    assert {name for name, config in PRESETS.items() if config.codec == "compact"} == {
+        "compact",
+        "fine",
+        "fast",
+        "tiny",
+    }
