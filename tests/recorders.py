@@ -16,13 +16,20 @@ class Repeater:
     """As a CUDA graph does, it writes every time into the tensors of its first result, and over those of others.
 
     Args:
-        replays: keys in the order of their replays.
+        keys: in the order of their replays.
     """
 
     def __init__(self) -> None:
-        self.replays: list[Hashable] = []
+        self.keys: list[Hashable] = []
         self._work: dict[Hashable, Callable[[], Any]] = {}
         self._results: dict[Hashable, Any] = {}
+
+    @property
+    def replays(self) -> int:
+        return len(self.keys)
+
+    def __len__(self) -> int:
+        return len(self._work)
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._work
@@ -32,7 +39,7 @@ class Repeater:
         self._work[key] = work
 
     def replay(self, key: Hashable) -> Any:
-        self.replays.append(key)
+        self.keys.append(key)
         result = self._work[key]()
         now = [value.clone() for value in _numbers(result)]
         with torch.no_grad():

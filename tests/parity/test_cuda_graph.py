@@ -36,6 +36,7 @@ def test_a_replay_reads_new_numbers_and_writes_into_the_first_result() -> None:
     assert weights.detach().eq(1.0).all()  # Recording runs nothing.
     assert "step" in recorder
     assert "other" not in recorder
+    assert (len(recorder), recorder.replays) == (1, 0)
     losses = []
     for value in (0.0, 0.1, 0.1):
         rate.fill_(value)
@@ -89,6 +90,8 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
         for backend in (recorded, single)
     ]
     assert ["replay" in result.seconds for result in results] == [True, False]
+    assert 2 * results[0].counts["recorded"] < results[0].counts["replayed"] < config.iterations
+    assert "replayed" not in results[1].counts
     tolerance = 1e-5 if device == "cpu" else 0.15  # gsplat adds gradients in any order.
     ours, exact = (state_of(result.scene) for result in results)
     start = state_of(scene)

@@ -98,7 +98,7 @@ def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
         optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(CPU), recorder=recorder)
         found.append([x for what, _, x in hooks.seen if what == "after"])
         if recorder is not None:
-            assert recorder.replays == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.
+            assert recorder.keys == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.
             assert adam.steps["x"] == 9
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 

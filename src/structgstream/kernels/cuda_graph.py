@@ -23,6 +23,15 @@ Result = TypeVar("Result")
 class Recorder(Protocol[Result]):
     """Records work by key and repeats it (Note [Recorded work])."""
 
+    @property
+    def replays(self) -> int:
+        """How often recorded work was run."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of recordings."""
+        ...
+
     def __contains__(self, key: Hashable) -> bool:
         """Whether work was recorded under ``key``."""
         ...
@@ -84,8 +93,12 @@ class GraphRecorder(Generic[Result]):
     """Records into CUDA graphs; see :class:`Recorder`."""
 
     def __init__(self, memory: GraphMemory) -> None:
+        self.replays = 0
         self._memory = memory
         self._recorded: dict[Hashable, tuple[torch.cuda.CUDAGraph, Result]] = {}
+
+    def __len__(self) -> int:
+        return len(self._recorded)
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._recorded
@@ -98,4 +111,5 @@ class GraphRecorder(Generic[Result]):
         """See :meth:`Recorder.replay`."""
         graph, result = self._recorded[key]
         graph.replay()
+        self.replays += 1
         return result

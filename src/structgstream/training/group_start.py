@@ -171,7 +171,7 @@ class _Rounds:
             scene=displaced.merge(result.scene),
             pruned=result.pruned + int((~new.kept).sum()),
             spawned=result.spawned + len(new.new_free),
-            counts={"corrected": lifted, "recalled": recalled, **new.counts},
+            counts={**result.counts, "corrected": lifted, "recalled": recalled, **new.counts},
         )
 
     def _partition(self, current: Scene) -> Partition:

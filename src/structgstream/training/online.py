@@ -174,6 +174,7 @@ class FrameFit:
         hooks = self._hooks(start, iterations)
         schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
         population, last_pass = hooks.population, hooks.last_pass
+        recorder = None if self.iteration_backend.recorder is None else self.iteration_backend.recorder()
         done = optimize(
             population.adam,
             samples,
@@ -181,7 +182,7 @@ class FrameFit:
             hooks,
             watch=self.watch,
             on_step=self.on_step,
-            recorder=None if self.iteration_backend.recorder is None else self.iteration_backend.recorder(),
+            recorder=recorder,
         )
         if hooks.average is not None:
             hooks.average.apply(hooks.parameters.values)
@@ -192,6 +193,7 @@ class FrameFit:
             moving=len(start.scene.anchors),
             spawned=population.spawned,
             pruned=population.pruned,
+            counts={} if recorder is None else {"recorded": len(recorder), "replayed": recorder.replays},
             seconds=self.watch.seconds,
             losses=last_pass.terms,
         )
@@ -316,6 +318,7 @@ def _fit_moving_part(
         pruned=result.pruned + int(segmentation.unseen.sum()) + new.counts["blamed"],
         spawned=result.spawned + len(new.new_free),
         counts={
+            **result.counts,
             "lifted": start.lifted_count,
             "corrected": start.corrected_count,
             **new.counts,
