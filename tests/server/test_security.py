@@ -12,6 +12,7 @@ import pytest
 from segment_folders import GrowingFolder
 from serving import Served, hosted
 from streams import small_stream
+from structgstream.server import catalog
 from structgstream.server.settings import Limits, ServerSettings
 
 STREAM = small_stream(7)
@@ -371,7 +372,7 @@ def test_a_server_that_cannot_open_files_says_so(server: Served, monkeypatch: py
     def failing(*parts: object) -> None:
         raise OSError(24, "Too many open files")
 
-    monkeypatch.setattr("structgstream.server.catalog.open_below", failing)
+    monkeypatch.setattr(catalog, "open_below", failing)
     answer = server.ask("/streams/ball.sgs/stream.sgs")
     assert (answer.status, answer.headers["retry-after"]) == (503, "5")
     assert b"Too many" not in answer.body
