@@ -134,4 +134,10 @@ def test_where_there_are_too_many_births_are_coarser() -> None:
     config = replace(CONFIG, crowded="coarser", most=9, least_hits=1)
     found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, config=config)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
+    assert found.merged_count == 15 - len(found.free), "a cap that binds is told"
     assert float(found.free.log_scales.mean()) > float(torch.tensor(CONFIG.size).log())
+    unbound = replace(config, most=15)
+    assert (
+        _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, config=unbound).merged_count
+        == 0
+    )

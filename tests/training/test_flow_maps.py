@@ -5,11 +5,13 @@ from functools import partial
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.flow_maps import FlowConfig, _parts, flow_map
 
@@ -33,6 +35,15 @@ def test_a_shifted_patch_is_told_at_half_the_size_in_whole_pixels() -> None:
     confidence, flow = inner[..., 0], inner[..., 1:] / inner[..., :1].clamp(min=1e-6)
     assert confidence.mean() > 0.9
     torch.testing.assert_close(flow[confidence > 0.5].median(0).values, torch.tensor([6.0, 0.0]), atol=0.3, rtol=0)
+
+
+def test_small_pictures_are_searched_up_to_their_full_size() -> None:
+    config = FlowConfig()
+    assert [config.level_of(width) for width in (160, 320, 479, 480, 640, 1920)] == [0, 0, 0, 1, 1, 1]
+    assert FlowConfig(finest_level=2).level_of(640) == 1
+    assert FlowConfig(least_width=0).level_of(160) == 1
+    with pytest.raises(ConfigError, match="finest level -1"):
+        FlowConfig(finest_level=-1)
 
 
 def test_beyond_the_box_around_what_changed_there_is_no_flow() -> None:

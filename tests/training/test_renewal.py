@@ -171,6 +171,13 @@ def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_conte
         assert found.counts["thin births refused"] == number - born, "told in the log"
 
 
+def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:
+    free = len(renewed(reference_backend(), config=CONFIG).new_free)
+    capped = renewed(reference_backend(), config=replace(CONFIG, most=free - 1))
+    assert 0 < len(capped.new_free) < free
+    assert capped.counts["births merged"] == free - len(capped.new_free)
+
+
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:
     few = replace(THIN, most_missing_share=1e-4)
     assert not len(renewed(reference_backend(), config=replace(BLIND, thin=few)).new_free)

@@ -79,8 +79,8 @@ class BirthConfig:
     most_cost: float = 0.12
     least_hits: int = 4
     """Least number of ray points within 1.8 voxels for a birth."""
-    most: int = 500
-    """Largest number of births per frame."""
+    most: int = 5000
+    """Largest number of births per frame: more than who walks in needs, since below that number all of it is haze."""
     crowded: Literal["coarser", "none", "small-clusters"] = "coarser"
     """Where there would be more than ``most``: births in larger voxels, none, or those in the smallest clusters."""
     most_missing_share: float = 0.25
@@ -182,10 +182,12 @@ class Births:
         free: the new free Gaussians.
         refused_count: how many more it would have borne, had they not been more than ``BirthConfig.most``; always 0
             where births are coarser then (``BirthConfig.crowded``).
+        merged_count: how many more it would have borne, had they not been made coarser for that reason.
     """
 
     free: FreeGaussians
     refused_count: int = 0
+    merged_count: int = 0
 
 
 def sweep_births(
@@ -268,10 +270,12 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
         raise MissingExtraError("scipy", "capture") from error
     values, voxel = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
     tree = KDTree(points.double().numpy(force=True))
+    finest = None
     while True:
         means, hits = _cells(values, tree, voxel)
         enough = hits >= config.least_hits
         wanted = int(enough.sum())
+        finest = wanted if finest is None else finest
         if wanted <= config.most or voxel > COARSEST * float(spacings.median()):
             break
         if config.crowded == "none":
@@ -296,7 +300,8 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             colors=looks.contiguous(),
             births=first_birth + torch.arange(count, device=points.device),
         ),
-        wanted - count if config.crowded == "small-clusters" else 0,
+        refused_count=wanted - count if config.crowded == "small-clusters" else 0,
+        merged_count=max(0, finest - count) if config.crowded == "coarser" else 0,
     )
 
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.errors import MissingExtraError
+from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.flow import ABSOLUTE, RELATIVE, dis_search
 from structgstream.kernels.backend import Backend
 from structgstream.training.views import area_mean
@@ -25,9 +25,26 @@ class FlowConfig:
 
     finest_level: int = 1
     """Of the search's pyramid: 0 is the size of the pictures, 1 half of it."""
+    least_width: int = 240
+    """Where the finest level would be narrower than this, pixels, a finer one is searched: in small pictures what moves
+    is small, too."""
     apart: bool = False
     """Search in a box for each part of a picture that changed, instead of one around all: quicker where things move far
     from each other."""
+
+    def __post_init__(self) -> None:
+        if self.finest_level < 0 or self.least_width < 0:
+            raise ConfigError(
+                f"online.start.flow has finest level {self.finest_level} and least width {self.least_width}; "
+                "expected neither below 0."
+            )
+
+    def level_of(self, width: int) -> int:
+        """The finest level for pictures ``width`` pixels wide."""
+        level = self.finest_level
+        while level > 0 and width >> level < self.least_width:
+            level -= 1
+        return level
 
 
 USUAL_FLOW = FlowConfig()
@@ -58,7 +75,7 @@ def flow_map(
         backend: the compute back-end.
     """
     maps = torch.zeros(3, *changed.shape)
-    search = dis_search("capture", refined=False, finest_level=config.finest_level)
+    search = dis_search("capture", refined=False, finest_level=config.level_of(changed.shape[1]))
     where = changed.numpy(force=True)
     for rows, columns in _boxes(where) if config.apart else _box(where):
         earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))

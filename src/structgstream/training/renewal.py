@@ -29,6 +29,7 @@ class Renewal:
         new_free: those that are born.
         thin_count: how many of them are thin content's.
         thin_refused_count: how many thin ones were not born because they would have been too many.
+        merged_count: how many more would have been born, had they not been made coarser because they were too many.
         missing_share: share of missing pixels in all training views.
         refused: whether too much is missing for births.
     """
@@ -37,6 +38,7 @@ class Renewal:
     new_free: FreeGaussians
     thin_count: int = 0
     thin_refused_count: int = 0
+    merged_count: int = 0
     missing_share: float = 0.0
     refused: bool = False
 
@@ -47,6 +49,7 @@ class Renewal:
             "born": len(self.new_free),
             "born thin": self.thin_count,
             "thin births refused": self.thin_refused_count,
+            "births merged": self.merged_count,
             "blamed": int((~self.kept).sum()),
             "births refused": int(self.refused),
         }
@@ -97,10 +100,10 @@ def renew_free_gaussians(
         room = max(0, room - int(kept.sum()))
         large = sweep.births(missing, first_birth=first_birth, room=room)
         if len(large.free) or not config.thin.enabled:
-            return Renewal(kept, large.free, missing_share=share)
+            return Renewal(kept, large.free, merged_count=large.merged_count, missing_share=share)
         known = {entry.view.index: entry for entry in missing}
         thin = _thin_births(replace(sweep, config=config.for_thin, known=known), first_birth=first_birth, room=room)
-    return Renewal(kept, thin.free, len(thin.free), thin.refused_count, share)
+    return Renewal(kept, thin.free, len(thin.free), thin.refused_count, missing_share=share)
 
 
 def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Births:
