@@ -33,6 +33,13 @@ def test_the_anchors_that_moved_are_found_and_few_others() -> None:
     assert others < movers - 0.2  # Those that the movers cover or uncover: pictures this small are crowded.
 
 
+def test_anchors_that_no_two_views_show_go_with_their_neighbours() -> None:
+    alone, carried = (moving(config=replace(CONFIG, carried_share=share)) for share in (0.0, 0.5))
+    assert alone.carried_count == 0
+    assert torch.equal(carried.anchors & alone.anchors, alone.anchors)
+    assert carried.carried_count == int((carried.anchors & ~alone.anchors).sum()) > 0
+
+
 def test_nothing_moves_between_equal_pictures() -> None:
     found = moving(1, 1)
     assert not found.anchors.any()

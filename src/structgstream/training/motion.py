@@ -20,6 +20,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, Granularity, fields_of, parameters_of
+from structgstream.training.carrying import carried_anchors
 from structgstream.training.flow_maps import USUAL_FLOW, FlowConfig
 from structgstream.training.observation import (
     MotionEvidence,
@@ -60,6 +61,9 @@ class MotionConfig:
     object, which change in few views."""
     moved_ease: float = 1.0
     """Factor (hysteresis) on the thresholds of pixels and shares for movers that the last frame changed. 1: none."""
+    carried_share: float = 0.0
+    """An anchor that fewer than ``least_views`` views show is trained if at least this share of its nearest shown ones
+    is: it lies in or behind what moves. 0: none."""
     unseen_pixels: float = 0.0
     """Free Gaussians that cover fewer pixels than this in every view, by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
@@ -99,6 +103,7 @@ class MotionSegmentation:
         centers: ``[M + F, 3]`` visible centres of all movers, if flow was estimated.
         changed: by index of each trusted view that is compared with an earlier picture, mask ``[h, w]`` of its changed
             pixels at ``MotionConfig.picture_scale``.
+        carried_count: how many of the moving anchors are hidden and carried along (``training/carrying.py``).
     """
 
     anchors: Tensor
@@ -111,6 +116,7 @@ class MotionSegmentation:
     views_with_flow: tuple[int, ...] = ()
     centers: Tensor | None = None
     changed: Mapping[int, Tensor] = field(default_factory=dict)
+    carried_count: int = 0
 
     @property
     def movers(self) -> Tensor:
@@ -198,14 +204,17 @@ def segment_motion(
     coverage = torch.stack([view_evidence[n].coverage for n in trusted])
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
     unseen = coverage[:, coverage.shape[1] - free :].amax(0) < config.unseen_pixels
+    shown = seen[:anchors] >= config.least_views
+    carried = carried_anchors(scene.anchors.positions, enough[:anchors], shown, share=config.carried_share)
     found = MotionSegmentation(
-        enough[:anchors],
+        enough[:anchors] | carried,
         enough[anchors:] & ~unseen,
         unseen,
         visible={views[n].index: view_evidence[n].coverage > config.least_pixels for n in trusted},
         trusted=tuple(trusted),
         scene_cut=is_scene_cut(view_changes),
         changed={views[n].index: changed for n in trusted if (changed := view_evidence[n].changed) is not None},
+        carried_count=int(carried.sum()),
     )
     views_with_flow = [n for n in trusted if getattr(changes[n], "flow", None) is not None]
     if not views_with_flow or found.scene_cut:

@@ -319,6 +319,7 @@ def _fit_moving_part(
         spawned=result.spawned + len(new.new_free),
         counts={
             **result.counts,
+            "carried": segmentation.carried_count,
             "lifted": start.lifted_count,
             "corrected": start.corrected_count,
             **new.counts,

@@ -10,6 +10,7 @@ from structgstream.errors import ConfigError
 from structgstream.presets import COMPACT, PRESETS, RIG, to_json
 from structgstream_studies.experiments.effects import (
     BETTER_FIRST,
+    CARRIED_SHARE,
     EASED,
     LEAST_GAIN,
     REFRESH_FRAMES,
@@ -86,13 +87,17 @@ def test_what_the_switches_are() -> None:
 
 def test_what_is_off_is_tried_and_what_is_on_is_left_out() -> None:
     online = COMPACT.online
-    on = replace(online, least_gain=0.03, motion=replace(online.motion, moved_ease=0.3, least_views_share=0.2))
-    off = replace(online, least_gain=0.0, motion=replace(online.motion, moved_ease=1.0, least_views_share=0.0))
-    for whole, gain, ease, share in ((on, 0.0, 1.0, 0.0), (off, LEAST_GAIN, EASED, VIEWS_SHARE)):
+    given = {"moved_ease": 0.3, "least_views_share": 0.2, "carried_share": 0.7}
+    none = {"moved_ease": 1.0, "least_views_share": 0.0, "carried_share": 0.0}
+    on = replace(online, least_gain=0.03, motion=replace(online.motion, **given))
+    off = replace(online, least_gain=0.0, motion=replace(online.motion, **none))
+    tried = (off, LEAST_GAIN, EASED, VIEWS_SHARE, CARRIED_SHARE)
+    for whole, gain, ease, share, carried in ((on, 0.0, 1.0, 0.0, 0.0), tried):
         rows = effects(replace(COMPACT, online=whole), paper=RIG)
         assert rows["compact-settling"].config.online.least_gain == gain
         assert rows["compact-memory"].config.online.motion.moved_ease == ease
         assert rows["compact-views-share"].config.online.motion.least_views_share == share
+        assert rows["compact-carrying"].config.online.motion.carried_share == carried
 
 
 @pytest.mark.parametrize(("whole", "other"), [(0.0, 1.0), (0.7, 0.0)])

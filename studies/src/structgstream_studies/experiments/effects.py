@@ -25,7 +25,7 @@ BETTER_FIRST = "paper-better-first"
 DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales", "until_share"))
 LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
-EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.5, 0.1, 8, 0.3
+CARRIED_SHARE, EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.4, 0.5, 0.1, 8, 0.3
 """Values of switches that are off in the whole preset."""
 PAPER_ITERATIONS = 100
 REFRESH_FRAMES = 5
@@ -133,6 +133,9 @@ def _of_the_gate(rows: _Rows) -> None:
     eased = EASED if motion.moved_ease == 1.0 else 1.0
     title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
     rows.gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
+    carried = CARRIED_SHARE if motion.carried_share == 0.0 else 0.0
+    title = "hidden anchors are carried along" if carried else "hidden anchors stay behind"
+    rows.gated("carrying", title, replace(motion, carried_share=carried), "carried_share")
 
 
 def _of_coding(rows: _Rows) -> None:
