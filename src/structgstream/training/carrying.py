@@ -28,7 +28,7 @@ def carried_anchors(positions: Tensor, moving: Tensor, shown: Tensor, *, share: 
         MissingExtraError: SciPy is not installed.
     """
     carried = torch.zeros_like(moving)
-    hidden, known = ((mask).nonzero()[:, 0] for mask in (~moving & ~shown, shown))
+    hidden, known = (mask.nonzero()[:, 0] for mask in (~moving & ~shown, shown))
     if share == 0.0 or not len(hidden) or not moving.any() or not len(known):
         return carried
     near, _ = nearest(positions[hidden], positions[known], NEIGHBOURS)
