@@ -4,9 +4,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from rigs import random_scene
+from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
@@ -38,6 +40,12 @@ def test_anchors_that_no_two_views_show_go_with_their_neighbours() -> None:
     assert alone.carried_count == 0
     assert torch.equal(carried.anchors & alone.anchors, alone.anchors)
     assert carried.carried_count == int((carried.anchors & ~alone.anchors).sum()) > 0
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1])
+def test_a_share_beyond_one_is_refused(share: float) -> None:
+    with pytest.raises(ConfigError, match="carried_share"):
+        MotionConfig(carried_share=share)
 
 
 def test_nothing_moves_between_equal_pictures() -> None:

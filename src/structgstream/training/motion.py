@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from structgstream.errors import ConfigError
 from structgstream.flow import picture_shift
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render, to_8bit_image
@@ -79,6 +80,10 @@ class MotionConfig:
     reach them. -1: all are."""
     tiles: bool = True
     """Draw only the tiles that moving Gaussians reach. False: whole pictures, with the same result."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.carried_share <= 1.0:
+            raise ConfigError(f"online.motion.carried_share is {self.carried_share:g}; expected a share from 0 to 1.")
 
 
 SHARED_FIELDS: frozenset[FieldName] = frozenset(fields_of("shared", "camera"))
