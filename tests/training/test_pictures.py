@@ -38,7 +38,7 @@ def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
     for view, change in zip(found.views, changes):
         assert change.changed.shape == view.image.shape[:2]
         assert 0.0 < float(change.changed.float().mean()) < 0.9
-        assert not change.identical
+        assert not change.repeated
         if change.flow is not None:
             assert change.flow.shape == (48, 64, 6)
             confidence, shift = change.flow[..., 0], change.flow[..., 1:3]
@@ -51,7 +51,7 @@ def test_equal_pictures_are_the_same() -> None:
     frozen = replace(WORLD.frames[0], index=1)
     found = pictures_of(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
     changes = known(found)
-    assert all(change.identical and not change.changed.any() for change in changes)
+    assert all(change.repeated and not change.changed.any() for change in changes)
     assert all(change.flow is None or not change.flow[..., :3].any() for change in changes)
 
 

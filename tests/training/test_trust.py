@@ -11,7 +11,7 @@ from structgstream.training.trust import ViewChange, is_scene_cut, suspects, tru
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
-USUAL = ViewChange(changed_share=0.05, wrong_share=0.02, identical=False)
+USUAL = ViewChange(changed_share=0.05, wrong_share=0.02, repeated=False)
 WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)
 CONFIG = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0)
 
@@ -28,15 +28,15 @@ def test_a_picture_that_changed_or_is_wrong_everywhere_is_not() -> None:
 
 def test_a_bumped_camera_is_wrong_where_it_shows_something() -> None:
     """The shares of a camera of counter that was moved by 14 and 9 pixels, and of the others."""
-    others = [ViewChange(changed_share=0.05, wrong_share=share, identical=False) for share in (0.005, 0.008, 0.016)]
-    bumped = ViewChange(changed_share=0.05, wrong_share=0.43, identical=False)
+    others = [ViewChange(changed_share=0.05, wrong_share=share, repeated=False) for share in (0.005, 0.008, 0.016)]
+    bumped = ViewChange(changed_share=0.05, wrong_share=0.43, repeated=False)
     assert trusted_views([*others, bumped]) == [True, True, True, False]
 
 
 def test_a_camera_near_to_what_moves_is_believed() -> None:
     """The shares of basketball's throw, and of someone who comes near one camera while others are wrong, too."""
     throw = [
-        ViewChange(changed_share=0.1, wrong_share=share, identical=False) for share in (0.016, 0.034, 0.034, 0.088)
+        ViewChange(changed_share=0.1, wrong_share=share, repeated=False) for share in (0.016, 0.034, 0.034, 0.088)
     ]
     assert all(trusted_views(throw))
     assert all(trusted_views([*throw, replace(USUAL, wrong_share=0.25)]))
@@ -47,7 +47,7 @@ def test_a_camera_near_to_what_moves_is_believed() -> None:
 def test_a_shifted_picture_is_a_bumped_camera_however_little_of_it_is_wrong() -> None:
     """The shares of a camera of basketball that was moved by 14 and 9 pixels, before a plain wall, and of others."""
     shares = (0.005, 0.004, 0.014, 0.018, 0.176)
-    views = [ViewChange(changed_share=0.05, wrong_share=share, identical=False) for share in shares]
+    views = [ViewChange(changed_share=0.05, wrong_share=share, repeated=False) for share in shares]
     assert all(trusted_views(views))
     assert suspects(views) == [4]
     assert trusted_views([*views[:4], replace(views[4], shift_pixels=16.0)]) == [True, True, True, True, False]
@@ -56,7 +56,7 @@ def test_a_shifted_picture_is_a_bumped_camera_however_little_of_it_is_wrong() ->
 
 
 def test_a_frozen_picture_is_not_while_others_change() -> None:
-    frozen = ViewChange(changed_share=0.0, wrong_share=0.0, identical=True)
+    frozen = ViewChange(changed_share=0.0, wrong_share=0.0, repeated=True)
     assert trusted_views([USUAL, USUAL, USUAL, frozen]) == [True, True, True, False]
     assert trusted_views([frozen] * 3) == [True] * 3, "nothing moves: all are equal to the last"
 
@@ -96,7 +96,7 @@ def test_a_light_switched_on_is_a_jump() -> None:
 
 
 def test_a_view_that_was_absent_before_is_trusted_and_no_measure_for_others() -> None:
-    back = ViewChange(changed_share=None, wrong_share=0.0, identical=False)
+    back = ViewChange(changed_share=None, wrong_share=0.0, repeated=False)
     odd = replace(USUAL, changed_share=0.9)
     assert trusted_views([USUAL, back, odd, USUAL, back]) == [True, True, False, True, True]
     assert is_scene_cut([odd, odd, back, back, back])

@@ -275,7 +275,7 @@ def _view_evidence(
         covered = enlarged * weigh_maps(gaussians, small.camera, counting[..., None], backend)
         coverage[gaussians.ids] = covered[:, 0]
         none = torch.zeros_like(ease, dtype=torch.bool)
-        return _ViewEvidence(none, none, coverage, covered, ViewChange(None, 0.0, identical=False))
+        return _ViewEvidence(none, none, coverage, covered, ViewChange(None, 0.0, repeated=False))
     part = area_mean(change.changed[None, None].to(gaussians.means), size)
     difference = float(part.mean() if view.mask is None else mean_of_counting(change.changed.float(), view.mask))
     part = part[0, 0]
@@ -303,6 +303,6 @@ def _view_evidence(
         votes=(inside > config.least_pixels * ease) & (inside > config.least_share * ease * total),
         coverage=coverage,
         flows=of_movers[:, [2, 3, 4, 0, 5, 6, 7]] if change.flow is not None else total,
-        change=ViewChange(difference, wrong_share, identical=change.identical),
+        change=ViewChange(difference, wrong_share, repeated=change.repeated),
         changed=part > 0.0,
     )

@@ -230,7 +230,7 @@ def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> 
     moved = sum_by_mover(sums, movers, scene)
     total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
-    of_view = ViewChange(float(change.changed.float().mean()), 0.0, identical=change.identical)
+    of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
     return _Seen(view, tiles, gaussians, movers, votes, sums[:, 3], moved[:, :7], of_view)
 
 

@@ -4,7 +4,7 @@
 A view is an outlier in four cases. Its picture changed, or has large residuals, nearly everywhere while the median
 view did not. Or it has many times the large residuals of the median view, as of a camera that was bumped, whose picture
 stays right where it shows plain surfaces. Or it has several times them and its picture is shifted as a whole, as of a
-bumped camera that shows little else. Or it is identical to the last one while others changed: the camera is frozen. If
+bumped camera that shows little else. Or it is the last one once more while others changed: the camera is frozen. If
 most views changed everywhere, motion between the frames cannot be segmented.
 """
 
@@ -26,7 +26,7 @@ that were shifted by 5 and 3 pixels."""
 CLEAR_SHIFT = 0.3
 """Least clarity of a shift, 0 to 1 (``flow.picture_shift``); basketball's are 0.53 or more."""
 FROZEN_SHARE = 0.005
-"""Least share of changed pixels in the median view for an identical picture to count as frozen; at most one view in
+"""Least share of changed pixels in the median view for a repeated picture to count as frozen; at most one view in
 four may be."""
 
 
@@ -37,13 +37,13 @@ class ViewChange:
     Args:
         changed_share: share of its pixels that changed since the last frame; None if the camera was absent from that.
         wrong_share: share of its pixels with a residual above frame 0's.
-        identical: whether it equals the last picture bit for bit.
+        repeated: whether it is the last picture once more (``picture_change``).
         shift_pixels: how far the picture is shifted as a whole; known of suspects only (:func:`suspects`).
     """
 
     changed_share: float | None
     wrong_share: float
-    identical: bool
+    repeated: bool
     shift_pixels: float = 0.0
 
 
@@ -56,14 +56,14 @@ def suspects(changes: Sequence[ViewChange]) -> list[int]:
 def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
     """For each view whether it is no outlier. If fewer than two views are left, none counts as an outlier."""
     usual_change, usual_wrong = _usual_change(changes), median(c.wrong_share for c in changes)
-    few_same = 4 * sum(c.identical for c in changes) <= len(changes)
+    few_same = 4 * sum(c.repeated for c in changes) <= len(changes)
     found = [
         not (
             ((c.changed_share or 0.0) > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
             or (c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE)
             or c.wrong_share > max(BUMPED_SHARE, BUMPED_TIMES * usual_wrong)
             or c.shift_pixels > SHIFTED_PIXELS
-            or (c.identical and few_same and usual_change > FROZEN_SHARE)
+            or (c.repeated and few_same and usual_change > FROZEN_SHARE)
         )
         for c in changes
     ]
