@@ -35,9 +35,7 @@ def test_a_bumped_camera_is_wrong_where_it_shows_something() -> None:
 
 def test_a_camera_near_to_what_moves_is_believed() -> None:
     """The shares of basketball's throw, and of someone who comes near one camera while others are wrong, too."""
-    throw = [
-        ViewChange(changed_share=0.1, wrong_share=share, repeated=False) for share in (0.016, 0.034, 0.034, 0.088)
-    ]
+    throw = [ViewChange(changed_share=0.1, wrong_share=share, repeated=False) for share in (0.016, 0.034, 0.034, 0.088)]
     assert all(trusted_views(throw))
     assert all(trusted_views([*throw, replace(USUAL, wrong_share=0.25)]))
     few_wrong = [replace(USUAL, wrong_share=share) for share in (0.001, 0.001, 0.001, 0.19)]
