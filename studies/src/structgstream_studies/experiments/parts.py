@@ -42,6 +42,11 @@ PARTS: Mapping[str, Part] = {
         "motion.residual_threshold",
         lambda c: replace(c, motion=replace(c.motion, residual_threshold=0.0)),
     ),
+    "carrying": Part(
+        "hidden anchors carried along",
+        "motion.carried_share",
+        lambda c: replace(c, motion=replace(c.motion, carried_share=0.0)),
+    ),
     "coherence": Part(
         "price of incoherent motion",
         "coherence.weight",
