@@ -20,12 +20,15 @@ def world(*, speed: float = SPEED, movers: int = 60) -> World:
     return moving_world(FRAMES, cameras=6, movers=movers, speed=speed, width=128, height=96)
 
 
-def tracker(scenery: World, config: TrackConfig = CONFIG) -> Tracker:
-    return Tracker(config, MotionConfig(enabled=True), LiftConfig(), scenery.rig, quickest_backend())
+def tracker(scenery: World, config: TrackConfig = CONFIG, *, carried_share: float = 0.0) -> Tracker:
+    motion = MotionConfig(enabled=True, carried_share=carried_share)
+    return Tracker(config, motion, LiftConfig(), scenery.rig, quickest_backend())
 
 
-def tracked(scenery: World, config: TrackConfig = CONFIG, *, frames: int = FRAMES) -> Tracked:
-    chosen, past = tracker(scenery, config), Tracked.at_rest(scenery.scene)
+def tracked(
+    scenery: World, config: TrackConfig = CONFIG, *, frames: int = FRAMES, carried_share: float = 0.0
+) -> Tracked:
+    chosen, past = tracker(scenery, config, carried_share=carried_share), Tracked.at_rest(scenery.scene)
     before = chosen.pictures(scenery.frames[0], None).views
     for frame in scenery.frames[1:frames]:
         pictures = chosen.pictures(frame, before)
@@ -40,6 +43,16 @@ def test_movers_are_followed_over_many_frames() -> None:
     assert abs(float(moved) - (FRAMES - 1) * SPEED) < 0.3 * (FRAMES - 1) * SPEED
     assert abs(float(found.velocities[:, 0].median()) - SPEED) < 0.4 * SPEED
     assert found.moved > 30
+
+
+def test_hidden_anchors_go_along_with_what_hides_them() -> None:
+    scenery = world()
+    start = scenery.scene.anchors.positions
+    alone, carried = (tracked(scenery, carried_share=share).scene.anchors.positions for share in (0.0, 0.4))
+    left = (alone == start).all(1) & (carried != start).any(1)
+    assert int(left.sum()) > 0
+    travelled = (carried - start)[left, 0] / ((FRAMES - 1) * SPEED)
+    assert float(travelled.mean()) > 0.3
 
 
 def test_flow_from_the_rendering_corrects_drift() -> None:

@@ -20,6 +20,7 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.scene import Scene
+from structgstream.training.carrying import carried_anchors
 from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.lifting import LiftConfig, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
@@ -172,7 +173,9 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             votes = torch.stack([entry.votes for entry in seen]).sum(0)
             # What moved goes on as long as one camera sees it: not all that see it are used in every frame.
             goes_on = (past.velocities != 0).any(1) & (votes > 0)
-            movers = ((votes >= tracker.motion.least_views) | goes_on).nonzero()[:, 0]
+            moving = (votes >= tracker.motion.least_views) | goes_on
+            moving[: len(scene.anchors)] |= _carried(tracker.motion, scene, seen, moving[: len(scene.anchors)])
+            movers = moving.nonzero()[:, 0]
         with watch.stage("flow between pictures"):
             views = [entry.view for entry in seen]
             evidence = _evidence([entry.flows[movers] for entry in seen])
@@ -232,6 +235,31 @@ def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> 
     votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
     return _Seen(view, tiles, gaussians, movers, votes, sums[:, 3], moved[:, :7], of_view)
+
+
+def _carried(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving: Tensor) -> Tensor:
+    """Mask ``[M]`` of the anchors that are hidden in changed tiles and carried along.
+
+    Nothing is known of anchors outside of these tiles: they are neither carried nor compared with.
+
+    Args:
+        motion: thresholds.
+        scene: whose anchors may be carried.
+        seen: what the cameras tell.
+        moving: mask ``[M]`` of the anchors that move by themselves.
+    """
+    anchors, carried = len(moving), torch.zeros_like(moving)
+    drawn, shown = (torch.zeros_like(moving, dtype=torch.int32) for _ in range(2))
+    for entry in seen:
+        of_view = torch.zeros(len(entry.votes), dtype=torch.bool, device=moving.device)
+        of_view[entry.movers] = True
+        drawn += of_view[:anchors]
+        shown += entry.flows[:anchors, 3] > motion.least_pixels
+    among = ((drawn >= motion.least_views) | (shown >= motion.least_views)).nonzero()[:, 0]
+    carried[among] = carried_anchors(
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.least_views, share=motion.carried_share
+    )
+    return carried
 
 
 def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tensor) -> Tensor:
