@@ -56,12 +56,14 @@ def test_methods_are_points_with_the_spread_as_bars(tmp_path: Path) -> None:
 
 
 def test_a_method_without_a_cost_is_left_out_and_no_cost_is_drawn_at_the_edge(tmp_path: Path) -> None:
-    free = [outcome("held", psnr=20.0, mean={"online_bytes": 0.0, "online_cpu_seconds": None})]
-    write_comparison(tmp_path / "m.png", [*runs(), *free], titles=TITLES)
-    picture = pixels_of(tmp_path / "m.png")
-    left, right = np.split(picture, [picture.shape[1] // 2], axis=1)
-    assert coloured(left, COLORS[2]) > 10
-    assert coloured(right, COLORS[2]) == 0
+    counts = []
+    for seconds in (None, 2.0):
+        free = [outcome("held", psnr=20.0, mean={"online_bytes": 0.0, "online_cpu_seconds": seconds})]
+        write_comparison(tmp_path / "m.png", [*runs(), *free], titles=TITLES)
+        picture = pixels_of(tmp_path / "m.png")
+        assert coloured(picture[:, : picture.shape[1] // 4], COLORS[2]) > 10, "at the left of the first panel"
+        counts.append(coloured(picture, COLORS[2]))
+    assert counts[0] < counts[1] - 10, "a point in the second panel is there only with seconds"
 
 
 def test_details_show_where_pictures_differ_most_and_nothing_else(tmp_path: Path) -> None:

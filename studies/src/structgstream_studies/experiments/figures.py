@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
     found = summaries(results)
     figure = figure_of(10.0, 4.2)
     axes = figure.subplots(1, 2, sharey=True)
+    points: dict[str, Any] = {}
     panels = (("online_bytes", "MB a frame after the first"), ("online_cpu_seconds", "core-seconds a frame"))
     for axis, (name, caption) in zip(axes, panels):
         for number, key in enumerate(key for key in titles if key in found):
@@ -61,13 +62,16 @@ def write_comparison(path: Path, results: Iterable[Result], *, titles: Mapping[s
                 continue
             x = max(cost.mean * SCORES[name].factor, 1e-4)
             colour = INK if key == FULL else COLORS[number % len(COLORS)]
-            axis.errorbar(x, quality.mean, yerr=quality.deviation, fmt="o", color=colour, capsize=3)
-            axis.annotate(titles[key], (x, quality.mean), xytext=(6, 4), textcoords="offset points", fontsize=8)
+            spread = quality.deviation
+            points[titles[key]] = axis.errorbar(x, quality.mean, yerr=spread, fmt="o", color=colour, capsize=3)
         axis.set_xscale("log")
-        axis.margins(x=0.25, y=0.12)
+        axis.margins(x=0.12, y=0.12)
         axis.set_xlabel(caption, fontsize=9)
         without_frame(axis)
     axes[0].set_ylabel("PSNR of held-out cameras, dB", fontsize=9)
+    # Beside the panels: methods lie so near to each other that names at the points would cover one another.
+    beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+    axes[-1].legend(points.values(), points.keys(), fontsize=8, frameon=False, **beside)
     save_figure(figure, path)
 
 
