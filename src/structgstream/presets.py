@@ -311,7 +311,7 @@ COMPACT = replace(
             rest_every=3,
         ),
         start=MotionStartConfig(enabled=True, flow=FlowConfig(apart=True)),
-        births=BirthConfig(enabled=True, thin=ThinBirthConfig(enabled=True)),
+        births=BirthConfig(enabled=True, changed_floor_medians=1.0, thin=ThinBirthConfig(enabled=True)),
         motion_prior=0.7,
         coherence=CoherenceConfig(weight=8e-4),
         rounding=RoundingConfig(free_priced=True),

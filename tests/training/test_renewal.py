@@ -15,7 +15,7 @@ from structgstream.training.motion import MotionConfig
 from structgstream.training.partition import Partition, focus_views
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.training.renewal import Renewal, renew_free_gaussians
-from structgstream.training.residuals import residual_floor
+from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.views import training_views
 from worlds import emerging_ball, moved_since, moving_world
 
@@ -28,7 +28,14 @@ BACKENDS = [
 ]
 
 
-def renewed(backend: Backend, *, scene: Scene = WORLD.scene, config: BirthConfig = CONFIG, room: int = 1000) -> Renewal:
+def renewed(
+    backend: Backend,
+    *,
+    scene: Scene = WORLD.scene,
+    config: BirthConfig = CONFIG,
+    room: int = 1000,
+    floor: ResidualFloor | None = None,
+) -> Renewal:
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     partition = Partition.of(scene, moved_since(scene, views, first, config=motion, backend=backend))
@@ -37,7 +44,7 @@ def renewed(backend: Backend, *, scene: Scene = WORLD.scene, config: BirthConfig
         views,
         focus_views(partition, views, config=motion, backend=backend),
         first_birth=1 << 32,
-        floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend),
+        floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
         least_pixels=motion.least_pixels,
         config=config,
@@ -56,6 +63,21 @@ def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
     torch.testing.assert_close(born.colors.median(0).values, ball.colors[0], atol=0.4, rtol=0)  # soft, before others
     assert born.births.tolist() == [BIRTHS_PER_FRAME + n for n in range(len(born))]
     torch.testing.assert_close(born.logit_opacities.sigmoid(), torch.full((len(born),), 0.7))
+
+
+def test_what_emerges_before_something_that_frame_0_drew_badly_is_born_if_the_floor_is_eased() -> None:
+    scene, backend = WORLD.scene, reference_backend()
+    first = training_views(WORLD.frames[0], WORLD.rig, CPU)
+    floor = residual_floor(scene, first, scale=1.0, backend=backend)
+    bad = replace(floor, maps={i: torch.full_like(of_view, 0.02) for i, of_view in floor.maps.items()})
+    for of_view in bad.maps.values():
+        of_view[16:48, 24:72] = 0.9  # Frame 0 was drawn badly in the middle, where the ball is now.
+    born = [
+        len(renewed(backend, floor=bad, config=replace(CONFIG, changed_floor_medians=medians)).new_free)
+        for medians in (None, 1.0)
+    ]
+    assert born[0] == 0
+    assert born[1] >= 3
 
 
 def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from torch.nn.functional import avg_pool2d
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
-from structgstream.training.residuals import apply_camera_color, box_mean, residual, residual_floor
+from structgstream.training.residuals import ResidualFloor, apply_camera_color, box_mean, residual, residual_floor
 from structgstream.training.views import blackened, training_views
 from worlds import moved_since, moving_world
 
@@ -58,6 +58,18 @@ def test_the_floor_is_what_frame_0_missed_nearby() -> None:
     more = floor[1] - clean[1]
     assert (more[8:13, 18:23] > 0.01).all()
     assert not more[:6].any()
+
+
+def test_the_floor_is_at_most_the_usual_one_where_pictures_have_changed() -> None:
+    floor = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5, 1.0]])  # The last pixel is masked.
+    changed = torch.tensor([[True, True, True, True, False, False]])
+    eased = ResidualFloor(1.0, {3: floor, 4: floor}).eased({3: changed}, medians=1.0).maps
+    torch.testing.assert_close(eased[3], torch.tensor([[0.1, 0.2, 0.3, 0.3, 0.5, 1.0]]))
+    assert torch.equal(eased[4], floor), "nothing is known of its changes"
+    none = ResidualFloor(1.0, {3: floor}).eased({3: changed}, medians=0.0).maps[3]
+    assert not none[changed].any()
+    masked = torch.ones(1, 6)
+    assert torch.equal(ResidualFloor(1.0, {3: masked}).eased({3: changed}, medians=1.0).maps[3], masked)
 
 
 def test_slow_change_is_seen_by_the_residual_alone() -> None:

@@ -69,6 +69,9 @@ class BirthConfig:
     """Residual, 0 to 1, above which a pixel counts as wrong."""
     missing_threshold: float = 0.10
     """Excess of the residual over frame 0's, 0 to 1, above which a pixel counts as missing."""
+    changed_floor_medians: float | None = None
+    """Where a picture has changed, frame 0's residual, which was of other content, counts as at most this many medians
+    of its view's. None: all of it counts, as it does in the sweep for thin content."""
     pixel_step: int = 2
     """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48

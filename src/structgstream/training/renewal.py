@@ -86,7 +86,10 @@ def renew_free_gaussians(
     if not config.enabled or not focuses:
         return none
     with torch.no_grad():
-        sweep = Sweep(moving, still, views, focuses, floor, config, backend)
+        eased = floor
+        if floor is not None and config.changed_floor_medians is not None:
+            eased = floor.eased(partition.segmentation.changed, medians=config.changed_floor_medians)
+        sweep = Sweep(moving, still, views, focuses, eased, config, backend)
         missing = sweep.missing()
         share = missing_share(missing)
         if share > config.most_missing_share:
@@ -102,7 +105,9 @@ def renew_free_gaussians(
         if len(large.free) or not config.thin.enabled:
             return Renewal(kept, large.free, merged_count=large.merged_count, missing_share=share)
         known = {entry.view.index: entry for entry in missing}
-        thin = _thin_births(replace(sweep, config=config.for_thin, known=known), first_birth=first_birth, room=room)
+        # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
+        thin_sweep = replace(sweep, floor=floor, config=config.for_thin, known=known)
+        thin = _thin_births(thin_sweep, first_birth=first_birth, room=room)
     return Renewal(kept, thin.free, len(thin.free), thin.refused_count, missing_share=share)
 
 

@@ -4,8 +4,8 @@
 Residuals that frame 0 already had do not indicate change.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -34,6 +34,25 @@ class ResidualFloor:
 
     scale: float
     maps: dict[int, Tensor]
+
+    def eased(self, changed: Mapping[int, Tensor], *, medians: float) -> "ResidualFloor":
+        """The floor, with at most ``medians`` times a view's median where it has changed.
+
+        Frame 0's residual there was of other content, and tells nothing of how well what is there now can be drawn.
+
+        Args:
+            changed: by view index, mask ``[h, w]`` of the changed pixels, at the maps' scale.
+            medians: 0: no floor there.
+        """
+        return replace(self, maps={i: _eased(floor, changed.get(i), medians) for i, floor in self.maps.items()})
+
+
+def _eased(floor: Tensor, changed: Tensor | None, medians: float) -> Tensor:
+    if changed is None:
+        return floor
+    # Without what a mask left out. No median (everything is left out): fmin then keeps the floor.
+    usual = medians * torch.where(floor < 1.0, floor, torch.nan).nanmedian()
+    return torch.where(changed, torch.fmin(floor, usual), floor)
 
 
 def apply_camera_color(image: Tensor, color: CameraColor, view_index: int) -> Tensor:
