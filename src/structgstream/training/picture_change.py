@@ -17,7 +17,7 @@ from structgstream.training.views import View, blackened, mean_of_counting
 REPEATED_LEVELS = 0.2
 """Mean absolute difference, in levels of 255, below which a picture without a changed pixel is the last one once more.
 
-A frozen picture that is encoded again differs by up to 0.15 (H.264, rate factors 6 and 23, from the second repetition
+A frozen picture that is encoded again differs by up to 0.16 (H.264, rate factors 6 and 23, from the second repetition
 on); the noise of a camera alone by more: at least 1.2 in every camera of basketball, 2.5 in counter."""
 
 
