@@ -8,7 +8,7 @@ import { Flight } from "../src/view/flight.ts";
 import { linkOf, linkTo, viewFrom } from "../src/view/link.ts";
 import { dollied, flown, looked, orbited, panned, type View, viewOf } from "../src/view/navigator.ts";
 import { QualityControl } from "../src/view/quality.ts";
-import { rigOf } from "../src/view/rig.ts";
+import { nearPlane, rigOf } from "../src/view/rig.ts";
 import { CLIP } from "./served.ts";
 
 const RIG = rigOf(readStream(CLIP).header!);
@@ -35,6 +35,35 @@ test("a rig begins with the camera in its middle, and up is up", () => {
   for (const { camera } of RIG.cameras) expect(dot(axes(camera)[1], RIG.up)).toBeLessThan(-0.5);
   const depth = dot(along(RIG.focus, center(START.camera), -1), axes(START.camera)[2]);
   expect(depth).toBeGreaterThan(0);
+});
+
+describe("the near plane", () => {
+  const near = (view: View) => nearPlane(RIG, center(view.camera));
+
+  test("at a camera of the rig is that of the capture, also on the way to another", () => {
+    for (const { camera } of RIG.cameras) expect(near(viewOf(camera, RIG.focus))).toBeCloseTo(camera.near, 9);
+    expect(near(flown(START, 0, 0, -5 * RIG.radius))).toBeCloseTo(START.camera.near, 9);
+    expect(near(flown(START, 0.01 * RIG.radius, 0, 0))).toBeGreaterThan(0.9 * START.camera.near);
+  });
+
+  test("is not pushed along by who goes closer: what the camera of the rig shows stays until the viewer has reached it", () => {
+    const alone = { ...RIG, cameras: [RIG.first] };
+    const [free, reach] = [0.01 * RIG.radius, length(along(START.pivot, center(START.camera), -1))];
+    for (let closer = 0; closer < 2 * reach; closer += 0.01 * reach) {
+      const plane = closer + nearPlane(alone, center(flown(START, 0, 0, closer).camera));
+      expect(plane).toBeCloseTo(Math.max(START.camera.near, closer + free), 9);
+    }
+    // Half way to what is looked at, and beyond it, as good as nothing is cut.
+    for (const share of [0.5, 1, 2]) expect(near(flown(START, 0, 0, share * reach))).toBeCloseTo(free, 9);
+  });
+
+  test("of a capture that filmed from nearer still is never larger than the capture's", () => {
+    const cameras = RIG.cameras.map((entry) => ({ ...entry, camera: { ...entry.camera, near: 1e-3 * RIG.radius } }));
+    for (const share of [0, 0.3, 0.9]) {
+      const eye = along(center(START.camera), along(START.pivot, center(START.camera), -1), share);
+      expect(nearPlane({ ...RIG, cameras }, eye)).toBeLessThanOrEqual(1e-3 * RIG.radius);
+    }
+  });
 });
 
 describe("orbiting", () => {

@@ -4,8 +4,10 @@
 import type { StreamHeader } from "@structgstream/core";
 import {
   along,
+  axes,
   type Camera,
   center,
+  dot,
   focusPoint,
   length,
   rigCameras,
@@ -29,6 +31,24 @@ export interface Rig {
   readonly radius: number;
   /** The camera that a stream begins with: the one nearest to their mean. */
   readonly first: RigCamera;
+}
+
+/**
+ * Share of the rig's radius that a free camera sees from on: a hundredth, less than anyone would put between a lens and a
+ * subject. Nearer still, single Gaussians fill the picture and the order by depth of their means says nothing.
+ */
+const FREE_NEAR = 0.01;
+
+/**
+ * Near plane of a camera at `eye`, in scene units. Nothing nearer than the capture's near plane was trained where its cameras
+ * stand: there a viewer's plane is theirs. A viewer who went closer does not push it along: the plane stays where the nearest
+ * camera of the rig has it until the viewer has reached it, so that nothing is cut that this camera shows.
+ */
+export function nearPlane({ cameras, radius }: Pick<Rig, "cameras" | "radius">, eye: Vector): number {
+  const away = ({ camera }: RigCamera) => length(along(eye, center(camera), -1));
+  const { camera } = cameras.reduce((best, other) => (away(other) < away(best) ? other : best));
+  const closer = dot(along(eye, center(camera), -1), axes(camera)[2]);
+  return Math.max(camera.near - Math.max(closer, 0), Math.min(FREE_NEAR * radius, camera.near));
 }
 
 export function rigOf(header: StreamHeader): Rig {
