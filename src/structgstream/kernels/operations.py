@@ -34,7 +34,7 @@ class Rasterize(Protocol):
     """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
     A Gaussian that less than 1/255 of a pixel's light reaches is drawn there, and gets no gradient from the pixel; with
-    gsplat (``cuda``) it does.
+    gsplat (``cuda``) it does. The low-pass is ``reference_raster.screen_low_pass``; it counts as a constant.
 
     Args:
         gaussians: to draw; their ids are not read.
@@ -308,6 +308,7 @@ class GenerateStructured(Protocol):
         distance_input: whether the distance is an input of the heads.
         tiles: if given, only anchors that reach one of these tiles.
         seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
+        sampling_intervals: ``[M]`` of the anchors, by which their balls grow for the low-pass (:class:`Rasterize`).
     """
 
     def __call__(
@@ -319,6 +320,7 @@ class GenerateStructured(Protocol):
         distance_input: bool,
         tiles: TileSelection | None = None,
         seen_from: Tensor | None = None,
+        sampling_intervals: Tensor | None = None,
     ) -> StructuredGaussians: ...
 
 

@@ -88,6 +88,8 @@ def fit_next_frame(
         return held(scene)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
+    if not config.sampling_filter:
+        scene = replace(scene, sampling=None)
     counts: dict[str, int] = {}
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
