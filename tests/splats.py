@@ -8,9 +8,12 @@ from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 
 
-def splats_of(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Gaussians:
+def splats_of(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, intervals: Tensor | None = None
+) -> Gaussians:
     """Gaussians numbered from 0 on."""
-    return Gaussians(means, quats, scales, opacities, colors, torch.arange(len(means), device=means.device))
+    ids = torch.arange(len(means), device=means.device)
+    return Gaussians(means, quats, scales, opacities, colors, ids, intervals)
 
 
 def viewport_of(viewmat: Tensor, K: Tensor, *, width: int, height: int, near: float) -> Viewport:

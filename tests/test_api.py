@@ -66,8 +66,10 @@ def test_an_interrupted_call_goes_on(stream: Path, tmp_path: Path, monkeypatch: 
 
 def test_a_capture_that_is_open(stream: Path, tmp_path: Path) -> None:
     source = structgstream.open_capture(CLIP, frames=1, scale=0.25)
-    with pytest.raises(ConfigError, match="open_capture takes them"):
-        structgstream.reconstruct(source, tmp_path / "x.sgs", frames=1)
+    wishes: list[dict[str, Any]] = [{"frames": 1}, {"every": 2}]
+    for chosen in wishes:
+        with pytest.raises(ConfigError, match="open_capture takes them"):
+            structgstream.reconstruct(source, tmp_path / "x.sgs", **chosen)
     structgstream.reconstruct(source, tmp_path / "x.sgs", preset=QUICK, backend=QUICKEST)
     ours, theirs = structgstream.open_stream(tmp_path / "x.sgs"), structgstream.open_stream(stream)
     assert torch.equal(ours.scene(0).anchors.positions, theirs.scene(0).anchors.positions)

@@ -10,9 +10,9 @@ def test_concatenation_keeps_rows_and_ids_together() -> None:
     gaussians = random_scene(free=4).gaussians(arc_rig()["cam01"], reference_backend())
     n = len(gaussians)
     parts = [
-        Gaussians(**{name: value[rows] for name, value in vars(gaussians).items()})
+        Gaussians(**{name: value[rows] for name, value in gaussians.columns().items()})
         for rows in (slice(0, n // 3), slice(n // 3, n))
     ]
     again = concatenate(*parts)
     assert len(again) == n
-    assert all(torch.equal(value, vars(again)[name]) for name, value in vars(gaussians).items())
+    assert all(torch.equal(value, vars(again)[name]) for name, value in gaussians.columns().items())

@@ -167,8 +167,8 @@ int sgs_use_isa(int wanted) {
 void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* screen_offsets, const uint8_t* drawn_tiles, int64_t trained, float* image,
-    float* alpha, float* radii, int threads) {
+    const float* background, const float* screen_offsets, const float* intervals, const uint8_t* drawn_tiles,
+    int64_t trained, float* image, float* alpha, float* radii, int threads) {
     try {
         auto raster = std::make_unique<Raster>();
         raster->camera = pinhole(viewmat, K, width, height, near_plane);
@@ -177,7 +177,8 @@ void* sgs_raster_forward(
         if (drawn_tiles) raster->drawn_tiles.assign(drawn_tiles, drawn_tiles + raster->tiles_x * raster->tiles_y);
         raster->trained = trained;
         raster->splats.resize(count);
-        project_dispatched({means, quats, scales, opacities, colors, screen_offsets, count}, *raster, radii, threads);
+        project_dispatched(
+            {means, quats, scales, opacities, colors, screen_offsets, intervals, count}, *raster, radii, threads);
         bin(*raster);
         rasterize_dispatched(*raster, background, image, alpha, threads);
         return raster.release();
@@ -189,7 +190,8 @@ void* sgs_raster_forward(
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* maps, int channels, float* weights, float* image, int threads) {
+    const float* background, const float* intervals, const float* maps, int channels, float* weights, float* image,
+    int threads) {
     try {
         Raster raster;
         raster.camera = pinhole(viewmat, K, width, height, near_plane);
@@ -201,7 +203,8 @@ int sgs_raster_weights(
         std::vector<float> radii(count);
         // Without a picture colours play no part; any numbers of the right count will do.
         project_dispatched(
-            {means, quats, scales, opacities, image ? colors : means, nullptr, count}, raster, radii.data(), threads);
+            {means, quats, scales, opacities, image ? colors : means, nullptr, intervals, count}, raster, radii.data(),
+            threads);
         bin(raster);
         const std::unique_ptr<float[]> sums(new float[raster.pairs.size() * channels]);
         weigh_dispatched(raster, maps, channels, sums.get(), background, image, threads);
@@ -254,7 +257,7 @@ int sgs_raster_backward(
     if (!moments) return 1;
     rasterize_backward_dispatched(raster, background, image, alpha, grad_image, grad_alpha, moments.get(), threads);
     project_backward_dispatched(
-        {means, quats, scales, opacities, colors, nullptr, count}, raster, moments.get(),
+        {means, quats, scales, opacities, colors, nullptr, nullptr, count}, raster, moments.get(),
         {grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_screen_offsets}, threads);
     return 0;
 }
@@ -283,9 +286,10 @@ void sgs_l1_ssim_backward(
 }
 
 int64_t sgs_anchors_visible(
-    const sgs_anchors* anchors, int64_t count, const float* viewmat, const float* K, int width, int height,
-    float near_plane, const uint8_t* tiles, int64_t* visible, int threads) {
+    const sgs_anchors* anchors, int64_t count, const float* intervals, const float* viewmat, const float* K, int width,
+    int height, float near_plane, const uint8_t* tiles, int64_t* visible, int threads) {
     View view;
+    view.intervals = intervals;
     std::copy_n(viewmat, 12, view.viewmat);
     view.fx = K[0], view.fy = K[4], view.cx = K[2], view.cy = K[5], view.near = near_plane;
     view.width = width, view.height = height;

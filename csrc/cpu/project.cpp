@@ -126,13 +126,27 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
     Rows<1> opacities;
     colors.read(in.colors, begin, in.count);
     opacities.read(in.opacities, begin, in.count);
-    const vf opacity = opacities[0];
-    const vf finite = traces(g.means) + traces(g.quats) + traces(g.scales) + traces(colors) + opacity * 0.0f;
+    vf opacity = opacities[0];
+    vf finite = traces(g.means) + traces(g.quats) + traces(g.scales) + traces(colors) + opacity * 0.0f;
     const Rotation rotation(g.quats);
     const Footprint f(c, g, rotation);
-    vf xx = splat(kLowPass), xy = splat(0.0f), yy = splat(kLowPass);
+    vf low_pass = splat(kLowPass);
+    if (in.intervals) {  // reference_raster.screen_low_pass
+        Rows<1> intervals;
+        intervals.read(in.intervals, begin, in.count);
+        finite += traces(intervals);
+        const vf side = intervals[0] * f.inverse;
+        low_pass *= c.fx * c.fy * side * side;
+    }
+    vf xx = low_pass, xy = splat(0.0f), yy = low_pass;
     for (int j = 0; j < 3; ++j) xx += f.a[j] * f.a[j], xy += f.a[j] * f.b[j], yy += f.b[j] * f.b[j];
-    const vf determinant = xx * yy - xy * xy;
+    vf determinant = xx * yy - xy * xy;
+    if (in.intervals) {
+        const vf added = largest(splat(kScreenLowPass) - low_pass, splat(0.0f)), before = determinant;
+        xx += added, yy += added;
+        determinant = xx * yy - xy * xy;
+        opacity *= square_root(smallest(splat(1.0f), largest(splat(0.0f), before / determinant)));
+    }
     vf x = c.fx * f.point[0] * f.inverse + c.cx, y = c.fy * f.point[1] * f.inverse + c.cy;
     if (in.screen_offsets) {
         Rows<2> offsets;

@@ -10,7 +10,8 @@ namespace structgstream {
 
 constexpr int kTile = 16;                          // pixels
 constexpr int kTilePixels = kTile * kTile;
-constexpr float kLowPass = 0.3f;                   // square pixels
+constexpr float kLowPass = 0.3f;                   // square pixels: reference_raster.LOW_PASS_PIXELS
+constexpr float kScreenLowPass = 0.15f;            // reference_raster.SCREEN_LOW_PASS_PIXELS
 constexpr float kMinAlpha = 1.0f / 255.0f;
 constexpr float kMaxAlpha = 0.999f;
 constexpr float kMinTransmittance = 1e-4f;
@@ -58,6 +59,7 @@ struct GaussianInputs {
     const float* opacities;
     const float* colors;
     const float* screen_offsets;  // or null
+    const float* intervals;       // size of a training pixel at each, or null: the low-pass is that of the picture
     int64_t count;
 };
 

@@ -43,6 +43,8 @@ void anchors_visible(const sgs_anchors& a, int64_t count, const View& view, cons
         store(radii, reach);
         for (int l = 0; l < kLanes; ++l) radii[l] = std::sqrt(radii[l]);
         store(radii, load(radii) + size);
+        if (view.intervals)
+            for (int l = 0; l < kLanes; ++l) radii[l] += kBallIntervals * view.intervals[lane_anchor[l]];
         for (int j = 0; j < 3; ++j) {
             const float* v = view.viewmat + 4 * j;
             store(points[j], load(rows[0]) * v[0] + load(rows[1]) * v[1] + load(rows[2]) * v[2] + v[3]);

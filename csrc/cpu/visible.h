@@ -12,11 +12,13 @@ namespace structgstream {
 
 constexpr float kBallDeviations = 3.4f;  // alpha = 1/255 is reached before 3.33 at any opacity
 constexpr float kBoxMargin = 2.0f;       // pixels: the rasteriser's low-pass makes the smallest Gaussian this wide
+constexpr float kBallIntervals = 1.86226f;  // kBallDeviations times the root of kLowPass
 
 struct View {
     float viewmat[12];
     float fx, fy, cx, cy, near;
     int width, height, tiles_x, tiles_y;
+    const float* intervals;  // of each anchor, or null
 
     [[gnu::always_inline]] static bool beyond(float x, float z, float radius, float focal, float edge) {
         const float slope = (edge + kBoxMargin) / focal;

@@ -8,13 +8,14 @@
 
 int sgs_cuda_anchor_inputs(
     const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
-    const float* features, int anchors, int offsets_per_anchor, int feature_size, int distance_input,
+    const float* features, const float* intervals, int anchors, int offsets_per_anchor, int feature_size,
+    int distance_input,
     const float* viewmat, const float* intrinsics, const float* center, int width, int height, float near,
     const uint8_t* tiles, float* inputs, uint8_t* seen, void* stream) {
     using namespace structgstream::cuda;
     const int columns = feature_size + 3 + (distance_input ? 1 : 0);
-    const Seen see = {positions, log_offset_scales, log_base_scales, offsets, offsets_per_anchor, viewmat, intrinsics,
-                      {width, height}, near, tiles, seen};
+    const Seen see = {positions, log_offset_scales, log_base_scales, offsets, intervals, offsets_per_anchor, viewmat,
+                      intrinsics, {width, height}, near, tiles, seen};
     const int error = for_each(see, anchors, stream);
     if (error) return error;
     const Input input = {positions, features, center, feature_size, columns, inputs};

@@ -11,6 +11,7 @@ namespace cuda {
 
 constexpr float kBallDeviations = 3.4f;   // reference_anchors.BALL_DEVIATIONS
 constexpr float kBoxMargin = 2.0f;        // pixels, reference_anchors.BOX_MARGIN_PIXELS
+constexpr float kBallIntervals = 1.86226f;  // reference_anchors.BALL_INTERVALS
 constexpr float kLeastLength = 1e-12f;
 
 SGS_ELEMENT float least(float a, float b) { return a < b ? a : b; }
@@ -20,7 +21,7 @@ SGS_ELEMENT float length(float x, float y, float z) { return sqrtf(x * x + y * y
 
 // Whether the ball of an anchor's Gaussians reaches the picture, or one of its tiles.
 struct Seen {
-    const float *positions, *log_offset_scales, *log_base_scales, *offsets;
+    const float *positions, *log_offset_scales, *log_base_scales, *offsets, *intervals;
     int k;
     const float *viewmat, *intrinsics;
     int size[2];
@@ -37,7 +38,8 @@ struct Seen {
             reach = most(reach, length(offset[0] * scale[0], offset[1] * scale[1], offset[2] * scale[2]));
         }
         for (int axis = 1; axis < 3; ++axis) base = most(base, log_base_scales[3 * i + axis]);
-        return reach + kBallDeviations * expf(base);
+        const float ball = reach + kBallDeviations * expf(base);
+        return intervals == nullptr ? ball : ball + kBallIntervals * intervals[i];
     }
 
     SGS_ELEMENT bool reaches_tile(const float* low, const float* high) const {

@@ -11,12 +11,14 @@ extern "C" {
 #endif
 
 /* The inputs of the MLPs, and which anchors' balls of Gaussians reach the picture, or one of its tiles.
- * positions, log_offset_scales, log_base_scales [M,3], offsets [M,K,3], features [M,D]; viewmat [4,4], intrinsics [3,3],
+ * positions, log_offset_scales, log_base_scales [M,3], offsets [M,K,3], features [M,D]; intervals [M], the size of a training
+ * pixel at each anchor, or null; viewmat [4,4], intrinsics [3,3],
  * center [3], of directions and distances; tiles: a byte for each tile of 16 x 16 pixels, or null for all. Out: inputs
  * [M,D+3+distance_input], seen: a byte for each anchor. */
 int sgs_cuda_anchor_inputs(
     const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
-    const float* features, int anchors, int offsets_per_anchor, int feature_size, int distance_input,
+    const float* features, const float* intervals, int anchors, int offsets_per_anchor, int feature_size,
+    int distance_input,
     const float* viewmat, const float* intrinsics, const float* center, int width, int height, float near,
     const uint8_t* tiles, float* inputs, uint8_t* seen, void* stream);
 /* Out: v_positions [M,3], from v_inputs, the gradient of the inputs. That of the features is its first D columns. */

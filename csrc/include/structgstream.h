@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 6
+#define SGS_ABI_VERSION 7
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -23,14 +23,15 @@ int sgs_use_isa(int isa);    /* switch, for tests; returns the one in use afterw
 
 /* Rasteriser. Forward returns a state for backward, null where memory does not suffice; sgs_raster_free releases it.
  * means [N,3], quats [N,4] wxyz, scales [N,3], opacities [N], colors [N,3], viewmat [4,4] world to camera, K [3,3] pixels;
- * background [3] or null, screen_offsets [N,2] or null. drawn_tiles: one byte for each tile of 16 x 16 pixels, row by row,
+ * background [3] or null, screen_offsets [N,2] or null; intervals [N], the size of a training pixel at each Gaussian, or null
+ * (reference_raster.screen_low_pass). drawn_tiles: one byte for each tile of 16 x 16 pixels, row by row,
  * zero where nothing is to be drawn and the picture is left as it is; or null. Gaussians from `trained` on get no
  * gradient. Out: image [H,W,3], alpha [H,W], radii [N]. */
 void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* screen_offsets, const uint8_t* drawn_tiles, int64_t trained, float* image,
-    float* alpha, float* radii, int threads);
+    const float* background, const float* screen_offsets, const float* intervals, const uint8_t* drawn_tiles,
+    int64_t trained, float* image, float* alpha, float* radii, int threads);
 /* weights [N,C]: for each Gaussian the sum over the pixels of its blending weight times each of maps [H,W,C], C =
  * channels >= 1. Takes C numbers of memory for each pair of a Gaussian and a tile. image [H,W,3]: the picture of colors
  * [N,3] over background [3] or null, drawn in the same pass; or null, as then is colors. Returns 0, or 1 where memory does
@@ -38,7 +39,8 @@ void* sgs_raster_forward(
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* maps, int channels, float* weights, float* image, int threads);
+    const float* background, const float* intervals, const float* maps, int channels, float* weights, float* image,
+    int threads);
 /* grad_image [H,W,3]; grad_alpha [H,W] or null. Returns 0, or 1 where memory does not suffice. */
 int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,
@@ -113,10 +115,10 @@ int sgs_plane_scores(
     const double* homographies, int64_t planes, int window, float noise, float* scores);
 
 /* Anchors (of `count`) that can put a Gaussian into the picture, or into its tiles that are not zero; ascending. Reads
- * positions, scales and offsets. Returns their number, or -1 where memory does not suffice. */
+ * positions, scales and offsets; intervals [count] widens the Gaussians by their low-pass, or null. Returns their number, or -1 where memory does not suffice. */
 int64_t sgs_anchors_visible(
-    const struct sgs_anchors* anchors, int64_t count, const float* viewmat, const float* K, int width, int height,
-    float near_plane, const uint8_t* tiles, int64_t* visible, int threads);
+    const struct sgs_anchors* anchors, int64_t count, const float* intervals, const float* viewmat, const float* K, int width,
+    int height, float near_plane, const uint8_t* tiles, int64_t* visible, int threads);
 
 /* Structured Gaussians: select, then dress into arrays of selection->gaussian_count rows. */
 void sgs_anchors_select(const struct sgs_anchors* anchors, struct sgs_selection* selection, int threads);

@@ -16,7 +16,7 @@ from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
-from structgstream.evaluation.capture import capture_of
+from structgstream.evaluation.capture import capture_of, part_metadata
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.report import Report
@@ -99,6 +99,7 @@ def reconstruct(
     start: int = 0,
     frames: int | None = None,
     near: float | None = None,
+    every: int = 1,
     backend: Backend | BackendName = "auto",
     resume: bool = False,
     overwrite: bool = False,
@@ -125,6 +126,7 @@ def reconstruct(
         start: first frame to use.
         frames: number of frames; None for all.
         near: distance of the near plane, in units of the capture; None for the capture's own.
+        every: step from one frame that is used to the next; the frames a second are divided by it.
         backend: the compute back-end; ``auto`` takes the first available of cuda, cpu, reference.
         resume: continue after the last whole frame of ``path``.
         overwrite: replace ``path`` if it exists.
@@ -159,12 +161,14 @@ def reconstruct(
         check_output(path, may_exist=resume or overwrite)
     metadata: dict[str, object] = {} if named is None else {"preset": named}
     if isinstance(capture, Path | str):
-        source = open_capture(capture, held_out=held_out, scale=scale, start=start, frames=frames, near=near)
-        metadata |= {"start": start, "scale": scale}
-    elif (held_out, scale, start, frames, near) != (None, 1.0, 0, None, None):
+        source = open_capture(
+            capture, held_out=held_out, scale=scale, start=start, frames=frames, near=near, every=every
+        )
+        metadata |= part_metadata(start=start, scale=scale, every=every)
+    elif (held_out, scale, start, frames, near, every) != (None, 1.0, 0, None, None, 1):
         raise ConfigError(
-            "held_out, scale, start, frames and near choose from a folder; an opened capture was given, for which "
-            "open_capture takes them."
+            "held_out, scale, start, frames, near and every choose from a folder; an opened capture was given, for "
+            "which open_capture takes them."
         )
     else:
         source = capture

@@ -26,6 +26,8 @@ class Gaussians:
         opacities: ``[N]`` in (0, 1).
         colors: ``[N, 3]`` sRGB.
         ids: ``[N]`` int64, identifies a Gaussian of the scene. See Note [Ids].
+        sampling_intervals: ``[N]`` side of a training pixel at the Gaussian, scene units, without gradient, by which
+            it is filtered (``scene/sampling.py``, Note [Drawn as it was trained]); None: by the picture that is drawn.
 
     Note [Ids]
     ~~~~~~~~~~
@@ -40,27 +42,27 @@ class Gaussians:
     opacities: Tensor
     colors: Tensor
     ids: Tensor
+    sampling_intervals: Tensor | None = None
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def detached(self) -> "Gaussians":
         """The same Gaussians without a gradient graph."""
-        return Gaussians(**{f.name: getattr(self, f.name).detach() for f in fields(self)})
+        return Gaussians(**{name: value.detach() for name, value in self.columns().items()})
+
+    def columns(self) -> dict[str, Tensor]:
+        """The tensors by name, without intervals if there are none."""
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
 
     def select(self, rows: Tensor) -> "Gaussians":
         """The rows of a mask ``[N]`` or of indices ``[n]``."""
         rows = row_indices(rows)
-        return Gaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        return Gaussians(**{name: value[rows] for name, value in self.columns().items()})
 
 
 def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
-    """The rows of ``first``, then those of ``second``."""
-    return Gaussians(
-        means=torch.cat([first.means, second.means]),
-        quats=torch.cat([first.quats, second.quats]),
-        scales=torch.cat([first.scales, second.scales]),
-        opacities=torch.cat([first.opacities, second.opacities]),
-        colors=torch.cat([first.colors, second.colors]),
-        ids=torch.cat([first.ids, second.ids]),
-    )
+    """The rows of ``first``, then those of ``second``; both have sampling intervals, or neither."""
+    ones, others = first.columns(), second.columns()
+    assert ones.keys() == others.keys(), (sorted(ones), sorted(others))
+    return Gaussians(**{name: torch.cat([value, others[name]]) for name, value in ones.items()})

@@ -134,7 +134,9 @@ class CompactCodec(SceneCodec):
         if scene.environment is not None:
             init_steps["environment"] = float32(self.config.environment.step)
         rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
-        return scene_of(rounded, distance_input=scene.distance_input), QuantizationSteps(steps, init_steps)
+        return scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling), QuantizationSteps(
+            steps, init_steps
+        )
 
 
 def scene_codec(config: StreamConfig) -> SceneCodec:

@@ -55,6 +55,7 @@ def test_resume_goes_on_live(tmp_path: Path) -> None:
     ("options", "said"),
     [
         (["--start", "3"], "--start chooses from a recording"),
+        (["--every", "2"], "--every chooses from a recording"),
         (["--frames", "0"], "--frames must be at least 1"),
         (["--queue-gigabytes", "0"], "needs room"),
         (["--held-out", "zz"], "zz"),

@@ -14,6 +14,7 @@ from structgstream.cli.options import (
     resolve_config,
 )
 from structgstream.data.clip import bundled_clip_path
+from structgstream.errors import ConfigError
 from structgstream.presets import DEFAULT_PRESET, PRESETS
 
 
@@ -23,13 +24,21 @@ def test_no_option_is_the_whole_capture() -> None:
 
 def test_options_of_a_capture_choose_its_part() -> None:
     arguments = ["--held-out", "cam01", "cam02", "--scale", "0.25", "--start", "3", "--frames", "4", "--near", "0.5"]
+    arguments += ["--every", "2"]
     options = parse_options(CaptureOptions, "reconstruct", arguments=arguments)
-    assert options == CaptureOptions(("cam01", "cam02"), 0.25, 3, 4, 0.5)
+    assert options == CaptureOptions(("cam01", "cam02"), 0.25, 3, 4, 2, 0.5)
     source = open_selected_capture(Path(bundled_clip_path()), options)
-    assert len(source) == 4
+    assert (len(source), source.fps) == (4, 15.0)
     assert source.rig.testing == ("cam01", "cam02")
     camera = source.rig["cam00"]
     assert (camera.width, camera.height, camera.near) == (80, 60, 0.5)
+
+
+@pytest.mark.parametrize("step", ["0", "-2"])
+def test_a_step_below_one_is_refused(step: str) -> None:
+    options = parse_options(CaptureOptions, "reconstruct", arguments=["--every", step])
+    with pytest.raises(ConfigError, match=f"--every.* at least 1, got {step}"):
+        open_selected_capture(Path(bundled_clip_path()), options)
 
 
 def test_the_camera_best_surrounded_is_held_out_on_request() -> None:

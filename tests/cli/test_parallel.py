@@ -7,7 +7,8 @@ import pytest
 
 from quick_streams import CLIP, QUARTER, error_of
 from structgstream.cli import main
-from structgstream.cli.parallel import WorkerOptions, join_words
+from structgstream.cli.options import CaptureOptions
+from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_words
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
 
@@ -62,6 +63,12 @@ def test_wrong_options_are_told(
 ) -> None:
     assert said in error_of(["parallel", CLIP, "-o", str(tmp_path / "out.sgs"), *words], capsys, status=status)
     assert not (tmp_path / "out.sgs").exists()
+
+
+def test_frame_zero_is_fitted_to_the_part_that_was_chosen() -> None:
+    chosen = CaptureOptions(scale=0.5, start=3, every=2)
+    unit = _job(Parallel(Path("capture"), Path("out.sgs"), capture=chosen), []).unit
+    assert unit.header == ("--start", "3", "--every", "2", "--scale", "0.5")
 
 
 def test_an_output_that_is_no_parallel_run_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

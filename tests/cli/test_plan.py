@@ -91,12 +91,14 @@ def test_a_probe_is_a_short_run_with_the_same_options(
 
     monkeypatch.setattr(app, "main", command)
     words = ["-o", str(tmp_path / "probe"), "--preset", "tiny", "--held-out", "cam01", "--scale", "0.5"]
+    words += ["--every", "2"]
     assert real(["plan", CLIP, *words, "--online.iterations", "9"]) == 0
     capsys.readouterr()
     (asked,) = given
     assert asked[:4] == ["parallel", CLIP, "-o", str(tmp_path / "probe" / "probe.sgs")]
     text = " ".join(asked)
-    for part in (f"--frames {plan.PROBE_FRAMES}", "--preset tiny", "--held-out cam01", "--scale 0.5", "--workers 1"):
+    same = ("--preset tiny", "--held-out cam01", "--scale 0.5", "--every 2")
+    for part in (f"--frames {plan.PROBE_FRAMES}", *same, "--workers 1"):
         assert part in text
     assert text.endswith("--online.iterations 9")
 

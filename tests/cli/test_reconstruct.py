@@ -6,11 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import CLIP, QUICK, SMALL, error_of
+from backends import QUICKEST
+from quick_streams import CLIP, QUARTER, QUICK, SMALL, error_of
 from structgstream import recorder
 from structgstream.cli import main
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
+from structgstream.data.open import open_capture
+from structgstream.evaluation.capture import capture_of
 from structgstream.session import FrameReport
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
@@ -80,6 +83,29 @@ def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
     assert len(path.with_suffix(".log.jsonl").read_text().splitlines()) == 3
 
 
+def test_every_second_frame_is_resumed_and_scored_against_the_same_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, whole = tmp_path / "half.sgs", tmp_path / "whole.sgs"
+    base = ["reconstruct", CLIP, *QUARTER, "--start", "1", "--every", "2"]
+    assert main([*base, "-o", str(path), "--frames", "2"]) == 0
+    for other in (["--every", "3"], ["--every", "1"]):
+        error = error_of([*base, *other, "-o", str(path), "--frames", "3", "--resume"], capsys, status=1)
+        assert "every, fps differ" in error
+    assert main([*base, "-o", str(path), "--frames", "3", "--resume"]) == 0
+    assert main([*base, "-o", str(whole), "--frames", "3"]) == 0
+    assert path.read_bytes() == whole.read_bytes()
+    with open_stream(path) as reader:
+        assert reader.header.fps == 15.0
+        assert [info.index for info in reader.packets] == [0, 1, 2]
+        assert [info.pts_seconds for info in reader.packets] == pytest.approx([0, 1 / 15, 2 / 15])
+        found = capture_of(reader.header, CLIP, frames=3)
+    filmed = [frame.images["cam00"] for frame in open_capture(CLIP, scale=0.25).frames()]
+    for frame, number in zip(found.frames(), (1, 3, 5), strict=True):
+        assert (frame.images["cam00"] == filmed[number]).all()
+    assert main(["evaluate", str(path), CLIP, "--metrics", "basic", "--device", QUICKEST]) == 0
+
+
 @pytest.mark.parametrize(
     ("extra", "status", "words"),
     [
@@ -92,6 +118,8 @@ def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
         (["--preset", "tiny", "--held-out", "cam77"], 1, "cam77"),
         (["--preset", "tiny", "--scale", "3"], 1, "(0, 1]"),
         (["--preset", "tiny", "--start", "12"], 1, "12 frames"),
+        (["--preset", "tiny", "--every", "0"], 1, "(--every) must be at least 1, got 0"),
+        (["--preset", "tiny", "--every", "2", "--frames", "7"], 1, "has 12 frames; got start 0 and 7 frames, counting"),
         (["--preset", "rig", "--quality", "1"], 2, "--quality is for streams with the codec compact; the preset 'rig'"),
         (
             ["--preset", "motion", "--mbits", "5"],

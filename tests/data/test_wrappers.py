@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from captures import all_numbers, numbers, write_clip, write_panoptic
+from structgstream.data.images import ImageSource
 from structgstream.data.json_videos import open_json_videos
 from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import (
+    SourceWrapper,
     WithoutPoints,
     WithRig,
     apart_seconds,
@@ -113,11 +115,12 @@ def test_a_source_of_another_kind_keeps_its_cameras(source: FrameSource) -> None
     assert select_cameras(other, (*source.rig,)[:2]) is other
 
 
-def test_every_third_frame_counts_and_times_from_zero(source: FrameSource) -> None:
+def test_every_third_frame_counts_from_zero_and_keeps_the_time(source: FrameSource) -> None:
     few = every_nth_frame(source, 3)
-    assert len(few) == 2
+    assert (len(few), few.fps) == (2, source.fps / 3)
     assert all_numbers(few.frames()) == [all_numbers(source.frames())[i] for i in (0, 3)]
-    assert [(frame.index, frame.pts_seconds) for frame in few.frames()] == [(0, 0.0), (1, 1 / source.fps)]
+    assert [frame.index for frame in few.frames()] == [0, 1]
+    assert [frame.pts_seconds for frame in few.frames()] == pytest.approx([0.0, 3 / source.fps])
     assert [frame.index for frame in few.frames(1)] == [1]
     assert all_numbers(few.frames(1)) == [all_numbers(source.frames())[3]]
     assert list(few.frames(2)) == []
@@ -131,6 +134,41 @@ def test_steps_of_a_thinned_capture(source: FrameSource) -> None:
     for step in (0, -1):
         with pytest.raises(ConfigError, match="at least 1, got"):
             every_nth_frame(source, step)
+
+
+def test_frames_that_stand_for_all_keep_the_rate(source: FrameSource) -> None:
+    few = every_nth_frame(source, 3, rate=source.fps)
+    assert few.fps == source.fps
+    assert [frame.pts_seconds for frame in few.frames()] == pytest.approx([0.0, 1 / source.fps])
+
+
+def test_a_thinned_section_begins_at_the_start_and_counts_what_is_used(source: FrameSource) -> None:
+    taken = {
+        (1, None, 2): (1, 3, 5), (1, 2, 2): (1, 3), (2, 1, 3): (2,), (0, None, 4): (0, 4), (5, None, 2): (5,),
+    }  # fmt: skip
+    whole = all_numbers(source.frames())
+    for (start, frames, every), expected in taken.items():
+        part = section(source, start=start, frames=frames, every=every)
+        assert all_numbers(part.frames()) == [whole[i] for i in expected]
+        assert part.fps == source.fps / every
+    part = section(source, start=1, frames=1, every=2)
+    assert isinstance(part, SourceWrapper)
+    assert all_numbers(part.frames_behind()) == [whole[3], whole[5]]  # what a look ahead may see has the same step
+    for start, frames, every in ((0, 4, 2), (6, None, 2), (-1, 1, 2), (0, 0, 3)):
+        with pytest.raises(CaptureError, match=f"has 6 frames; .*1 in {every}"):
+            section(source, start=start, frames=frames, every=every)
+
+
+@pytest.mark.parametrize("source", ["pictures"], indirect=True)
+def test_pictures_between_are_not_opened(source: FrameSource) -> None:
+    assert isinstance(source, ImageSource)
+    for name in source.rig:
+        between = source.files[name][1]
+        assert between is not None
+        between.write_bytes(b"broken")
+    assert len(list(section(source, every=2).frames())) == 3
+    with pytest.raises(CaptureError, match="cannot be decoded"):
+        list(source.frames())
 
 
 def test_times_of_pictures_are_those_of_the_source_below(tmp_path: Path) -> None:

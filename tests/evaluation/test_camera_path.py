@@ -7,7 +7,7 @@ import torch
 from rigs import arc_rig, look_at
 from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import ConfigError
-from structgstream.evaluation.camera_path import arc, central_camera, focus_point, looking, orbit
+from structgstream.evaluation.camera_path import arc, central_camera, focus_point, free_near, looking, orbit
 
 
 def forward_rig() -> CameraRig:
@@ -76,7 +76,19 @@ def test_an_arc_without_ends_takes_training_cameras_well_apart() -> None:
 
 
 def test_looking_gives_the_rotation_of_the_tests_own_camera() -> None:
-    camera = arc_rig(4)["cam02"]
+    rig = arc_rig(4)
+    camera = rig["cam02"]
     eye, target = torch.tensor([1.0, -2.0, -3.0]).double(), torch.tensor([0.1, 0.2, 0.3]).double()
     down = torch.tensor([0.0, 1.0, 0.0]).double()
-    torch.testing.assert_close(looking(camera, eye, target, down).viewmat, look_at(eye, target))
+    torch.testing.assert_close(looking(camera, eye, target, down, rig).viewmat, look_at(eye, target))
+
+
+def test_a_free_camera_cuts_nothing_that_the_rig_shows() -> None:
+    rig = arc_rig(4)
+    camera = rig["cam02"]
+    forward = camera.viewmat[2, :3]
+    assert free_near(rig, camera.center) == camera.near
+    # From a little ahead, what lies just beyond the camera's near plane is still drawn.
+    assert free_near(rig, camera.center + 0.04 * forward) == pytest.approx(camera.near - 0.04)
+    for distance in (0.2, 1.0, 2.9):
+        assert free_near(rig, camera.center + distance * forward) == pytest.approx(0.01 * camera.near)

@@ -24,6 +24,16 @@ def test_start_frames_and_scale_are_those_of_the_stream(frames: int | None, expe
     assert (first.images["cam01"] == wanted.images["cam01"]).all()
 
 
+@pytest.mark.parametrize(("frames", "expected"), [(2, 2), (99, 4), (None, 4)])
+def test_every_third_frame_is_found_again(frames: int | None, expected: int) -> None:
+    made_from = open_capture(bundled_clip_path(), start=1, scale=0.25, every=3)
+    header = replace(header_for(small_scene()), rig=made_from.rig, metadata={"start": 1, "every": 3})
+    found = capture_of(header, bundled_clip_path(), frames=frames)
+    assert (len(found), found.fps) == (expected, made_from.fps)
+    for one, wanted in zip(found.frames(), made_from.frames(), strict=False):
+        assert (one.images["cam01"] == wanted.images["cam01"]).all()
+
+
 def test_a_capture_that_ends_before_the_stream_begins_is_told() -> None:
     header = replace(header_for(small_scene()), metadata={"start": 12})
     with pytest.raises(CaptureError, match="12 frames"):

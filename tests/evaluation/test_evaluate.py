@@ -19,7 +19,7 @@ from structgstream.data.images import ImageSource
 from structgstream.data.wrappers import section
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.evaluate import compared_frames, evaluate
-from structgstream.evaluation.facts import start_of
+from structgstream.evaluation.facts import numbers_of
 from structgstream.evaluation.flow import FlowField
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
@@ -355,12 +355,23 @@ def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     reader.header = replace(reader.header, metadata={"start": 2})
     whole: Any = MemoryCapture(world.rig, world.frames * 2)
-    assert start_of(whole) is None
-    assert start_of(section(whole, start=1)) is None
+    assert numbers_of(whole) is None
+    assert numbers_of(section(whole, start=1)) is None
     pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 8 for name in world.rig})
-    assert [start_of(pictures), start_of(section(section(pictures, start=1), start=1, frames=4))] == [0, 2]
+    assert numbers_of(pictures) == range(8)
+    assert numbers_of(section(section(pictures, start=1), start=1, frames=4)) == range(2, 6)
+    assert numbers_of(section(section(pictures, start=1, every=2), start=1, frames=2)) == range(3, 7, 2)
     with pytest.raises(CaptureError, match="begins at frame 2 .* at frame 1.*start=2"):
         run(reader, section(pictures, start=1))
+
+
+def test_a_part_of_another_step_is_refused(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 16 for name in world.rig})
+    for stated, step in (({}, 2), ({"every": 2}, 1), ({"every": 2}, 3)):
+        reader.header = replace(reader.header, metadata={"start": 1, **stated})
+        with pytest.raises(CaptureError, match=rf"1 in {stated.get('every', 1)} frames .* 1 in {step}; .*every="):
+            run(reader, section(pictures, start=1, every=step))
 
 
 @dataclass

@@ -18,8 +18,8 @@ from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.facts import (
     check_same_frames,
     check_same_rig,
+    numbers_of,
     scored_cameras,
-    start_of,
     stream_facts,
     training_facts,
 )
@@ -117,7 +117,7 @@ def test_a_capture_that_is_too_short_or_begins_elsewhere_is_told() -> None:
         check_same_frames(recording([*four, {}]), source)
     late = recording(four, replace(HEADER, metadata={"start": 7}))
     check_same_frames(late, source)
-    assert start_of(source) is start_of(section(source, start=2, frames=2)) is None
+    assert numbers_of(source) is numbers_of(section(source, start=2, frames=2)) is None
 
 
 def test_sizes_and_rates_by_hand() -> None:

@@ -125,7 +125,7 @@ def test_a_picture_is_drawn_onto_in_its_own_memory_and_nothing_else_changes(buil
     gaussians = random_scene(40).gaussians(camera, backend)
     colors = gaussians.colors.detach().clone().requires_grad_()
     given = replace(gaussians, colors=colors)
-    before = {f.name: getattr(given, f.name).clone() for f in fields(given)}
+    before = {name: value.clone() for name, value in given.columns().items()}
     picture = torch.rand(camera.height, camera.width, 3)
     was, inside = picture.clone(), tiles.pixels()
     output = backend.rasterize(given, camera.viewport(gaussians.means), tiles=tiles, onto=picture)

@@ -52,18 +52,25 @@ def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
     )
 
 
-def run(rasterize, inputs: tuple[Tensor, ...], *, background: Tensor | None = None, device: str = "cpu"):
+def run(
+    rasterize,
+    inputs: tuple[Tensor, ...],
+    *,
+    background: Tensor | None = None,
+    device: str = "cpu",
+    intervals: Tensor | None = None,
+):
     """Image, alpha and the gradients for fixed cotangents."""
     dtype = inputs[0].dtype
     leaves = [value.to(device).clone().requires_grad_() for value in inputs]
     output = rasterize(
-        splats_of(*leaves[:5]),
+        splats_of(*leaves[:5], None if intervals is None else intervals.to(device, dtype)),
         camera(dtype, device),
         screen_offsets=leaves[5],
         background=None if background is None else background.to(device, dtype),
     )
     g = torch.Generator().manual_seed(11)
-    away = safe_pixels(inputs)
+    away = safe_pixels(inputs, intervals)
     v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * away[..., None]
     v_alpha = torch.randn(HEIGHT, WIDTH, generator=g, dtype=torch.float64) * away
     total = (output.image * v_image.to(device, dtype)).sum() + (output.alpha * v_alpha.to(device, dtype)).sum()
@@ -71,7 +78,7 @@ def run(rasterize, inputs: tuple[Tensor, ...], *, background: Tensor | None = No
     return output.image.detach().cpu(), output.alpha.detach().cpu(), [x.cpu() for x in gradients], output.radii.cpu()
 
 
-def safe_pixels(inputs: tuple[Tensor, ...]) -> Tensor:
+def safe_pixels(inputs: tuple[Tensor, ...], intervals: Tensor | None = None) -> Tensor:
     """Mask ``[H, W]``: pixels that do not change when the definition's limits move by a little."""
     values = [value.double() for value in inputs]
     pictures = []
@@ -81,10 +88,10 @@ def safe_pixels(inputs: tuple[Tensor, ...]) -> Tensor:
             reference_raster.MIN_ALPHA = saved[0] * factor
             reference_raster.MAX_ALPHA = 1 - (1 - saved[1]) * factor
             reference_raster.MIN_TRANSMITTANCE = saved[2] * factor
-            pictures.append(reference(splats_of(*values[:5]), camera()).image)
+            pictures.append(reference(splats_of(*values[:5], intervals), camera()).image)
         for factor in (1 - 1e-3, 1 + 1e-3):  # Stopping there shows in which pixels something begins to be faint.
             reference_raster.MIN_TRANSMITTANCE = reference_raster.MIN_GRADIENT_TRANSMITTANCE * factor
-            pictures.append(reference(splats_of(*values[:5]), camera()).image)
+            pictures.append(reference(splats_of(*values[:5], intervals), camera()).image)
     finally:
         reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE = saved
     apart = [(pictures[n] - pictures[n + 1]).abs().amax(-1) for n in (0, 2)]
@@ -98,13 +105,15 @@ def relative_errors(got: Tensor, truth: Tensor) -> Tensor:
     return (got - truth).norm(dim=1) / (size + 1e-3 * size.median() + 1e-12)
 
 
-def check_against_reference(rasterize, exact, *, background: Tensor | None, device: str = "cpu") -> None:
+def check_against_reference(
+    rasterize, exact, *, background: Tensor | None, device: str = "cpu", intervals: Tensor | None = None
+) -> None:
     inputs = gaussians()
-    away = safe_pixels(inputs).bool()
+    away = safe_pixels(inputs, intervals).bool()
     assert away.float().mean() > 0.5
-    image, alpha, gradients, radii = run(exact, inputs, background=background)
+    image, alpha, gradients, radii = run(exact, inputs, background=background, intervals=intervals)
     image32, alpha32, gradients32, radii32 = run(
-        rasterize, tuple(v.float() for v in inputs), background=background, device=device
+        rasterize, tuple(v.float() for v in inputs), background=background, device=device, intervals=intervals
     )
     # Float32 sums of some tens of terms of size one: 1e-5 is 80 units in the last place.
     assert (image32 - image).abs()[away].max() < 1e-5
@@ -112,7 +121,7 @@ def check_against_reference(rasterize, exact, *, background: Tensor | None, devi
     # A box may miss the picture by a rounding; gsplat's are whole pixels, so that more of them reach it.
     assert ((radii32 > 0) | (radii == 0)).float().mean() > 0.99
     assert ((radii32 > 0) == (radii > 0)).float().mean() > (0.99 if device == "cpu" else 0.95)
-    _, _, torch32, _ = run(exact, tuple(v.float() for v in inputs), background=background)
+    _, _, torch32, _ = run(exact, tuple(v.float() for v in inputs), background=background, intervals=intervals)
     for name, got, single, truth in zip(NAMES, gradients32, torch32, gradients):
         errors, autograd = relative_errors(got, truth), relative_errors(single, truth)
         # As good as torch's own float32 autograd on the same input, give or take the order of its sums.
@@ -124,6 +133,35 @@ def check_against_reference(rasterize, exact, *, background: Tensor | None, devi
 @pytest.mark.parametrize("background", [None, torch.tensor([0.3, 0.6, 0.1])], ids=["black", "coloured"])
 def test_cpu(isa: int, background: Tensor | None) -> None:
     check_against_reference(cpu_raster.rasterize, reference, background=background)
+
+
+def intervals_at(share: float) -> Tensor:
+    """Training pixels of ``share`` of this picture's pixels at each of the Gaussians, give or take a third."""
+    view = camera()
+    depths = gaussians()[0] @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    around = torch.linspace(0.7, 1.3, len(depths), dtype=torch.float64)
+    return share * around * depths / (view.K[0, 0] * view.K[1, 1]).sqrt()
+
+
+@native
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 3.0])
+def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float) -> None:
+    """Pictures without training pixels, much smaller than the training pictures, as large, and three times as large."""
+    background = torch.tensor([0.3, 0.6, 0.1])
+    intervals = intervals_at(share)
+    check_against_reference(cpu_raster.rasterize, reference, background=background, intervals=intervals)
+    plain, filtered = (
+        cpu_raster.rasterize(splats_of(*(v.float() for v in gaussians()[:5]), given), camera(torch.float32)).image
+        for given in (None, intervals.float())
+    )
+    assert (plain - filtered).abs().max() > 0.01
+
+
+@pytest.mark.needs_cuda
+@pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
+def test_the_low_pass_of_the_training_pictures_on_a_gpu(share: float) -> None:
+    everything = partial(reference, least_transmittance=0.0)
+    check_against_reference(cuda.rasterize, everything, background=None, device="cuda", intervals=intervals_at(share))
 
 
 @native

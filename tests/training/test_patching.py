@@ -32,7 +32,7 @@ def parents(count: int) -> Gaussians:
         colors=torch.tensor([[0.1, 0.2, 0.3]]),
         ids=torch.tensor([0]),
     )
-    return Gaussians(**{name: getattr(one, name).expand(count, *getattr(one, name).shape[1:]) for name in vars(one)})
+    return Gaussians(**{name: value.expand(count, *value.shape[1:]) for name, value in one.columns().items()})
 
 
 def test_children_are_drawn_from_two_sigma() -> None:

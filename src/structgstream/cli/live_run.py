@@ -83,6 +83,8 @@ def open_live(
 
     if capture.start:
         raise UsageError("--start chooses from a recording; live cameras begin now.")
+    if capture.every != 1:
+        raise UsageError("--every chooses from a recording; of live cameras, fps in the rig file sets the rate.")
     if capture.frames is not None and capture.frames < 1:
         raise UsageError(f"--frames must be at least 1, got {capture.frames}.")
     options = LiveOptions(

@@ -36,6 +36,8 @@ class CaptureOptions:
     """First frame to use."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Use every N-th frame, from the first; the frames a second are divided by N."""
     near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 rig radii."""
 
@@ -87,4 +89,5 @@ def open_selected_capture(scene: Path, options: CaptureOptions) -> "FrameSource"
         start=options.start,
         frames=options.frames,
         near=options.near,
+        every=options.every,
     )

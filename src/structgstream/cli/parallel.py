@@ -165,6 +165,7 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     capture = options.capture
     header = [*_words("preset", options.preset), *_words("quality", options.quality), *_words("seed", options.seed)]
     header += [*_words("start", capture.start or None), *_words("near", capture.near)]
+    header += _words("every", None if capture.every == 1 else capture.every)
     header += _words("scale", None if capture.scale == 1.0 else capture.scale)
     header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
     track = [

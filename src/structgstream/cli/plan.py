@@ -106,7 +106,7 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     words += ["--groups", str(PROBE_GROUP), "--odd", "--workers", "1", "--device", options.device]
     words += [] if options.preset is None else ["--preset", options.preset]
     words += [] if capture.held_out is None else ["--held-out", *capture.held_out]
-    words += ["--scale", str(capture.scale), "--start", str(capture.start)]
+    words += ["--scale", str(capture.scale), "--start", str(capture.start), "--every", str(capture.every)]
     words += [] if capture.near is None else ["--near", str(capture.near)]
     console.print(f"Probe: frame 0 and {PROBE_FRAMES - 1} frames, on one worker.", highlight=False)
     if status := command([*words, *rest]):

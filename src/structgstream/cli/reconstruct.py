@@ -173,6 +173,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         UsageError: options that contradict each other.
         StructGStreamError: it cannot be read, or the back-end is not available.
     """
+    from structgstream.evaluation.capture import part_metadata
     from structgstream.kernels.backend import select_backend
     from structgstream.presets import departures
 
@@ -198,7 +199,8 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     )
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
-    metadata = {"preset": preset, "start": options.capture.start, "scale": options.capture.scale}
+    part = part_metadata(start=options.capture.start, scale=options.capture.scale, every=options.capture.every)
+    metadata = {"preset": preset, **part}
     return OpenedScene(source, captured, backend, metadata)
 
 

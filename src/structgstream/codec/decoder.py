@@ -11,6 +11,7 @@ from structgstream.codec.packets import Packet, StreamHeader
 from structgstream.codec.scene.compact import CompactDecoder, CompactState
 from structgstream.codec.scene.shapes import check_shapes
 from structgstream.errors import StreamError
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, scene_of
 
@@ -26,6 +27,7 @@ class SceneDecoder:
 
     def __init__(self, header: StreamHeader) -> None:
         self._header = header
+        self._sampling = RigSampling.of(header.similarity.rig(header.rig))
         self._compact = None if header.codec == "raw" else CompactDecoder(header)
 
     @property
@@ -52,7 +54,7 @@ class SceneDecoder:
         check_shapes(
             fields, distance_input=header.distance_input, training_cameras=len(header.rig.training), where=where
         )
-        return scene_of(fields, distance_input=header.distance_input)
+        return scene_of(fields, distance_input=header.distance_input, sampling=self._sampling)
 
 
 def _check_fields(names: Set[FieldName], header: StreamHeader, where: str) -> None:

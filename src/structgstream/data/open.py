@@ -55,6 +55,7 @@ def open_capture(
     start: int = 0,
     frames: int | None = None,
     near: float | None = None,
+    every: int = 1,
 ) -> FrameSource:
     """Opens the capture in a folder, recognising its layout.
 
@@ -64,8 +65,9 @@ def open_capture(
             one best surrounded by others (:func:`~structgstream.data.held_out.best_surrounded`).
         scale: size of the pictures relative to the stored ones, in (0, 1].
         start: first frame to use.
-        frames: number of frames, None for all.
+        frames: number of frames to use, None for all.
         near: near plane in capture units; None for the capture's own, else 0.12 rig radii.
+        every: step from one frame that is used to the next; the rate is divided by it.
 
     Raises:
         CaptureError: the folder is missing, empty or of an unknown layout, or its content is broken.
@@ -75,7 +77,7 @@ def open_capture(
     sized = selected(source, held_out=held_out, scale=scale, near=near)
     if recognizes_prepared(Path(path)) and not sized.rig.held_out <= source.rig.held_out:
         sized = WithoutPoints(sized)  # its points come from pictures of a camera that is held out now
-    return section(sized, start=start, frames=frames)
+    return section(sized, start=start, frames=frames, every=every)
 
 
 def selected(

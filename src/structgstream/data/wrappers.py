@@ -102,6 +102,13 @@ def unwrapped(source: FrameSource) -> FrameSource:
     return source
 
 
+def innermost(source: FrameSource) -> FrameSource:
+    """The capture below all wrappers."""
+    while isinstance(source, SourceWrapper):
+        source = source.source
+    return source
+
+
 def apart_seconds(source: FrameSource) -> Mapping[str, NDArray[np.float64]]:
     """Camera name to how long after its instant its picture of each frame was taken, ``[N]`` by its own time stamps;
     NaN where it has none; empty where that is not known, as for pictures without times."""
@@ -166,19 +173,25 @@ def resized_to(source: FrameSource, rig: CameraRig) -> FrameSource:
     return source.resized(rig) if isinstance(source, Resizable) else Resized(source, rig)
 
 
-def section(source: FrameSource, *, start: int = 0, frames: int | None = None) -> FrameSource:
-    """``frames`` frames (None: all) of the capture from its frame ``start``.
+def section(source: FrameSource, *, start: int = 0, frames: int | None = None, every: int = 1) -> FrameSource:
+    """``frames`` frames (None: all) of the capture: its frames ``start``, ``start + every``, and so on.
 
     Raises:
         CaptureError: the capture does not have these frames.
+        ConfigError: ``every`` is less than 1.
     """
-    available = len(source) - start
+    check_step(every)
+    available = -(-(len(source) - start) // every)
     length = available if frames is None else frames
     if start < 0 or length < 1 or length > available:
+        counted = "" if every == 1 else f", counting 1 in {every}"
         raise CaptureError(
             f"The capture {source.name} has {len(source)} frames; got start {start} and "
-            f"{'all' if frames is None else frames} frames. Choose a range inside the capture."
+            f"{'all' if frames is None else frames} frames{counted}. Choose a range inside the capture."
         )
+    if every != 1 and start:
+        source, start = Section(source, start, len(source) - start), 0
+    source = every_nth_frame(source, every)
     return source if (start, length) == (0, len(source)) else Section(source, start, length)
 
 
@@ -199,26 +212,53 @@ def select_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
 
 @dataclass(frozen=True)
 class EveryNthFrame(SourceWrapper):
-    """Every ``step``-th frame, counted and timed from 0 as if they followed each other."""
+    """Every ``step``-th frame, counted from 0.
+
+    Args:
+        source: the recording.
+        step: from one frame that is used to the next.
+        rate: frames a second; None for a ``step``-th of the source's, so that the time stays.
+    """
 
     step: int
+    rate: float | None = None
+
+    @property
+    def fps(self) -> float:
+        return self.source.fps / self.step if self.rate is None else self.rate
 
     def __len__(self) -> int:
         return -(-len(self.source) // self.step)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        for index in range(start, len(self)):
-            # Seeking to each frame lets the source skip those between without decoding.
-            frame = next(self.source.frames(index * self.step))
+        wanted = range(start * self.step, len(self.source), self.step)
+        for index, frame in enumerate(self._read(wanted), start):
             yield replace(frame, index=index, pts_seconds=index / self.fps)
 
+    def _read(self, wanted: range) -> Iterator[MultiViewFrame]:
+        """The source's frames of these numbers."""
+        if isinstance(innermost(self.source), ImageSource):
+            for number in wanted:  # files of those between need not be opened
+                yield from islice(self.source.frames(number), 1)
+        elif wanted:  # a seek in a video decodes from its key frame on, which is mostly farther back
+            yield from islice(self.source.frames(wanted.start), 0, wanted[-1] - wanted.start + 1, self.step)
 
-def every_nth_frame(source: FrameSource, step: int) -> FrameSource:
-    """Every ``step``-th frame of the capture, from the first.
+
+def every_nth_frame(source: FrameSource, step: int, *, rate: float | None = None) -> FrameSource:
+    """Every ``step``-th frame of the capture, from the first; ``rate`` as of :class:`EveryNthFrame`.
 
     Raises:
         ConfigError: ``step`` is less than 1.
     """
+    check_step(step)
+    return source if step == 1 else EveryNthFrame(source, step, rate)
+
+
+def check_step(step: int) -> None:
+    """Check the step from one frame that is used to the next.
+
+    Raises:
+        ConfigError: it is less than 1.
+    """
     if step < 1:
-        raise ConfigError(f"The step between frames must be at least 1, got {step}.")
-    return source if step == 1 else EveryNthFrame(source, step)
+        raise ConfigError(f"The step between frames (--every) must be at least 1, got {step}; 1 uses each frame.")

@@ -13,6 +13,8 @@ from structgstream.errors import ConfigError
 ORBIT_SHARE = 0.5  # of the distance to the nearest cameras: further out, surfaces were seen from one side only
 NEIGHBOURS = 3
 ARC_HALF_ANGLE = math.radians(50.0)
+LEAST_NEAR_SHARE = 0.01
+"""A free camera's near plane is at least this share of that of the nearest camera of the rig: what is nearer is a blur."""
 
 
 def focus_point(rig: CameraRig) -> Tensor:
@@ -57,7 +59,7 @@ def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Cam
     for index in range(frames):
         angle = 2.0 * math.pi * index / frames
         eye = camera.center + radius * (math.sin(angle) * right - 0.5 * math.cos(angle) * down)
-        path.append(looking(camera, eye, target, down))
+        path.append(looking(camera, eye, target, down, rig))
     return path
 
 
@@ -81,18 +83,29 @@ def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) 
     for index in range(frames):
         share = index / max(frames - 1, 1)
         length = (1.0 - share) * start.norm() + share * end.norm()
-        path.append(looking(first, focus + length * _between(start, end, share), focus, down))
+        path.append(looking(first, focus + length * _between(start, end, share), focus, down, rig))
     return path
 
 
-def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor) -> Camera:
+def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor, rig: CameraRig) -> Camera:
     """``camera`` moved to ``eye`` and turned to ``target``, upright as ``down`` says (all ``[3]``, world)."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return replace(camera, viewmat=viewmat)
+    return replace(camera, viewmat=viewmat, near=free_near(rig, eye))
+
+
+def free_near(rig: CameraRig, eye: Tensor) -> float:
+    """The near plane of a free camera at ``eye`` ``[3]``: nothing that the rig's cameras show is behind it.
+
+    The rig's cameras show nothing nearer to them than their own near plane, so around each there is a ball of that radius
+    that need not be drawn; it shrinks as the free camera leaves its nearest camera.
+    """
+    distances = (rig.centers - eye).norm(dim=1)
+    near = list(rig.cameras.values())[int(distances.argmin())].near
+    return max(near - float(distances.min()), LEAST_NEAR_SHARE * near)
 
 
 def central_camera(rig: CameraRig) -> str:

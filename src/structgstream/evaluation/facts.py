@@ -11,7 +11,7 @@ from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.source import FrameSource
 from structgstream.data.video import VideoSource
-from structgstream.data.wrappers import Section, SourceWrapper
+from structgstream.data.wrappers import EveryNthFrame, Section, SourceWrapper
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.recording import Recording
 from structgstream.evaluation.report import FrameScores
@@ -65,29 +65,37 @@ def check_same_frames(recording: Recording, source: FrameSource) -> None:
     """Check that the capture has the frames of the recording.
 
     Raises:
-        CaptureError: it has fewer, or both state their start frame, and differ.
+        CaptureError: it has fewer, or both state their start frame and step, and differ.
     """
     if len(source) < len(recording.packets):
         raise CaptureError(
             f"The stream has {len(recording.packets)} frames and this part of the capture {source.name} only "
             f"{len(source)}; evaluate it on the capture it was made from."
         )
-    theirs, ours = start_of(source), recording.header.metadata.get("start")
-    if theirs is not None and ours is not None and int(ours) != theirs:
+    theirs, metadata = numbers_of(source), recording.header.metadata
+    if theirs is None or metadata.get("start") is None:
+        return
+    start, every = int(metadata["start"]), int(metadata.get("every", 1))
+    if start != theirs.start:
         raise CaptureError(
-            f"The stream begins at frame {int(ours)} of its capture and this part of the capture {source.name} at "
-            f"frame {theirs}; open the capture with start={int(ours)}."
+            f"The stream begins at frame {start} of its capture and this part of the capture {source.name} at "
+            f"frame {theirs.start}; open the capture with start={start}."
+        )
+    if every != theirs.step:
+        raise CaptureError(
+            f"The stream has 1 in {every} frames of its capture and this part of the capture {source.name} 1 in "
+            f"{theirs.step}; open the capture with every={every}."
         )
 
 
-def start_of(source: FrameSource) -> int | None:
-    """Start frame of a source in its whole capture; None if the type of source does not state it."""
-    if isinstance(source, Section):
-        inner = start_of(source.source)
-        return None if inner is None else inner + source.first
-    if isinstance(source, SourceWrapper):
-        return start_of(source.source)
-    return 0 if isinstance(source, ImageSource | VideoSource) else None
+def numbers_of(source: FrameSource) -> range | None:
+    """Numbers of a source's frames in its whole capture; None if the type of source does not state them."""
+    if not isinstance(source, SourceWrapper):
+        return range(len(source)) if isinstance(source, ImageSource | VideoSource) else None
+    inner = numbers_of(source.source)
+    if inner is not None and isinstance(source, Section):
+        return inner[source.first : source.first + source.length]
+    return inner[:: source.step] if inner is not None and isinstance(source, EveryNthFrame) else inner
 
 
 def stream_facts(reader: Recording, names: tuple[str, ...]) -> dict[str, Any]:

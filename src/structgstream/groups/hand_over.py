@@ -108,7 +108,7 @@ class HandOver:
         state = state_of(found)
         for name, step in self._steps.items():
             state[name] = (_bins(state[name], step) + self._faded(name)) * step
-        return scene_of(state, distance_input=found.distance_input)
+        return scene_of(state, distance_input=found.distance_input, sampling=found.sampling)
 
     def _advance(self, found: Scene) -> None:
         moved = changed_movers(self._last, found)[: len(found.anchors)]

@@ -11,7 +11,7 @@ from structgstream.errors import BackendError
 from structgstream.kernels.prototypes import PROTOTYPES, declare
 
 _NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
-ABI_VERSION = 6
+ABI_VERSION = 7
 """As in csrc/include/structgstream.h, which states when it is incremented."""
 
 

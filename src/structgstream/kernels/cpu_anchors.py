@@ -148,7 +148,9 @@ def _check(tensors: Sequence[Tensor], mlps: MLPWeights, distance_input: bool) ->
             )
 
 
-def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
+def visible_anchors(
+    anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None = None
+) -> Tensor:
     """Indices ``[m]``, ascending, of the anchors in view, see ``kernels.reference_anchors.visible_anchors``.
 
     Raises:
@@ -165,11 +167,12 @@ def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection |
     native.offsets_per_anchor = anchors.offsets.shape[1]
     viewmat, K = (matrix.detach().float().contiguous() for matrix in (viewport.viewmat, viewport.K))
     mask = None if tiles is None else tiles.mask.contiguous()
+    sizes = None if intervals is None else intervals.detach().float().contiguous()
     found = torch.empty(count, dtype=torch.int64)
     seen = native_library().sgs_anchors_visible(
         ctypes.byref(native),
         count,
-        *addresses(viewmat, K),
+        *addresses(sizes, viewmat, K),
         viewport.width,
         viewport.height,
         viewport.near,
@@ -206,6 +209,7 @@ def generate_structured(
     distance_input: bool,
     tiles: TileSelection | None = None,
     seen_from: Tensor | None = None,
+    sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``.
 
@@ -215,6 +219,6 @@ def generate_structured(
         BackendError: a tensor of another precision, or inconsistent shapes.
         OutOfMemoryError: there is no memory for one byte per anchor.
     """
-    visible = visible_anchors(anchors, viewport, tiles)
+    visible = visible_anchors(anchors, viewport, tiles, sampling_intervals)
     center = viewport.center if seen_from is None else seen_from
     return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)

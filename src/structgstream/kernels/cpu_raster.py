@@ -35,6 +35,7 @@ class _View:
     background: Tensor | None
     tiles: Tensor | None
     trained: int
+    intervals: Tensor | None
 
     def arguments(self) -> list[int | float | None]:
         """The camera's arguments in the order of the C++ functions."""
@@ -44,6 +45,10 @@ class _View:
 
 def _constant(tensor: Tensor) -> Tensor:
     return tensor.detach().float().contiguous()
+
+
+def _intervals(gaussians: Gaussians) -> Tensor | None:
+    return None if gaussians.sampling_intervals is None else _constant(gaussians.sampling_intervals)
 
 
 def _in_float32(viewport: Viewport) -> Viewport:
@@ -68,7 +73,7 @@ class _Rasterize(torch.autograd.Function):
                 count,
                 *addresses(*gaussians),
                 *view.arguments(),
-                *addresses(view.background, screen_offsets, view.tiles),
+                *addresses(view.background, screen_offsets, view.intervals, view.tiles),
                 view.trained,
                 *addresses(image, alpha, radii),
                 torch.get_num_threads(),
@@ -142,6 +147,7 @@ def rasterize(
         None if background is None else _constant(background),
         None if tiles is None else tiles.mask.contiguous(),
         n if trained is None else trained,
+        _intervals(gaussians),
     )
     offsets = None if screen_offsets is None else screen_offsets.contiguous()
     image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
@@ -180,13 +186,15 @@ def _weights(
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
     assert (width, height) == (viewport.width, viewport.height), maps.shape
-    view = _View(_in_float32(viewport), None if background is None else _constant(background), None, 0)
+    view = _View(
+        _in_float32(viewport), None if background is None else _constant(background), None, 0, _intervals(gaussians)
+    )
     weights = torch.empty(len(gaussians), channels)
     failed = native_library().sgs_raster_weights(
         len(gaussians),
         *addresses(*tensors, colors),
         *view.arguments(),
-        *addresses(view.background, maps),
+        *addresses(view.background, view.intervals, maps),
         channels,
         *addresses(weights, image),
         torch.get_num_threads(),

@@ -18,7 +18,12 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget, radii_reaching_tiles, tile_lists, tile_lists_in_kernels
 from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection, tile_grid
-from structgstream.kernels.reference_raster import boxes_reaching_tiles, restrict_to_tiles
+from structgstream.kernels.reference_raster import (
+    LOW_PASS_PIXELS,
+    boxes_reaching_tiles,
+    restrict_to_tiles,
+    screen_low_pass,
+)
 
 
 def cuda_reason() -> str | None:
@@ -54,6 +59,9 @@ def rasterize(
 
     gaussians, screen_offsets = _with_trained_rows(gaussians, screen_offsets, trained)
     radii, means2d, depths, conics = _projected(gaussians, viewport)
+    opacities = gaussians.opacities
+    if gaussians.sampling_intervals is not None:
+        radii, conics, opacities = _filtered(radii, depths, conics, gaussians, viewport)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[None]
     starts, ids, masks = _pair_lists(means2d, radii, depths, viewport, tiles, budget, library)
@@ -61,7 +69,7 @@ def rasterize(
         means2d,
         conics,
         gaussians.colors[None],
-        gaussians.opacities[None],
+        opacities[None],
         viewport.width,
         viewport.height,
         TILE_PIXELS,
@@ -128,12 +136,40 @@ def _projected(gaussians: Gaussians, viewport: Viewport) -> tuple[Tensor, Tensor
         viewport.K[None],
         viewport.width,
         viewport.height,
-        eps2d=0.3,
+        eps2d=LOW_PASS_PIXELS,
         near_plane=viewport.near,
         packed=False,
         opacities=gaussians.opacities,
     )
     return radii, means2d, depths, conics
+
+
+def _filtered(
+    radii: Tensor, depths: Tensor, conics: Tensor, gaussians: Gaussians, viewport: Viewport
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Radii, conics and opacities ``[N]`` with the low-pass of the training pictures in place of gsplat's.
+
+    What gsplat's own low-pass leaves outside of the picture is not drawn: of a picture that is larger than the training
+    pictures a few pixels at the border lack it.
+    """
+    assert gaussians.sampling_intervals is not None
+    kept, added = screen_low_pass(gaussians.sampling_intervals, depths[0].detach().clamp(min=viewport.near), viewport.K)
+    a, b, c = conics[0].unbind(1)
+    determinant = a * c - b * b
+    xx, xy, yy = (
+        c / determinant + (kept - LOW_PASS_PIXELS),
+        -b / determinant,
+        a / determinant + (kept - LOW_PASS_PIXELS),
+    )
+    before = (xx * yy - xy * xy).detach()
+    xx, yy = xx + added, yy + added
+    after = xx * yy - xy * xy
+    opacities = gaussians.opacities * (before / after.detach()).nan_to_num().clamp(0.0, 1.0).sqrt()
+    conics = torch.stack([yy, -xy, xx], dim=1) / after[:, None]
+    reach = 2.0 * (255.0 * opacities.detach()).clamp(min=1.0).log()
+    extents = (reach[:, None] * torch.stack([xx, yy], dim=1).detach()).clamp(min=0.0).sqrt().ceil()
+    drawn = (radii[0] > 0).all(1, keepdim=True) & (after.detach() > 0)[:, None]
+    return torch.where(drawn, extents.to(radii.dtype), 0)[None], conics[None], opacities
 
 
 def _pair_lists(

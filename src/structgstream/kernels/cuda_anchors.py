@@ -27,6 +27,7 @@ def generate_structured(
     distance_input: bool,
     tiles: TileSelection | None = None,
     seen_from: Tensor | None = None,
+    sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``: ``N = M * K`` Gaussians of all anchors.
 
@@ -35,7 +36,7 @@ def generate_structured(
     """
     positions, log_offset_scales, log_base_scales, offsets, features = anchors
     count, k = offsets.shape[:2]
-    seen = visible_anchor_mask(anchors, viewport, tiles)
+    seen = visible_anchor_mask(anchors, viewport, tiles, sampling_intervals)
     to_anchor = positions - (viewport.center if seen_from is None else seen_from)
     distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)
     parts = [features, to_anchor / distance]

@@ -28,6 +28,7 @@ class _KernelCamera(NamedTuple):
     viewport: Viewport
     center: Tensor
     tiles: Tensor | None
+    intervals: Tensor | None
     distance_input: bool
 
 
@@ -42,7 +43,7 @@ class _Inputs(torch.autograd.Function):
         seen = torch.empty(m, dtype=torch.bool, device=features.device)
         camera.library.call(
             "sgs_cuda_anchor_inputs",
-            *addresses(positions, log_offset_scales, log_base_scales, offsets, features),
+            *addresses(positions, log_offset_scales, log_base_scales, offsets, features, camera.intervals),
             *(m, k, d, int(camera.distance_input)),
             *addresses(view.viewmat, view.K, camera.center),
             *(view.width, view.height, view.near),
@@ -124,6 +125,7 @@ def generate_all(
     distance_input: bool,
     tiles: TileSelection | None = None,
     seen_from: Tensor | None = None,
+    sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``; float32. All ``N = M * K`` Gaussians, as
     ``kernels.cuda_anchors.generate_structured`` gives them, without host synchronisation.
@@ -131,7 +133,9 @@ def generate_all(
     Raises:
         BackendError: a precision or device that the kernels do not support.
     """
-    gaussians, _, raw = _generated(library, anchors, mlps, viewport, distance_input, tiles, seen_from)
+    gaussians, _, raw = _generated(
+        library, anchors, mlps, viewport, distance_input, tiles, seen_from, sampling_intervals
+    )
     return StructuredGaussians(gaussians, torch.arange(len(raw), device=raw.device), raw)
 
 
@@ -144,13 +148,16 @@ def generate_structured(
     distance_input: bool,
     tiles: TileSelection | None = None,
     seen_from: Tensor | None = None,
+    sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``; float32. Those that are drawn, for whose number the host waits.
 
     Raises:
         BackendError: a precision or device that the kernels do not support.
     """
-    gaussians, seen, raw = _generated(library, anchors, mlps, viewport, distance_input, tiles, seen_from)
+    gaussians, seen, raw = _generated(
+        library, anchors, mlps, viewport, distance_input, tiles, seen_from, sampling_intervals
+    )
     drawn, visible = (gaussians.opacities.detach() > 0).nonzero()[:, 0], seen.nonzero()[:, 0]
     return StructuredGaussians(gaussians.select(drawn), visible, raw[visible])
 
@@ -163,18 +170,20 @@ def _generated(
     distance_input: bool,
     tiles: TileSelection | None,
     seen_from: Tensor | None,
+    intervals: Tensor | None,
 ) -> tuple[Gaussians, Tensor, Tensor]:
     """All Gaussians, the mask ``[M]`` of the anchors that are seen, and the raw opacities ``[M, K]``."""
     center = (viewport.center if seen_from is None else seen_from).detach().contiguous()
     mask = None if tiles is None else tiles.mask.contiguous()
-    library.check_devices(*anchors, viewport.viewmat, viewport.K, center, mask)
-    if any(value.dtype != torch.float32 for value in (*anchors, viewport.viewmat, viewport.K, center)):
+    library.check_devices(*anchors, viewport.viewmat, viewport.K, center, mask, intervals)
+    numbers = [*anchors, viewport.viewmat, viewport.K, center, *([] if intervals is None else [intervals])]
+    if any(value.dtype != torch.float32 for value in numbers):
         raise BackendError(
             "The cuda back-end generates float32 Gaussians; convert anchors and camera, or take another."
         )
     view = viewport._replace(viewmat=viewport.viewmat.contiguous(), K=viewport.K.contiguous())
     values = [value.contiguous() for value in anchors]
-    inputs, seen = _Inputs.apply(_KernelCamera(library, view, center, mask, distance_input), *values)  # type: ignore[misc]
+    inputs, seen = _Inputs.apply(_KernelCamera(library, view, center, mask, intervals, distance_input), *values)  # type: ignore[misc]
     outputs = [value.contiguous() for value in head_outputs(mlps, inputs)]
     means, quats, scales, opacities, colors, raw, ids = _Outputs.apply(library, seen, *values[:4], *outputs)  # type: ignore[misc]
     return Gaussians(means, quats, scales, opacities, colors, ids), seen, raw

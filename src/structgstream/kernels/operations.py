@@ -34,7 +34,7 @@ class Rasterize(Protocol):
     """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
     A Gaussian that less than 1/255 of a pixel's light reaches is drawn there, and gets no gradient from the pixel; with
-    gsplat (``cuda``) it does.
+    gsplat (``cuda``) it does. The low-pass is ``reference_raster.screen_low_pass``; it counts as a constant.
 
     Args:
         gaussians: to draw; their ids are not read.
@@ -226,9 +226,10 @@ class Lift(Protocol):
     """For each of ``T`` targets the 3D displacement d that fits its neighbours' optical flow in all views.
 
     Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views by iteratively reweighted least
-    squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / s^2)^2`` of decreasing
-    scale s (``reference_lift.ROBUST_PIXELS``). ``reg`` is ``0.02 sum + 0.05`` times the mean square of J, with the
-    sum of the present weights.
+    squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / (s tau)^2)^2`` of decreasing
+    scale s (``reference_lift.ROBUST_SCALES``), with the residual ``r = |J d - f|`` and the tolerance ``tau = 1 +
+    0.1 |f|``, pixels. What has ``r < 1.5 tau`` in the end is an inlier. ``reg`` is ``0.02 sum + 0.05`` times the mean
+    square of J, with the sum of the present weights.
 
     Args:
         centers: ``[E, 3]`` of movers.
@@ -308,6 +309,7 @@ class GenerateStructured(Protocol):
         distance_input: whether the distance is an input of the heads.
         tiles: if given, only anchors that reach one of these tiles.
         seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
+        sampling_intervals: ``[M]`` of the anchors, by which their balls grow for the low-pass (:class:`Rasterize`).
     """
 
     def __call__(
@@ -319,6 +321,7 @@ class GenerateStructured(Protocol):
         distance_input: bool,
         tiles: TileSelection | None = None,
         seen_from: Tensor | None = None,
+        sampling_intervals: Tensor | None = None,
     ) -> StructuredGaussians: ...
 
 

@@ -8,20 +8,27 @@ from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
 from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection
+from structgstream.kernels.reference_raster import LOW_PASS_PIXELS
 
 BALL_DEVIATIONS = 3.4
 """Radius of a Gaussian in standard deviations: alpha falls below 1/255 before 3.33 at any opacity."""
 BOX_MARGIN_PIXELS = 2.0
 """Margin for the rasteriser's low-pass filter, which widens the smallest Gaussian to this."""
+BALL_INTERVALS = BALL_DEVIATIONS * LOW_PASS_PIXELS**0.5
+"""By so many sampling intervals the low-pass of a Gaussian widens its ball."""
 
 
-def visible_anchor_mask(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
+def visible_anchor_mask(
+    anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None
+) -> Tensor:
     """Mask ``[M]`` bool of the anchors whose ball of Gaussians reaches the picture, or one of the ``tiles``."""
     size = (viewport.width, viewport.height)
     with torch.no_grad():
         points = anchors.positions @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]  # [M, 3]
         reach = (anchors.offsets * anchors.log_offset_scales.exp()[:, None]).norm(dim=-1).amax(1)
         radius = reach + BALL_DEVIATIONS * anchors.log_base_scales.amax(1).exp()  # [M]
+        if intervals is not None:
+            radius = radius + BALL_INTERVALS * intervals
         closest, furthest = points[:, 2] - radius, points[:, 2] + radius
         seen = furthest > viewport.near
         low, high = [], []
@@ -55,9 +62,11 @@ def _reaches(tiles: Tensor, low: Tensor, high: Tensor, size: tuple[int, int]) ->
     return covered[y1, x1] - covered[y0, x1] - covered[y1, x0] + covered[y0, x0] > 0
 
 
-def visible_anchors(anchors: Anchors, viewport: Viewport, tiles: TileSelection | None) -> Tensor:
+def visible_anchors(
+    anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None = None
+) -> Tensor:
     """Indices ``[m]`` int64, ascending, of the anchors that :func:`visible_anchor_mask` marks."""
-    return visible_anchor_mask(anchors, viewport, tiles).nonzero()[:, 0]
+    return visible_anchor_mask(anchors, viewport, tiles, intervals).nonzero()[:, 0]
 
 
 def _head(weights: HeadWeights, inputs: Tensor) -> Tensor:
@@ -73,9 +82,10 @@ def generate_structured(
     distance_input: bool,
     tiles: TileSelection | None = None,
     seen_from: Tensor | None = None,
+    sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``kernels.operations.GenerateStructured``."""
-    visible = visible_anchors(anchors, viewport, tiles)
+    visible = visible_anchors(anchors, viewport, tiles, sampling_intervals)
     center = viewport.center if seen_from is None else seen_from
     return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)
 

@@ -2,12 +2,13 @@
 """EWA splatting in pure torch, differentiable by autograd, at any floating-point precision: the oracle.
 
 Definition (as gsplat 1.5): perspective projection of the covariance with the point clamped to 1.3 times the field of
-view, 0.3 square pixels of low-pass, alpha = opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to
-back by camera depth until the transmittance would fall to 1e-4, pixel centres at +0.5. Gaussians that less than 1/255
-of a pixel's light reaches are drawn there, and get no gradient from it.
+view, a low-pass of 0.3 square pixels (of the picture, or of the training pictures: :func:`screen_low_pass`), alpha =
+opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to back by camera depth until the transmittance
+would fall to 1e-4, pixel centres at +0.5. Gaussians that less than 1/255 of a pixel's light reaches are drawn there,
+and get no gradient from it.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,6 +20,9 @@ from structgstream.kernels.operations import Rasterize
 from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection
 
 LOW_PASS_PIXELS = 0.3
+"""Variance of the low-pass, square pixels."""
+SCREEN_LOW_PASS_PIXELS = 0.15
+"""Variance that a picture needs against aliasing, square pixels, where Gaussians have a low-pass of their own."""
 MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -30,6 +34,7 @@ BOX_SLACK_PIXELS = 0.01
 class _Projected:
     means2d: Tensor  # [n, 2]
     conics: Tensor  # [n, 3]: xx, xy, yy
+    opacities: Tensor  # [n] after the low-pass
     depths: Tensor  # [n]
     extents: Tensor  # [n, 2] half size of the box where alpha reaches 1/255
     rows: Tensor  # [n] index into the input
@@ -39,7 +44,10 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
     means, quats, scales, opacities = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     viewmat, K, width, height = viewport.viewmat, viewport.K, viewport.width, viewport.height
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None], gaussians.colors], dim=1)).all(1)
+    columns = [means, quats, scales, opacities[:, None], gaussians.colors]
+    if gaussians.sampling_intervals is not None:
+        columns.append(gaussians.sampling_intervals[:, None])
+    finite = torch.isfinite(torch.cat(columns, dim=1)).all(1)
     rows = ((points[:, 2] >= viewport.near) & (opacities >= MIN_ALPHA) & finite).nonzero()[:, 0]
     points = points[rows]
     x, y, z = points.unbind(1)
@@ -51,26 +59,55 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
     jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z**2, zero, fy / z, -fy * clamped_y / z**2], dim=1).reshape(
         -1, 2, 3
     )
+    kept, added = _low_pass(gaussians.sampling_intervals, rows, z, K)
     axes = jacobian @ viewmat[:3, :3] @ (quaternion_matrices(quats[rows]) * scales[rows][:, None])  # [n, 2, 3]
     covariances = axes @ axes.transpose(1, 2)
-    xx, xy, yy = (
-        covariances[:, 0, 0] + LOW_PASS_PIXELS,
-        covariances[:, 0, 1],
-        covariances[:, 1, 1] + LOW_PASS_PIXELS,
-    )
+    xx, xy, yy = covariances[:, 0, 0] + kept, covariances[:, 0, 1], covariances[:, 1, 1] + kept
+    before = (xx * yy - xy * xy).detach()
+    xx, yy = xx + added, yy + added
     determinant = xx * yy - xy * xy
+    opacities = opacities[rows] * (before / determinant.detach()).clamp(0.0, 1.0).sqrt()
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[rows]
-    reach = 2.0 * torch.log(255.0 * opacities[rows].detach()).clamp(min=0.0)
+    reach = 2.0 * torch.log(255.0 * opacities.detach()).clamp(min=0.0)
     extents = torch.stack([(reach * xx.detach()).sqrt(), (reach * yy.detach()).sqrt()], dim=1)
     conics = torch.stack([yy, -xy, xx], dim=1) / determinant[:, None]
     low, high = means2d.detach() - extents, means2d.detach() + extents
     size = means2d.new_tensor([width, height])
-    seen = (determinant.detach() > 0) & (high > 0).all(1) & (low < size).all(1) & torch.isfinite(extents).all(1)
-    kept = seen.nonzero()[:, 0]
-    kept = kept[z.detach()[kept].argsort(stable=True)]
-    return _Projected(means2d[kept], conics[kept], z[kept], extents[kept], rows[kept])
+    seen = (
+        (opacities >= MIN_ALPHA)
+        & (determinant.detach() > 0)
+        & (high > 0).all(1)
+        & (low < size).all(1)
+        & torch.isfinite(extents).all(1)
+    )
+    drawn = seen.nonzero()[:, 0]
+    drawn = drawn[z.detach()[drawn].argsort(stable=True)]
+    return _Projected(means2d[drawn], conics[drawn], opacities[drawn], z[drawn], extents[drawn], rows[drawn])
+
+
+def screen_low_pass(intervals: Tensor, depths: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Variances ``[n]``, square pixels, of a Gaussian's low-pass on a picture: trained, and added against aliasing.
+
+    The first is the low-pass of the training pictures and leaves the opacity as it is. The second is above zero on
+    smaller pictures; it keeps the Gaussian's light: the opacity is multiplied by the root of the ratio of the
+    determinants of the covariances before and after it. Both count as constants in gradients.
+
+    Args:
+        intervals: ``[n]`` size of a training pixel at each Gaussian (``scene/sampling.py``, Note [Drawn as it was
+            trained]).
+        depths: ``[n]`` along the camera's axis.
+        K: ``[3, 3]`` of the picture.
+    """
+    trained = LOW_PASS_PIXELS * K[0, 0] * K[1, 1] * (intervals / depths) ** 2
+    return trained, (SCREEN_LOW_PASS_PIXELS - trained).clamp(min=0.0)
+
+
+def _low_pass(intervals: Tensor | None, rows: Tensor, depths: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    if intervals is None:
+        return torch.full_like(depths, LOW_PASS_PIXELS).detach(), torch.zeros_like(depths).detach()
+    return screen_low_pass(intervals[rows], depths.detach(), K)
 
 
 def rasterize(
@@ -118,8 +155,7 @@ def detach_untrained(
     if trained is None:
         return gaussians, screen_offsets
     values = {
-        f.name: torch.cat([getattr(gaussians, f.name)[:trained], getattr(gaussians, f.name)[trained:].detach()])
-        for f in fields(gaussians)
+        name: torch.cat([value[:trained], value[trained:].detach()]) for name, value in gaussians.columns().items()
     }
     if screen_offsets is not None:
         screen_offsets = torch.cat([screen_offsets[:trained], screen_offsets[trained:].detach()])
@@ -196,7 +232,7 @@ def _tile(
 
     Those that less than ``least`` of a pixel's light reaches get no gradient from it.
     """
-    like, opacities, colors = projected.means2d, gaussians.opacities, gaussians.colors
+    like, colors = projected.means2d, gaussians.colors
     if here.numel() == 0:
         return colors.new_zeros(len(rows), len(columns), 3), colors.new_zeros(len(rows), len(columns))
     xs = torch.arange(columns.start, columns.stop, dtype=like.dtype, device=like.device) + 0.5
@@ -206,7 +242,7 @@ def _tile(
     xx, xy, yy = (projected.conics[here, i, None, None] for i in range(3))
     power = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
     drawn = projected.rows[here]
-    alpha = opacities[drawn, None, None] * power.exp()
+    alpha = projected.opacities[here, None, None] * power.exp()
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0.0)
     faint = _before((1.0 - alpha.detach()).cumprod(0)) <= least
     alpha = torch.where(faint, alpha.detach(), alpha)

@@ -15,6 +15,7 @@ from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.environment import background
 from structgstream.scene.free import FreeGaussians
+from structgstream.scene.sampling import RigSampling
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Scene:
         appearance_basis: ``[R, D]`` directions along which the anchors' features change after frame 0; None without
             ``appearance``.
         environment: ``[(degree + 1)^2, 3]`` background coefficients (``scene/environment.py``); None for black.
+        sampling: of the training cameras, by which Gaussians are filtered (``scene/sampling.py``); None: by the
+            picture.
     """
 
     anchors: AnchorCloud
@@ -39,6 +42,7 @@ class Scene:
     distance_input: bool = True
     appearance_basis: Tensor | None = None
     environment: Tensor | None = None
+    sampling: RigSampling | None = None
 
     @property
     def features(self) -> Tensor:
@@ -68,14 +72,20 @@ class Scene:
         """
         cloud = self.anchors
         anchors = Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
-        return backend.generate_structured(
+        intervals = None if self.sampling is None else self.sampling.intervals(cloud.positions)
+        generated = backend.generate_structured(
             anchors,
             self.mlps,
             camera.viewport(cloud.positions),
             distance_input=self.distance_input,
             tiles=tiles,
             seen_from=seen_from,
+            sampling_intervals=intervals,
         )
+        if intervals is None:
+            return generated
+        of_anchor = generated.gaussians.ids // cloud.offsets_per_anchor
+        return replace(generated, gaussians=replace(generated.gaussians, sampling_intervals=intervals[of_anchor]))
 
     def free_gaussians(self) -> Gaussians:
         """The free Gaussians after activation, with their ids (Note [Ids])."""
@@ -88,6 +98,7 @@ class Scene:
             opacities=free.logit_opacities.sigmoid(),
             colors=free.colors,
             ids=torch.arange(first, first + len(free), device=free.means.device),
+            sampling_intervals=None if self.sampling is None else self.sampling.intervals(free.means),
         )
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:

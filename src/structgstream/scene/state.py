@@ -22,6 +22,7 @@ from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 
 FieldName = Literal[
@@ -262,7 +263,7 @@ def state_of(scene: Scene) -> dict[FieldName, Tensor]:
     return state
 
 
-def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scene:
+def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool, sampling: RigSampling | None = None) -> Scene:
     """The inverse of :func:`state_of`; tensors are views where possible."""
     values: dict[ParameterName, Tensor] = {}
     for name, value in state.items():
@@ -270,10 +271,12 @@ def scene_of(state: Mapping[FieldName, Tensor], *, distance_input: bool) -> Scen
         columns = value.split([p.columns for p in row.parts], dim=1) if row.parts else (value,)
         for parameter, tensor in zip(row.parameters, columns, strict=True):
             values[parameter.name] = tensor[:, 0] if parameter.columns == 1 else tensor
-    return scene_from(values, distance_input=distance_input)
+    return scene_from(values, distance_input=distance_input, sampling=sampling)
 
 
-def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) -> Scene:
+def scene_from(
+    values: Mapping[ParameterName, Tensor], *, distance_input: bool, sampling: RigSampling | None = None
+) -> Scene:
     """The scene whose parameters have the tensors ``values`` (:func:`tensor_of`)."""
     k, inputs = values["anchor_offsets"].shape[1], values["anchor_features"].shape[1] + 3 + int(distance_input)
     found: dict[str, Any] = {holder: {} for holder in _PARTS_OF_SCENE}
@@ -287,7 +290,7 @@ def scene_from(values: Mapping[ParameterName, Tensor], *, distance_input: bool) 
             (found[parameter.holder] if parameter.holder else found)[parameter.attribute] = value
     for holder, kind in _PARTS_OF_SCENE.items():
         found[holder] = kind(**found[holder])
-    return Scene(**found, distance_input=distance_input)
+    return Scene(**found, distance_input=distance_input, sampling=sampling)
 
 
 def with_dynamic_fields(scene: Scene, dynamic: Iterable[FieldName]) -> Scene:
@@ -303,7 +306,7 @@ def with_dynamic_fields(scene: Scene, dynamic: Iterable[FieldName]) -> Scene:
         if row.granularity != "anchor" or len(columns) < len(row.shape) - 1:
             raise ConfigError(f"The dynamic set has {row.name}, which the scene lacks; take it out of the set.")
         state[row.name] = scene.anchors.positions.new_zeros(len(scene.anchors), *columns)
-    return scene_of(state, distance_input=scene.distance_input) if missing else scene
+    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling) if missing else scene
 
 
 def on_device(scene: Scene, device: torch.device) -> Scene:
@@ -311,4 +314,4 @@ def on_device(scene: Scene, device: torch.device) -> Scene:
     if device.type == "cpu":
         return scene
     state: dict[FieldName, Tensor] = {name: value.to(device) for name, value in state_of(scene).items()}
-    return scene_of(state, distance_input=scene.distance_input)
+    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)

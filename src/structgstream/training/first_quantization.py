@@ -65,7 +65,7 @@ def estimate_sensitivity(scene: Scene, rig: CameraRig, *, backend: Backend, seed
     used = torch.zeros(state["anchor_offsets"].shape[:2], dtype=torch.bool, device=products.device)
     count = 0
     for name in rig.training:
-        open_scene = scene_of(state, distance_input=scene.distance_input)
+        open_scene = scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
         structured = open_scene.structured(rig[name], backend)
         used[structured.anchors] |= structured.raw_opacities > 0
         behind = open_scene.background(rig[name])
@@ -180,7 +180,7 @@ def quantize_first_frame(
             step = getattr(plain, key) if row.init_step else steps.get(name, getattr(plain, key))
             found[name] = float32(step)
             state[name] = round_straight_through(state[name], found[name])
-    return scene_of(state, distance_input=scene.distance_input), found
+    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling), found
 
 
 def _quantize_rows(

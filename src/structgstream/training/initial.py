@@ -9,6 +9,7 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PARAMETERS, ParameterName
 from structgstream.training.contribution import contributions
@@ -88,6 +89,9 @@ class InitialConfig:
     all_drawn: bool = False
     """Initialise F_alpha so that all of an anchor's Gaussians are drawn (``training/seeding.py``, Note [Dead outputs];
     Scaffold-GS: no, about half are)."""
+    sampling_filter: bool = False
+    """Train through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was trained]), also
+    on reduced pictures (paper: no, 0.3 square pixels of each picture)."""
     disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
     solidity: SolidityConfig = field(default_factory=SolidityConfig)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
@@ -262,6 +266,7 @@ def _fit(
 ) -> FitResult[Scene]:
     """Train ``template`` in the iterations of frame 0 after the first ``done``."""
     watch = Stopwatch(backend.device)
+    template = replace(template, sampling=RigSampling.of(rig) if config.sampling_filter else None)
     views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
     parameters = Parameters.of(template, trained=_trained(config))
     adam = Adam(backend, parameters.values)

@@ -88,6 +88,8 @@ def fit_next_frame(
         return held(scene)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
+    if not config.sampling_filter:
+        scene = replace(scene, sampling=None)
     counts: dict[str, int] = {}
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
@@ -322,6 +324,9 @@ def _fit_moving_part(
             "carried": segmentation.carried_count,
             "lifted": start.lifted_count,
             "corrected": start.corrected_count,
+            "fast": start.fast_count,
+            "fast lifted": start.fast_lifted_count,
+            "far boxes": sum(change.far_boxes for change in changes if change is not None),
             **new.counts,
             "views left out": len(views) - len(trusted),
             "jumps": int(segmentation.scene_cut),

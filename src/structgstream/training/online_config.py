@@ -68,6 +68,9 @@ class OnlineConfig:
     """Early stopping (and early patching): when ``iterations`` steps at the present rate would lower the loss by less
     than this share (paper: 0, never)."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
+    sampling_filter: bool = False
+    """Train and compare through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was
+    trained]), also where pictures are reduced (paper: no, 0.3 square pixels of each picture)."""
 
     def __post_init__(self) -> None:
         if self.light.enabled and "color_mlp" not in self.dynamic:

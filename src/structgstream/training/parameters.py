@@ -78,7 +78,7 @@ class Parameters:
         values |= {**self.values, "free_births": self.births}
         rounded = round_all_straight_through([self.values[name] for name in self.steps], [*self.steps.values()])
         values |= dict(zip(self.steps, rounded, strict=True))
-        found = scene_from(values, distance_input=template.distance_input)
+        found = scene_from(values, distance_input=template.distance_input, sampling=template.sampling)
         gauged = any(self.values[name].requires_grad for name in CAMERA_ROWS)
         return replace(found, camera_color=found.camera_color.gauged()) if gauged else found
 
@@ -86,4 +86,4 @@ class Parameters:
 def detached(scene: Scene) -> Scene:
     """The same scene without a gradient graph."""
     state: dict[FieldName, Tensor] = {name: value.detach().contiguous() for name, value in state_of(scene).items()}
-    return scene_of(state, distance_input=scene.distance_input)
+    return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)

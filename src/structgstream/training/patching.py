@@ -2,13 +2,14 @@
 """Global patching with free Gaussians (paper, section Global Free 3DGs Patching Strategy)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from structgstream.gaussians import Gaussians
+from structgstream.gaussians import Gaussians, concatenate
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import Backend
 from structgstream.scene.free import FreeGaussians
@@ -89,20 +90,10 @@ def gaussians_by_id(scene: Scene, views: Sequence[View], ids: Tensor, backend: B
             break
         seen = scene.gaussians(view.camera, backend)
         rows = (missing[seen.ids] & (seen.opacities > 0)).nonzero()[:, 0]
-        found.append(
-            Gaussians(
-                means=seen.means[rows],
-                quats=seen.quats[rows],
-                scales=seen.scales[rows],
-                opacities=seen.opacities[rows],
-                colors=seen.colors[rows],
-                ids=seen.ids[rows],
-            )
-        )
+        found.append(replace(seen, sampling_intervals=None).select(rows))
         missing[seen.ids[rows]] = False
-    columns = {name: torch.cat([getattr(g, name) for g in found]) for name in Gaussians.__dataclass_fields__}
-    order = columns["ids"].argsort()
-    return Gaussians(**{name: column[order] for name, column in columns.items()})
+    together = reduce(concatenate, found)
+    return together.select(together.ids.argsort())
 
 
 def _empty_like(scene: Scene) -> Gaussians:

@@ -68,6 +68,7 @@ def capture_part(scene: Folder, asked: ExperimentOptions) -> tuple["CapturePart"
         frames=options.frames,
         near=options.near,
         scored=asked.scored,
+        thinned=options.every,
     )
     source = part.open()
     if not source.rig.testing:

@@ -21,7 +21,8 @@ class CapturePart:
         start: first frame.
         frames: number of frames; None for all.
         near: distance of the near plane, in the capture's units; None for the capture's own.
-        every: step between frames, for methods that fit each frame alone.
+        every: step between frames, for methods that fit each frame alone, which stand for all frames.
+        thinned: step between the frames that are taken as filmed: a recording at so much a lower rate.
         scored: the held-out cameras to score; None for all. Choices and reports use different ones.
     """
 
@@ -33,6 +34,7 @@ class CapturePart:
     near: float | None = None
     every: int = 1
     scored: tuple[str, ...] | None = None
+    thinned: int = 1
 
     def open(self) -> "FrameSource":
         """The frames.
@@ -50,14 +52,15 @@ class CapturePart:
             start=self.start,
             frames=self.frames,
             near=self.near,
+            every=self.thinned,
         )
-        return every_nth_frame(whole, self.every)
+        return every_nth_frame(whole, self.every, rate=whole.fps)
 
 
 def capture_facts(part: CapturePart, source: "FrameSource") -> dict[str, Any]:
     """Facts of a capture for results, as plain values; equal facts mean the same pictures and cameras."""
     sizes = sorted({(source.rig[name].width, source.rig[name].height) for name in source.rig})
-    return {
+    facts = {
         "name": source.name,
         "fingerprint": fingerprint(source),
         "frames": len(source),
@@ -71,6 +74,7 @@ def capture_facts(part: CapturePart, source: "FrameSource") -> dict[str, Any]:
         "held_out": list(source.rig.testing),
         "scored": list(source.rig.testing if part.scored is None else part.scored),
     }
+    return facts if part.thinned == 1 else facts | {"thinned": part.thinned}
 
 
 def fingerprint(source: "FrameSource") -> str:

@@ -84,7 +84,8 @@ class PeerRun:
 
         self.stream.parent.mkdir(parents=True, exist_ok=True)
         pipeline = peer_pipeline(METHODS[self.key], seed=self.seed)
-        part = {"start": self.capture.start, "scale": self.capture.scale, "every": self.capture.every}
+        step = self.capture.every * self.capture.thinned
+        part = {"start": self.capture.start, "scale": self.capture.scale, "every": step}
         machine = environment() | {"backend": backend.name}
 
         def remarks(report: "FrameReport") -> Mapping[str, Any]:

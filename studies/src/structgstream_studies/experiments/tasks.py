@@ -176,6 +176,7 @@ def is_result_of(result: Path, run_identity: Mapping[str, Any], capture: Capture
     of = identity.pop("capture")
     part = (of["start"], of["scale"], of["every"], of.get("near"), of["frames"])
     same_part = part == (capture.start, round_floats(capture.scale), capture.every, round_floats(capture.near), frames)
+    same_part = same_part and of.get("thinned", 1) == capture.thinned
     same_split = capture.held_out is None or set(of["held_out"]) == set(capture.held_out)
     same_cameras = set(of["scored"]) == set(capture.scored or of["held_out"])
     return identity == round_floats(run_identity) and same_part and same_split and same_cameras
@@ -198,6 +199,7 @@ def _reconstruct(
     capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrameRun | None
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
+    from structgstream.evaluation.capture import part_metadata
     from structgstream.evaluation.environment import environment
     from structgstream.recorder import record
     from structgstream.struct_gstream import stream_pipeline
@@ -212,7 +214,7 @@ def _reconstruct(
         return {**shared, "trained_by": machine} if report.index == 0 else {}
 
     pipeline = stream_pipeline(config, fitted=None if first is None else first.fitted)
-    metadata = {"start": capture.start, "scale": capture.scale}
+    metadata = part_metadata(start=capture.start, scale=capture.scale, every=capture.thinned)
     try:
         run = record(stream, source, pipeline, backend, resume=True, metadata=metadata, remarks=remarks)
     except ConfigError as error:
