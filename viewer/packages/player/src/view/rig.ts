@@ -4,10 +4,8 @@
 import type { StreamHeader } from "@structgstream/core";
 import {
   along,
-  axes,
   type Camera,
   center,
-  dot,
   focusPoint,
   length,
   rigCameras,
@@ -33,22 +31,18 @@ export interface Rig {
   readonly first: RigCamera;
 }
 
-/**
- * Share of the rig's radius that a free camera sees from on: a hundredth, less than anyone would put between a lens and a
- * subject. Nearer still, single Gaussians fill the picture and the order by depth of their means says nothing.
- */
-const FREE_NEAR = 0.01;
+/** A free camera's near plane is at least this share of that of the nearest camera of the rig: what is nearer is a blur. */
+const MIN_NEAR_SHARE = 0.01;
 
 /**
- * Near plane of a camera at `eye`, in scene units. Nothing nearer than the capture's near plane was trained where its cameras
- * stand: there a viewer's plane is theirs. A viewer who went closer does not push it along: the plane stays where the nearest
- * camera of the rig has it until the viewer has reached it, so that nothing is cut that this camera shows.
+ * Near plane of a camera at `eye`, in scene units. That of the capture belongs to its cameras: what is left of the nearest
+ * one's after the distance to it cuts nothing that the rig shows (docs/conventions.md).
  */
-export function nearPlane({ cameras, radius }: Pick<Rig, "cameras" | "radius">, eye: Vector): number {
+export function nearPlane({ cameras }: Pick<Rig, "cameras">, eye: Vector): number {
   const away = ({ camera }: RigCamera) => length(along(eye, center(camera), -1));
-  const { camera } = cameras.reduce((best, other) => (away(other) < away(best) ? other : best));
-  const closer = dot(along(eye, center(camera), -1), axes(camera)[2]);
-  return Math.max(camera.near - Math.max(closer, 0), Math.min(FREE_NEAR * radius, camera.near));
+  const nearest = cameras.reduce((best, other) => (away(other) < away(best) ? other : best));
+  const { near } = nearest.camera;
+  return Math.max(near - away(nearest), MIN_NEAR_SHARE * near);
 }
 
 export function rigOf(header: StreamHeader): Rig {
