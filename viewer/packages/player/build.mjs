@@ -9,7 +9,7 @@ import { gzipSync } from "node:zlib";
 import { build } from "esbuild";
 import { minify } from "terser";
 
-/** Shaders and styles are written to be read: indentation, and remarks in shaders, stay out of the bundle. */
+/** Shaders and styles are written to be read: indentation, and in shaders comments and spaces, stay out of the bundle. */
 const terse = {
   name: "terse",
   setup({ onLoad }) {
@@ -17,7 +17,8 @@ const terse = {
       const text = readFileSync(path, "utf8");
       const shader = path.endsWith(".js");
       const plain = shader ? text.replaceAll(/(^|\s)\/\/[^\n]*/g, "$1") : text;
-      return { contents: plain.replaceAll(/\s*\n\s*/g, "\n"), loader: shader ? "js" : "ts" };
+      const dense = path.includes("/shaders/") ? plain.replaceAll(/ *([=*/+,;<>?:&|]) */g, "$1") : plain;
+      return { contents: dense.replaceAll(/\s*\n\s*/g, "\n"), loader: shader ? "js" : "ts" };
     });
   },
 };

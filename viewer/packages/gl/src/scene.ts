@@ -3,6 +3,7 @@
 
 import { FIELD_NAMES, type FieldName, type Fields, type StreamHeader, type Tensor } from "@structgstream/core";
 import { GlError } from "./errors.js";
+import { type TrainingCameras, trainingCamerasOf } from "./sampling.js";
 import type { SceneUpdate } from "./types.js";
 
 /** A scene at one instant; never changes. */
@@ -10,6 +11,7 @@ export interface Snapshot {
   readonly index: number;
   readonly ptsSeconds: number;
   readonly fields: Fields;
+  readonly training: TrainingCameras;
 }
 
 /** Numbers that say how much there is. */
@@ -58,9 +60,11 @@ export function sameShape(a: Shape, b: Shape): boolean {
 export class LiveScene {
   private fields: Map<FieldName, Tensor>;
   private found: Snapshot | undefined;
+  private readonly training: TrainingCameras;
 
   constructor(readonly header: StreamHeader) {
     this.fields = new Map(header.static);
+    this.training = trainingCamerasOf(header);
   }
 
   /** Undefined until an update has completed the scene. */
@@ -78,6 +82,6 @@ export class LiveScene {
       );
     }
     this.fields = fields;
-    this.found = { index: update.index, ptsSeconds: update.ptsSeconds, fields };
+    this.found = { index: update.index, ptsSeconds: update.ptsSeconds, fields, training: this.training };
   }
 }

@@ -1,27 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures and MLP outputs of a stream as the CPU back-end has them: what the browser's are held to.
 
-``python viewer/packages/gl/test/make_references.py STREAM FOLDER`` writes, for held-out cameras and on an arc, PNGs,
-the outputs of the MLPs of some Gaussians, and ``views.json``, which names both.
+``python viewer/packages/gl/test/make_references.py STREAM FOLDER`` writes, for held-out cameras, at other sizes,
+nearer, and on an arc, PNGs, the outputs of the MLPs of some Gaussians, and ``views.json``, which names both.
 """
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.evaluation.camera_path import arc
+from structgstream.evaluation.camera_path import arc, focus_point, free_near
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.png import write_png
 from structgstream.kernels.backend import Backend, select_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 
+SIZES = (0.25, 0.5, 3.0)  # of the pictures that the stream was trained with
 COLUMNS = 11  # opacity, rgb, share of the largest scale (3), quaternion (4)
 
 
@@ -49,10 +51,21 @@ def outputs_of(scene: Scene, camera: Camera, backend: Backend, most: int) -> tup
     return ids.numpy().astype("<u4"), values.numpy().astype("<f4")
 
 
+def nearer(camera: Camera, rig: CameraRig) -> Camera:
+    """``camera`` half way to what its picture has in the middle, where the rig looks at (capture's units)."""
+    middle = torch.tensor([camera.width / 2, camera.height / 2, 1.0], dtype=torch.float64)
+    depth = (focus_point(rig) - camera.center) @ camera.viewmat[2, :3]
+    eye = camera.center + 0.5 * depth * (camera.viewmat[:3, :3].T @ torch.linalg.solve(camera.K, middle))
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return replace(camera, viewmat=viewmat, near=free_near(rig, eye))
+
+
 def views_of(
     reader: StreamReader, *, frames: list[int] | None, held_out: int, on_arc: int
 ) -> list[tuple[str, int, Camera]]:
-    """Name, frame and camera (capture's units) of every picture: held-out cameras, and an arc on which time runs."""
+    """Name, frame and camera (capture's units) of every picture: held-out cameras, the first of them at
+    other sizes and from half the distance, and an arc on which time runs."""
     rig, count = reader.header.rig, len(reader.packets)
     chosen = [0, count // 2, count - 1] if frames is None else frames
     views = [
@@ -60,6 +73,12 @@ def views_of(
         for name in rig.testing[:held_out]
         for frame in dict.fromkeys(chosen)
     ]
+    if held_out > 0:
+        camera = rig[rig.testing[0]]
+        for size in SIZES:
+            small = camera.resized(round(size * camera.width), round(size * camera.height))
+            views.append((f"size-{size:g}-{chosen[0]}", chosen[0], small))
+        views.append((f"nearer-{chosen[0]}", chosen[0], nearer(camera, rig)))
     for number, camera in enumerate(arc(rig, on_arc)):
         frame = round(number * (count - 1) / max(on_arc - 1, 1))
         views.append((f"arc-{number}-{frame}", frame, camera))

@@ -52,6 +52,8 @@ const CAMERA: Camera = {
   height: 60,
   near: 0.2,
 };
+/** Training cameras around (0, 0, -3), of 50 pixels focal length. */
+const INTERVAL = { middle: [0, 0, -3], spread: 0.5, slope: 0.02 } as const;
 const K = 3;
 const ANCHORS = 2000;
 
@@ -68,7 +70,7 @@ function scene(): Map<PlacingField, Float32Array<ArrayBuffer>> {
 
 function placed(): Placement {
   const placement = new Placement();
-  placement.set({ arrays: scene(), offsetsPerAnchor: K, freeColumns: 14 });
+  placement.set({ arrays: scene(), offsetsPerAnchor: K, freeColumns: 14, interval: INTERVAL });
   return placement;
 }
 
@@ -125,6 +127,7 @@ test("an order names slots from far to near, each once, and none behind the near
     changed: scene(),
     offsetsPerAnchor: K,
     freeColumns: 14,
+    interval: INTERVAL,
     camera: CAMERA,
     maxSplats: Number.POSITIVE_INFINITY,
     buffers: [],
@@ -147,8 +150,9 @@ test("an order names slots from far to near, each once, and none behind the near
 });
 
 test("a budget of free Gaussians alone draws no anchor", () => {
-  const request = { id: 1, changed: scene(), offsetsPerAnchor: K, freeColumns: 14, camera: CAMERA, buffers: [] };
-  const found = new Sorter().order({ ...request, maxSplats: 3 });
+  const sizes = { offsetsPerAnchor: K, freeColumns: 14, interval: INTERVAL };
+  const request = { id: 1, changed: scene(), ...sizes, camera: CAMERA, buffers: [], maxSplats: 3 };
+  const found = new Sorter().order(request);
   expect(found.anchorCount).toBe(0);
   expect(found.splats).toBeLessThanOrEqual(3);
 });

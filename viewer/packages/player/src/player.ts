@@ -2,7 +2,7 @@
 /** A stream on a canvas: engine, renderer and a camera that moves. It knows nothing of buttons. */
 
 import type { StreamHeader } from "@structgstream/core";
-import { type Camera, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
+import { type Camera, center, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
 import { Engine } from "./engine/engine.js";
 import type { EngineEvents } from "./engine/events.js";
@@ -11,7 +11,7 @@ import type { SourceDescription } from "./source/description.js";
 import { Flight } from "./view/flight.js";
 import { carried, type View, viewOf } from "./view/navigator.js";
 import type { QualityControl } from "./view/quality.js";
-import { type Rig, type RigCamera, rigOf } from "./view/rig.js";
+import { nearPlane, type Rig, type RigCamera, rigOf } from "./view/rig.js";
 
 export interface PlayerEvents extends EngineEvents {
   /** The camera or the picture's size is another. */
@@ -129,7 +129,8 @@ export class Player extends Emitter<PlayerEvents> {
     const [width, height] = size;
     if (!fittedTo || fittedTo.view !== view.camera || fittedTo.width !== width || fittedTo.height !== height) {
       this.fittedTo = { view: view.camera, width, height };
-      this.drawnCamera = fitted(view.camera, width, height);
+      const near = this.rig ? nearPlane(this.rig, center(view.camera)) : view.camera.near;
+      this.drawnCamera = { ...fitted(view.camera, width, height), near };
     }
     return this.drawnCamera;
   }

@@ -8,7 +8,7 @@ import { Flight } from "../src/view/flight.ts";
 import { linkOf, linkTo, viewFrom } from "../src/view/link.ts";
 import { dollied, flown, looked, orbited, panned, type View, viewOf } from "../src/view/navigator.ts";
 import { QualityControl } from "../src/view/quality.ts";
-import { rigOf } from "../src/view/rig.ts";
+import { nearPlane, rigOf } from "../src/view/rig.ts";
 import { CLIP } from "./served.ts";
 
 const RIG = rigOf(readStream(CLIP).header!);
@@ -35,6 +35,27 @@ test("a rig begins with the camera in its middle, and up is up", () => {
   for (const { camera } of RIG.cameras) expect(dot(axes(camera)[1], RIG.up)).toBeLessThan(-0.5);
   const depth = dot(along(RIG.focus, center(START.camera), -1), axes(START.camera)[2]);
   expect(depth).toBeGreaterThan(0);
+});
+
+describe("the near plane", () => {
+  const near = (view: View) => nearPlane(RIG, center(view.camera));
+
+  test("at a camera of the rig is that of the capture", () => {
+    for (const { camera } of RIG.cameras) expect(near(viewOf(camera, RIG.focus))).toBeCloseTo(camera.near, 9);
+  });
+
+  test("of who goes closer cuts nothing that the cameras of the rig show", () => {
+    const reach = length(along(START.pivot, center(START.camera), -1));
+    const capture = START.camera.near;
+    for (let closer = 0; closer < 2 * reach; closer += 0.05 * reach) {
+      const view = flown(START, 0, 0, closer);
+      const distances = RIG.cameras.map(({ camera }) => length(along(center(view.camera), center(camera), -1)));
+      expect(near(view)).toBeLessThanOrEqual(Math.max(capture - Math.min(...distances), 0.01 * capture) + 1e-9);
+      expect(near(view)).toBeGreaterThanOrEqual(0.009 * capture);
+    }
+    // Half way to what is looked at, and beyond it, as good as nothing is cut.
+    for (const share of [0.5, 1, 2]) expect(near(flown(START, 0, 0, share * reach))).toBeCloseTo(0.01 * capture, 9);
+  });
 });
 
 describe("orbiting", () => {

@@ -12,6 +12,7 @@ import type { MlpPass } from "./mlpPass.js";
 import { type Look, PicturePass } from "./picturePass.js";
 import { ProjectionPass } from "./projectionPass.js";
 import { Resources } from "./resources.js";
+import { SamplingPass } from "./samplingPass.js";
 import { SceneTextures } from "./sceneTextures.js";
 import { SplatPass } from "./splatPass.js";
 import { TargetsPass } from "./targetsPass.js";
@@ -20,6 +21,7 @@ import { TargetsPass } from "./targetsPass.js";
 interface Stage {
   readonly shape: Shape;
   readonly scene: SceneTextures;
+  readonly sampling: SamplingPass;
   readonly mlp: MlpPass;
   readonly projection: ProjectionPass;
 }
@@ -59,6 +61,7 @@ export class Pipeline {
     }
     try {
       this.stage.scene.adopt(snapshot, order);
+      this.stage.sampling.update(this.stage.scene, snapshot);
     } catch (error) {
       this.forget();
       throw error;
@@ -69,6 +72,7 @@ export class Pipeline {
   /** The scene of a stream played before. */
   forget(): void {
     this.stage?.scene.delete();
+    this.stage?.sampling.delete();
     this.stage?.mlp.delete();
     this.stage?.projection.delete();
     this.stage = undefined;
@@ -99,12 +103,14 @@ export class Pipeline {
     const { resources, device } = this;
     const most = device.splatsPerPass[this.path];
     const Pass = this.path === "mrt" ? TargetsPass : FeedbackPass;
+    const sampling = new SamplingPass(resources, device);
     const mlp = new Pass(resources, device, shape, most);
     return {
       shape,
       scene: new SceneTextures(resources, device, shape),
+      sampling,
       mlp,
-      projection: new ProjectionPass(resources, device, shape.offsetsPerAnchor, mlp),
+      projection: new ProjectionPass(resources, device, shape.offsetsPerAnchor, mlp, sampling.intervals),
     };
   }
 }

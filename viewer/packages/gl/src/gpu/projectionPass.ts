@@ -24,6 +24,7 @@ export class ProjectionPass {
     device: Device,
     splatsPerAnchor: number,
     private readonly mlp: MlpPass,
+    private readonly intervals: Table,
   ) {
     this.program = resources.program(projectionProgram(splatsPerAnchor, mlp.reading));
     this.first = new Table(resources, device, "RGBA32UI", "projected splats");
@@ -49,6 +50,7 @@ export class ProjectionPass {
         offsets: scene.offsets.texture,
         free: scene.free.texture,
         anchors: scene.anchors.texture,
+        intervals: this.intervals.texture,
         ...textures,
       },
       arrays,
@@ -56,6 +58,7 @@ export class ProjectionPass {
     gl.uniform1i(program.at("passTexels"), this.mlp.passTexels);
     gl.uniform1i(program.at("anchorCount"), scene.anchorCount);
     gl.uniform1i(program.at("slotCount"), count);
+    gl.uniform1i(program.at("freeAt"), scene.sizes.anchors);
     const [right, down, forward] = axes(camera);
     const eye = center(camera);
     // The shader's matrices are column by column.

@@ -9,6 +9,8 @@ import type { Placement } from "./placement.js";
  * until theirs has come, and what they see at their edges must be in it.
  */
 const MARGIN = 0.2;
+/** Pixels at least, for tiny pictures: the low-pass reaches 1.3 pixels of what is drawn, which may be a third of the size. */
+const MIN_MARGIN_PIXELS = 4;
 const SIZE_BINS = 1024;
 /** Bins of an octave of apparent size. */
 const OCTAVE_BINS = 32;
@@ -36,11 +38,12 @@ export function seenAnchors(placement: Placement, camera: Camera, into: Uint32Ar
 /** Four planes in the scene, each a unit normal inwards and a shift: left, right, top, bottom. */
 function sidePlanes(camera: Camera): Float64Array {
   const { K, width, height, viewmat: v } = camera;
+  const [across, down] = [width, height].map((size) => Math.max(MARGIN * size, MIN_MARGIN_PIXELS)) as [number, number];
   const slopes = [
-    [0, 1, (K.cx + MARGIN * width) / K.fx],
-    [0, -1, ((1 + MARGIN) * width - K.cx) / K.fx],
-    [4, 1, (K.cy + MARGIN * height) / K.fy],
-    [4, -1, ((1 + MARGIN) * height - K.cy) / K.fy],
+    [0, 1, (K.cx + across) / K.fx],
+    [0, -1, (width + across - K.cx) / K.fx],
+    [4, 1, (K.cy + down) / K.fy],
+    [4, -1, (height + down - K.cy) / K.fy],
   ] as const;
   const planes = new Float64Array(16);
   slopes.forEach(([row, sign, slope], i) => {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** What the renderer and its sorting worker say to each other. */
 
+import type { IntervalBound } from "../sampling.js";
 import type { Camera } from "../types.js";
 import type { PlacingField } from "./placement.js";
 
@@ -11,6 +12,7 @@ export interface OrderRequest {
   readonly changed: ReadonlyMap<PlacingField, Float32Array<ArrayBuffer>>;
   readonly offsetsPerAnchor: number;
   readonly freeColumns: number;
+  readonly interval: IntervalBound;
   readonly camera: Camera;
   readonly maxSplats: number;
   /** Of an earlier answer, to be written to again. */

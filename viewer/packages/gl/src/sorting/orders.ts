@@ -112,6 +112,7 @@ export class Orders {
       changed,
       offsetsPerAnchor: sizesOf(fields).offsetsPerAnchor,
       freeColumns: fields.get("free")!.shape[1]!,
+      interval: next.snapshot.training.bound,
       camera: next.camera,
       maxSplats: next.maxSplats,
       buffers,

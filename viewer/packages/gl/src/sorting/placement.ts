@@ -2,6 +2,7 @@
 /** Where everything is: what does not depend on the camera, computed once for each state of the scene. */
 
 import type { FieldName } from "@structgstream/core";
+import { type IntervalBound, TRAINING_LOW_PASS } from "../sampling.js";
 
 /** The fields that say where splats are. */
 export const PLACING_FIELDS = ["anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "free"] as const;
@@ -12,6 +13,7 @@ export interface PlacingState {
   readonly arrays: ReadonlyMap<PlacingField, Float32Array>;
   readonly offsetsPerAnchor: number;
   readonly freeColumns: number;
+  readonly interval: IntervalBound;
 }
 
 /** A Gaussian ends within so many standard deviations: alpha = 1/255 is reached before 3.33 at any opacity. */
@@ -28,7 +30,7 @@ export class Placement {
   centers = new Float32Array(0);
   /** [M] of a ball around the anchor that holds all its Gaussians. */
   radii = new Float32Array(0);
-  /** [M] the largest standard deviation that a Gaussian of the anchor can have. */
+  /** [M] the largest standard deviation that a Gaussian of the anchor can have, without low-pass. */
   extents = new Float32Array(0);
 
   set(state: PlacingState): void {
@@ -48,7 +50,7 @@ export class Placement {
       this.radii = new Float32Array(this.anchors);
       this.extents = new Float32Array(this.anchors);
     }
-    this.placeAnchors(offsets, offsetScales, baseScales);
+    this.placeAnchors(offsets, offsetScales, baseScales, state.interval);
     for (let i = 0, to = 3 * this.anchors * k, from = 0; i < this.free; i++, to += 3, from += state.freeColumns) {
       this.centers[to] = free[from]!;
       this.centers[to + 1] = free[from + 1]!;
@@ -56,7 +58,12 @@ export class Placement {
     }
   }
 
-  private placeAnchors(offsets: Float32Array, offsetScales: Float32Array, baseScales: Float32Array): void {
+  private placeAnchors(
+    offsets: Float32Array,
+    offsetScales: Float32Array,
+    baseScales: Float32Array,
+    { middle, spread, slope }: IntervalBound,
+  ): void {
     const { positions, centers, radii, extents, offsetsPerAnchor: k } = this;
     for (let m = 0, a = 0, to = 0; m < this.anchors; m++, a += 3) {
       const [x, y, z] = [positions[a]!, positions[a + 1]!, positions[a + 2]!];
@@ -70,7 +77,10 @@ export class Placement {
         reach = Math.max(reach, dx * dx + dy * dy + dz * dz);
       }
       extents[m] = Math.exp(Math.max(baseScales[a]!, baseScales[a + 1]!, baseScales[a + 2]!));
-      radii[m] = Math.sqrt(reach) + BALL_DEVIATIONS * extents[m]!;
+      const away = Math.sqrt((x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2);
+      const interval = slope * (away + spread);
+      const drawn = Math.sqrt(extents[m]! ** 2 + TRAINING_LOW_PASS * interval * interval);
+      radii[m] = Math.sqrt(reach) + BALL_DEVIATIONS * drawn;
     }
   }
 }

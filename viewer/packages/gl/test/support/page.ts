@@ -13,6 +13,7 @@ import {
 import { HeldWorker } from "./heldWorker.js";
 import { mlpOutputs } from "./mlpOutputs.js";
 import { base64, pixelsOf } from "./pixels.js";
+import { type ReadBack, readBack } from "./readBack.js";
 import { timed } from "./timing.js";
 
 /** A camera as JSON has it. */
@@ -100,6 +101,12 @@ export class Play {
   outputs(): { anchors: string; outputs: string } {
     const { anchors, outputs } = mlpOutputs(this.renderer);
     return { anchors: base64(anchors), outputs: base64(outputs) };
+  }
+
+  /** What the passes before blending wrote, as base64 of numbers. */
+  readBack(): Record<keyof ReadBack, string> {
+    const { intervals, projected, blended } = readBack(this.renderer);
+    return { intervals: base64(intervals), projected: base64(projected), blended: base64(blended) };
   }
 
   close(): void {

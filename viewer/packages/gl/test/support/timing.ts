@@ -5,6 +5,7 @@ import { readStream } from "@structgstream/core";
 import { deviceOf } from "../../src/gpu/device.js";
 import { Pipeline } from "../../src/gpu/pipeline.js";
 import { type Camera, type MlpPath, rigCamera } from "../../src/index.js";
+import { trainingCamerasOf } from "../../src/sampling.js";
 import { Placement } from "../../src/sorting/placement.js";
 import { Sorter } from "../../src/sorting/sorter.js";
 
@@ -25,6 +26,7 @@ export async function timed(url: string, cameraName: string, path: MlpPath, repe
   const bytes = new Uint8Array(await (await fetch(url)).arrayBuffer());
   const reader = readStream(bytes);
   const header = reader.header!;
+  const training = trainingCamerasOf(header);
   const { fields, index, ptsSeconds } = reader.frame(0);
   const canvas = document.createElement("canvas");
   const camera = rigCamera(header, cameraName);
@@ -57,11 +59,12 @@ export async function timed(url: string, cameraName: string, path: MlpPath, repe
       id: i,
       offsetsPerAnchor: fields.get("anchor_offsets")!.shape[1]!,
       freeColumns: 14,
+      interval: training.bound,
       camera: moved,
     };
     const rest = { maxSplats: Number.POSITIVE_INFINITY, buffers: [] };
     const beganPlacing = performance.now();
-    placement.set({ arrays: changed, offsetsPerAnchor: request.offsetsPerAnchor, freeColumns: 14 });
+    placement.set({ ...request, arrays: changed });
     found.place.push(performance.now() - beganPlacing);
     const order = sorter.order({ ...request, ...rest, changed: i ? new Map() : changed });
     if (i === 0) continue; // compiles
@@ -75,7 +78,12 @@ export async function timed(url: string, cameraName: string, path: MlpPath, repe
       finish();
       found[stage].push(performance.now() - began);
     };
-    const wanted = { snapshot: { index, ptsSeconds, fields: snapshotFields }, camera: moved, maxSplats: 0, order };
+    const wanted = {
+      snapshot: { index, ptsSeconds, fields: snapshotFields, training },
+      camera: moved,
+      maxSplats: 0,
+      order,
+    };
     take("upload", () => pipeline.adopt(wanted, header.distanceInput));
     take("mlp", () => pipeline.evaluate(moved));
     take("draw", () => pipeline.draw(moved, 1));

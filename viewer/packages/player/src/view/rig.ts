@@ -31,6 +31,20 @@ export interface Rig {
   readonly first: RigCamera;
 }
 
+/** A free camera's near plane is at least this share of that of the nearest camera of the rig: what is nearer is a blur. */
+const MIN_NEAR_SHARE = 0.01;
+
+/**
+ * Near plane of a camera at `eye`, in scene units. That of the capture belongs to its cameras: what is left of the nearest
+ * one's after the distance to it cuts nothing that the rig shows (docs/conventions.md).
+ */
+export function nearPlane({ cameras }: Pick<Rig, "cameras">, eye: Vector): number {
+  const away = ({ camera }: RigCamera) => length(along(eye, center(camera), -1));
+  const nearest = cameras.reduce((best, other) => (away(other) < away(best) ? other : best));
+  const { near } = nearest.camera;
+  return Math.max(near - away(nearest), MIN_NEAR_SHARE * near);
+}
+
 export function rigOf(header: StreamHeader): Rig {
   const found = rigCameras(header);
   const cameras = header.cameras.map(({ name, heldOut }, i) => ({ name, heldOut, camera: found[i]! }));
