@@ -69,7 +69,7 @@ def test_a_picture_and_a_pair_are_looked_at_once(monkeypatch: pytest.MonkeyPatch
 
 
 def test_inliers_lie_as_near_in_larger_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same pictures with twice the pixels, whose keypoints are off by as much of a picture, have as many matches."""
+    """Keypoints that are off by the same share of a picture match, however many pixels it has."""
     g = np.random.default_rng(3)
 
     def count(times: int) -> int:

@@ -189,7 +189,7 @@ def test_cameras_that_look_away_from_each_other_give_random_points() -> None:
 
 
 def test_keypoints_are_those_of_pictures_of_the_reference_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures of twice the size give the points that they give when they are reduced, without a search in all pixels."""
+    """Pictures of twice the size give the points that they give when they are reduced."""
     clip, config = CLIP, PointsConfig(max_points=20_000, sweep_levels=(), min_points=1)
     frame, rig = next(iter(clip.frames())), clip.rig
     width, height = rig[rig.training[0]].width, rig[rig.training[0]].height
