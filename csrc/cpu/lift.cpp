@@ -13,15 +13,17 @@ namespace structgstream {
 namespace SGS_ISA {
 namespace {
 
-// Geman-McClure scales in pixels of the rounds after the first, which trusts everything.
-constexpr float kRobustPixels[] = {4.0f, 2.5f, 1.5f, 1.5f, 1.0f, 1.0f};
-constexpr float kInlierPixels = 1.5f;
+// See kernels/reference_lift.py for the units and reasons.
+constexpr float kTolerancePixels = 1.0f, kToleranceShare = 0.1f;
+constexpr float kRobustScales[] = {4.0f, 2.5f, 1.5f, 1.5f, 1.0f, 1.0f};
+constexpr float kInlierScale = 1.5f;
 constexpr float kPriorShare = 0.02f, kPriorFloor = 0.05f, kTiny = 1e-12f;
 
 // Data of one neighbour in one view: two rows of a Jacobian, the flow, and the weight. One array each, padded with
 // terms of weight zero to whole vectors.
+constexpr int kColumns = 10;
 struct Terms {
-    std::vector<float> columns[9];  // J00 J01 J02 J10 J11 J12 fx fy w
+    std::vector<float> columns[kColumns];  // J00 J01 J02 J10 J11 J12 fx fy w, 1 / squared tolerance
     std::vector<int> view_ends;
     int count = 0;
 
@@ -31,7 +33,7 @@ struct Terms {
         for (auto& column : columns) column.clear();
     }
     void add(const float* values) {
-        for (int i = 0; i < 9; ++i) columns[i].push_back(values[i]);
+        for (int i = 0; i < kColumns; ++i) columns[i].push_back(values[i]);
         ++count;
     }
     void pad() {
@@ -60,10 +62,13 @@ void gather(const FlowLift& lift, int64_t target, Terms& terms) {
         for (int n = 0; n < lift.neighbour_count; ++n) {
             const int64_t mover = lift.neighbours[target * lift.neighbour_count + n];
             const int64_t at = view * lift.movers + mover;
-            float values[9];
+            float values[kColumns];
             values[8] = lift.weights[at] * lift.affinities[target * lift.neighbour_count + n];
             if (!(values[8] > 0.0f) || !jacobian(lift, view, lift.centers + 3 * mover, values)) continue;
             values[6] = lift.flows[2 * at], values[7] = lift.flows[2 * at + 1];
+            const float length = std::sqrt(values[6] * values[6] + values[7] * values[7]);
+            const float tolerance = kTolerancePixels + kToleranceShare * length;
+            values[9] = 1.0f / (tolerance * tolerance);
             terms.add(values);
         }
         terms.view_ends.push_back(terms.count);
@@ -78,11 +83,12 @@ float sum(vf v) {
     return total;
 }
 
+// Squared residuals of the flow under d, in units of each term's tolerance.
 vf squared_error(const Terms& terms, int i, const float* d) {
     const auto& c = terms.columns;
     const vf x = load(&c[0][i]) * d[0] + load(&c[1][i]) * d[1] + load(&c[2][i]) * d[2] - load(&c[6][i]);
     const vf y = load(&c[3][i]) * d[0] + load(&c[4][i]) * d[1] + load(&c[5][i]) * d[2] - load(&c[7][i]);
-    return x * x + y * y;
+    return (x * x + y * y) * load(&c[9][i]);
 }
 
 // Solves the symmetric A x = b by Cholesky's method; A has a ridge, so it is positive definite.
@@ -137,7 +143,7 @@ void lift_target(const FlowLift& lift, int64_t target, Terms& terms) {
     }
     const float total = sum(weight), stiffness = sum(squares) / (2.0f * std::max(total, kTiny));
     refine(terms, 0.0f, stiffness, prior, d);
-    for (float scale : kRobustPixels) refine(terms, scale, stiffness, prior, d);
+    for (float scale : kRobustScales) refine(terms, scale, stiffness, prior, d);
     float agreed_in_all = 0.0f;
     int i = 0;
     for (int end : terms.view_ends) {
@@ -146,7 +152,7 @@ void lift_target(const FlowLift& lift, int64_t target, Terms& terms) {
             const float x = c[0][i] * d[0] + c[1][i] * d[1] + c[2][i] * d[2] - c[6][i];
             const float y = c[3][i] * d[0] + c[4][i] * d[1] + c[5][i] * d[2] - c[7][i];
             of_view += c[8][i];
-            if (x * x + y * y < kInlierPixels * kInlierPixels) agreed += c[8][i];
+            if ((x * x + y * y) * c[9][i] < kInlierScale * kInlierScale) agreed += c[8][i];
         }
         agreed_in_all += agreed;
         lift.agreeing_views[target] += agreed > lift.share * of_view;

@@ -1,7 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optical flow between two pictures of one camera, and its forward-backward consistency."""
+"""Optical flow between two pictures of one camera, and its forward-backward consistency.
+
+Dense inverse search (:func:`dis_search`) is accurate, but loses what moves farther than its own size: at the levels of
+the pyramid where the motion is short, the thing has vanished. :func:`block_search` looks through all displacements up
+to a bound at a size where that is cheap, and :func:`dis_refinement` makes its answer accurate.
+"""
 
 from collections.abc import Callable
+from math import hypot
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +25,15 @@ FlowSearch = Callable[[NDArray[np.uint8], NDArray[np.uint8]], NDArray[np.float32
 picture corresponds to ``p + flow[p]`` in the second."""
 
 
+FlowRefinement = Callable[[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]], NDArray[np.float32]]
+"""As :data:`FlowSearch`, with an approximate flow ``[H, W, 2]`` to begin from."""
+
+BLOCK_COST_CLIP = 300.0
+"""Largest difference of two cells, levels of 255 summed over the channels: beyond it they are just different."""
+BLOCK_COST_PER_CELL = 0.6
+"""Cost of a displacement by one cell, in the same levels, which decides where the pictures are plain."""
+
+
 def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> FlowSearch:
     """Flow by dense inverse search (Kroeger et al., 2016) on grey pictures.
 
@@ -31,10 +47,7 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", extra) from None
+    cv2 = _opencv(extra)
     preset = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if refined else cv2.DISOPTICAL_FLOW_PRESET_FAST
     search = cv2.DISOpticalFlow.create(preset)
     if not refined:
@@ -49,6 +62,95 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
     return flow
 
 
+def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
+    """As :func:`dis_search` with ``refined=False``, but from an approximate flow and the level ``coarsest_level`` on.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    cv2 = _opencv("capture")
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    search.setFinestScale(finest_level)
+    search.setCoarsestScale(coarsest_level)
+    search.setVariationalRefinementIterations(0)
+
+    def flow(first: NDArray[np.uint8], second: NDArray[np.uint8], start: NDArray[np.float32]) -> NDArray[np.float32]:
+        one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second))
+        return np.asarray(search.calc(one, other, start.copy()), np.float32)
+
+    return flow
+
+
+def block_search(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], *, cell_pixels: int, reach_cells: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Approximate flow ``[H, W, 2]`` from ``first`` to ``second`` and back: block matching of reduced pictures.
+
+    A pixel of a reduced picture is a cell. For each cell p the displacement s of at most ``reach_cells`` cells with the
+    least cost is taken: ``min(sum_c |first(p) - second(p + s)|, 300)``, averaged over 3 x 3 cells, plus ``0.6 |s|``.
+    Then the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes over the cells.
+
+    Args:
+        first: ``[H, W, 3]``.
+        second: ``[H, W, 3]``.
+        cell_pixels: size of a cell.
+        reach_cells: bound of displacements.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    cv2 = _opencv("capture")
+    height, width = first.shape[:2]
+    columns, rows = -(-width // cell_pixels), -(-height // cell_pixels)
+    one, other = (
+        cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32)
+        for picture in (first, second)
+    )
+    displacements = _displacements(reach_cells, columns, rows)
+    least = [np.full((rows, columns), np.inf, np.float32) for _ in range(2)]
+    best = [np.zeros((rows, columns), np.int16) for _ in range(2)]
+    total = np.ones((1, 3), np.float32)
+    for number, (dx, dy) in enumerate(displacements):
+        # The cells of the first picture that the displacement leads to cells of the second, and these.
+        here = slice(max(0, -dy), rows - max(0, dy)), slice(max(0, -dx), columns - max(0, dx))
+        there = slice(max(0, dy), rows + min(0, dy)), slice(max(0, dx), columns + min(0, dx))
+        cost = cv2.transform(cv2.absdiff(one[here], other[there]), total)
+        np.minimum(cost, BLOCK_COST_CLIP, out=cost)
+        cost = cv2.boxFilter(cost, -1, (3, 3), borderType=cv2.BORDER_REPLICATE)
+        cost += BLOCK_COST_PER_CELL * hypot(dx, dy)
+        for at, direction in ((here, 0), (there, 1)):
+            better = cost < least[direction][at]
+            np.copyto(least[direction][at], cost, where=better)
+            np.copyto(best[direction][at], number, where=better)
+    cells = np.array(displacements, np.float32) * (width / columns, height / rows)
+    forward, back = (
+        _enlarged(sign * cells[numbers], (width, height)) for sign, numbers in zip((1, -1), best, strict=True)
+    )
+    return forward, back
+
+
+def _enlarged(cells: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """The median over 3 x 3 cells of a flow ``[h, w, 2]``, interpolated to a width and height."""
+    cv2 = _opencv("capture")
+    smooth = [cv2.medianBlur(np.ascontiguousarray(cells[..., axis], np.float32), 3) for axis in (0, 1)]
+    return np.asarray(cv2.resize(np.stack(smooth, -1), size), np.float32)
+
+
+def _displacements(reach: int, columns: int, rows: int) -> list[tuple[int, int]]:
+    """Displacements (x, y) by at most ``reach`` cells that connect cells of two pictures, shortest first."""
+    xs, ys = (range(-min(reach, size - 1), min(reach, size - 1) + 1) for size in (columns, rows))
+    found = [(x, y) for y in ys for x in xs if x * x + y * y <= reach * reach]
+    return sorted(found, key=lambda by: by[0] ** 2 + by[1] ** 2)
+
+
+def _opencv(extra: str) -> Any:
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", extra) from None
+    return cv2
+
+
 def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[float, float]:
     """How far ``second`` is shifted as a whole against ``first`` ``[H, W, 3]``, in pixels, and how clearly, 0 to 1:
     phase correlation (Kuglin and Hines, 1975) of grey pictures under a Hann window.
@@ -56,10 +158,7 @@ def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
+    cv2 = _opencv("capture")
     one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (first, second))
     height, width = one.shape
     if min(height, width) < 2:

@@ -310,7 +310,7 @@ COMPACT = replace(
             tiles_around=1,
             rest_every=3,
         ),
-        start=MotionStartConfig(enabled=True, flow=FlowConfig(apart=True)),
+        start=MotionStartConfig(enabled=True, flow=FlowConfig(apart=True, far=True)),
         births=BirthConfig(enabled=True, changed_floor_medians=1.0, thin=ThinBirthConfig(enabled=True)),
         motion_prior=0.7,
         coherence=CoherenceConfig(weight=8e-4),

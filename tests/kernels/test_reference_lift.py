@@ -3,6 +3,7 @@
 
 import torch
 
+from structgstream.kernels import reference_lift
 from structgstream.kernels.motion_types import Neighbors, ViewFlows
 from structgstream.kernels.reference_lift import lift, projection_jacobians
 
@@ -72,6 +73,48 @@ def test_a_view_whose_flow_is_wrong_is_outvoted() -> None:
     torch.testing.assert_close(found.displacements, MOTION.expand(MOVERS, 3), atol=3e-3, rtol=0.1)
     assert (found.agreeing_views == VIEWS - 1).all()
     torch.testing.assert_close(found.inlier_share, torch.full_like(found.inlier_share, 0.8))
+
+
+def test_a_turning_ball_that_moves_by_40_pixels_is_lifted_whole(monkeypatch) -> None:
+    """Its flow is right, but 40 pixels are not linear, and one displacement is fitted to neighbours that turn."""
+    viewmats, Ks, near = cameras()
+    generator = torch.Generator().manual_seed(3)
+    skin = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator, dtype=torch.float64), dim=1)
+    ball = 0.12 * skin
+    turn = torch.linalg.matrix_exp(0.25 * torch.tensor([[0, -1, 0.5], [1, 0, 0.3], [-0.5, -0.3, 0]]).double())
+    by = torch.tensor([0.22, -0.14, 0.10], dtype=torch.float64)
+    now = ball @ turn.T + by
+
+    def projected(x: torch.Tensor) -> torch.Tensor:
+        seen = torch.einsum("vij,ej->vei", viewmats[:, :3, :3], x) + viewmats[:, None, :3, 3]
+        pixels = torch.einsum("vij,vej->vei", Ks, seen)
+        return pixels[..., :2] / pixels[..., 2:]
+
+    flows = projected(now) - projected(ball)
+    assert flows.norm(dim=-1).mean() > 30.0
+    distances = torch.cdist(ball, ball)
+    rows = distances.argsort(1)[:, :12]
+    near_by = distances.gather(1, rows)
+    affinities = torch.exp(-0.5 * (near_by / (0.7 * near_by[:, -1:])).square())
+    seen = ViewFlows(torch.full_like(flows[..., 0], 5.0), flows, viewmats, Ks, near)
+
+    def lifted_share() -> float:
+        found = lift(ball, seen, Neighbors(rows, affinities), torch.zeros_like(ball), share=0.4)
+        whole = (found.inlier_share > 0.4) & (found.agreeing_views >= 2)
+        errors = (found.displacements - (now - ball)).norm(dim=1)
+        assert (errors[whole] < 0.2 * by.norm()).all()
+        return float(whole.double().mean())
+
+    assert lifted_share() == 1.0
+    monkeypatch.setattr(reference_lift, "TOLERANCE_SHARE", 0.0)
+    assert lifted_share() < 0.5, "a tolerance in pixels alone"
+
+
+def test_where_nothing_moves_fast_an_error_of_three_pixels_is_outvoted() -> None:
+    viewmats, Ks, near = cameras()
+    flows = projection_jacobians(centers(), viewmats, Ks, near) @ (0.3 * MOTION)
+    flows[2] += torch.tensor([3.0, 0.0])
+    assert (lifted(flows).agreeing_views == VIEWS - 1).all()
 
 
 def test_without_flow_the_prior_holds() -> None:

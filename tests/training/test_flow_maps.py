@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flow as maps: where it is believed, and where it is not looked for."""
 
-from functools import partial
-
 import cv2
 import numpy as np
 import pytest
@@ -13,10 +11,15 @@ from hypothesis.extra.numpy import arrays
 
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.flow_maps import FlowConfig, _parts, flow_map
+from structgstream.training.flow_maps import FlowConfig, FlowMaps, _parts, flow_map
 
-one_box = partial(flow_map, config=FlowConfig(), backend=reference_backend())
-boxes_apart = partial(flow_map, config=FlowConfig(apart=True), backend=reference_backend())
+
+def one_box(*given) -> torch.Tensor:
+    return flow_map(*given, config=FlowConfig(), backend=reference_backend()).maps
+
+
+def boxes_apart(*given) -> torch.Tensor:
+    return flow_map(*given, config=FlowConfig(apart=True), backend=reference_backend()).maps
 
 
 def textured(height: int = 120, width: int = 160) -> np.ndarray:
@@ -97,6 +100,67 @@ def test_parts_near_each_other_are_searched_together() -> None:
     pictures = torch.from_numpy(first), torch.from_numpy(second)
     one, apart = (search(*pictures, changed, (120, 160)) for search in (one_box, boxes_apart))
     assert torch.equal(one, apart)
+
+
+WIDTHS = pytest.mark.parametrize("width", [320, 960, 1920])
+
+
+def thrown(width: int, *, far: bool, by: float = 60 / 320) -> tuple[FlowMaps, torch.Tensor]:
+    """Flow, at the size of the pictures, of a ball that crosses a share of the width over a resting ground; the ball's
+    pixels in the first picture."""
+    height, radius, moved = width * 3 // 4, width // 20, round(by * width)
+    small = textured(120, 160)
+    ground = cv2.resize(small // 4 + 96, (width, height), interpolation=cv2.INTER_CUBIC)
+    skin = cv2.resize(np.ascontiguousarray(small[::-1, ::-1]), (width, height), interpolation=cv2.INTER_AREA)
+    rows, columns = np.mgrid[:height, :width]
+    ball = (rows - height // 2) ** 2 + (columns - width // 3) ** 2 < radius**2
+    first, second = ground.copy(), ground.copy()
+    first[ball], second[np.roll(ball, moved, 1)] = skin[ball], skin[ball]
+    pictures = torch.from_numpy(first), torch.from_numpy(second)
+    changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
+    config = FlowConfig(apart=True, far=far)
+    found = flow_map(*pictures, changed, (height, width), config=config, backend=reference_backend())
+    return found, torch.from_numpy(ball)
+
+
+@WIDTHS
+def test_a_ball_that_crosses_a_share_of_the_width_is_found_at_every_size(width: int) -> None:
+    by = 0.14
+    found, ball = thrown(width, far=True, by=by)
+    assert found.far_boxes == 1, "the old and the new place are searched together"
+    confidence, flow = found.maps[ball][:, 0], found.maps[ball][:, 1:]
+    assert confidence.mean() > 0.7
+    expected = torch.tensor([round(by * width), 0.0])
+    right = (flow - expected).norm(dim=1) < 0.01 * width
+    assert right[confidence > 0].float().mean() > 0.95
+    nothing = thrown(width, far=False, by=by)[0].maps[ball]
+    assert ((nothing[:, 1:] - expected).norm(dim=1) < 0.01 * width).float().mean() < 0.3, "else this tests nothing"
+
+
+@WIDTHS
+def test_what_does_not_move_far_is_searched_once(width: int) -> None:
+    once, again = (thrown(width, far=far, by=0.01)[0] for far in (False, True))
+    assert again.far_boxes == 0
+    assert torch.equal(once.maps, again.maps)
+
+
+def test_where_there_is_nothing_to_find_no_far_flow_is_found() -> None:
+    """A ball that appears, on a ground that rests: what is found of it in the ground is not found back."""
+    first = cv2.resize(textured(), (640, 480)) // 4 + 96
+    second = first.copy()
+    cv2.circle(second, (300, 200), 30, (250, 40, 40), -1)
+    pictures = torch.from_numpy(first), torch.from_numpy(second)
+    changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
+    config = FlowConfig(apart=True, far=True)
+    found = flow_map(*pictures, changed, (480, 640), config=config, backend=reference_backend())
+    assert found.far_boxes == 1
+    far = found.maps[..., 1:].norm(dim=-1) > 8.0
+    assert (far & changed).sum() < 0.02 * changed.sum()
+    assert not (far & ~changed).any()
+
+
+def test_far_flow_is_repeated_bit_for_bit() -> None:
+    assert torch.equal(thrown(320, far=True)[0].maps, thrown(320, far=True)[0].maps)
 
 
 @given(cells=st.integers(1, 12).flatmap(lambda n: arrays(np.bool_, (n, 13), elements=st.booleans())))

@@ -6,9 +6,17 @@ from torch import Tensor
 
 from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 
-ROBUST_PIXELS = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
-"""Scale of the Geman-McClure weights in each round after the first, which has none."""
-INLIER_PIXELS = 1.5
+TOLERANCE_PIXELS, TOLERANCE_SHARE = 1.0, 0.1
+"""Tolerance of an observed flow f, pixels: the first plus the second times |f|.
+
+The first is the noise of the flow search, whose finest level is at most half the size of the pictures, however large
+they are (``flow_maps.FlowConfig``): a number of pixels, not a share of the width. The second covers what grows with the
+displacement: the linearised projection, rotation of the object (one displacement fits several neighbours), and errors
+of the search on large motion, together 5 to 10 per cent of |f|."""
+ROBUST_SCALES = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
+"""Scale of the Geman-McClure weights in each round after the first, which has none, in tolerances."""
+INLIER_SCALE = 1.5
+"""A flow whose residual is below this, in tolerances, is an inlier."""
 PRIOR_SHARE, PRIOR_FLOOR = 0.02, 0.05
 
 
@@ -33,17 +41,18 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     total = w.sum((0, 2))
     stiffness = (w * J.square().sum((-1, -2))).sum((0, 2)) / (2.0 * total.clamp(min=1e-12))
     eye = torch.eye(3, dtype=centers.dtype, device=centers.device)
+    tolerances = TOLERANCE_PIXELS + TOLERANCE_SHARE * f.norm(dim=-1)  # [V, T, N]
     d = priors
-    for scale in (None, *ROBUST_PIXELS):
+    for scale in (None, *ROBUST_SCALES):
         now = w
         if scale is not None:
-            now = w / (1.0 + _squared(J, f, d) / scale**2).square()
+            now = w / (1.0 + _squared(J, f, d) / (scale * tolerances).square()).square()
         reg = (PRIOR_SHARE * now.sum((0, 2)) + PRIOR_FLOOR) * stiffness.clamp(min=1e-12)
         A = torch.einsum("vtn,vtnki,vtnkj->tij", now, J, J) + reg[:, None, None] * eye
         b = torch.einsum("vtn,vtnki,vtnk->ti", now, J, f) + reg[:, None] * priors
         d = torch.linalg.solve(A, b)
     d = torch.where((total > 0)[:, None], d, priors)
-    inlier = w * (_squared(J, f, d) < INLIER_PIXELS**2)
+    inlier = w * (_squared(J, f, d) < (INLIER_SCALE * tolerances).square())
     of_view, agreed = w.sum(2), inlier.sum(2)  # [V, T]
     return Lifted(
         d,

@@ -1,7 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optical flow of a training camera as maps to be summed by blending weights."""
+"""Optical flow of a training camera as maps to be summed by blending weights.
 
+Note [Lengths of the flow search]
+~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
+What moves is as large, and moves as far, as a share of the picture. So margins, cells and the reach of the search for
+large motion are shares of the longer side. The floor of the margin is in pixels because the search compares patches of
+8 pixels.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import floor, log2
 
 import numpy as np
 import torch
@@ -9,14 +18,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.flow import ABSOLUTE, RELATIVE, dis_search
+from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search
 from structgstream.kernels.backend import Backend
 from structgstream.training.views import area_mean
 
-CONTEXT_PIXELS = 16
-"""Margin in pixels around the bounding box of the changed pixels, in which flow is estimated."""
+CONTEXT_SHARE, LEAST_CONTEXT_PIXELS = 1 / 40, 16
+"""Margin around the bounding box of the changed pixels, in which flow is estimated: share of the picture's longer side,
+but at least so many pixels (Note [Lengths of the flow search])."""
 LEAST_SAVING = 0.8
 """Boxes around parts have to be together smaller than this share of the box around all."""
+CELLS, REACH_CELLS = 80, 12
+"""The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
+of them: 15 per cent of it."""
+CONSISTENT_SHARE = 0.6
+"""Large motion is searched for where less than this share of the changed pixels has consistent flow. What has left its
+own outline leaves at most half of them."""
+CHANGED_CELLS = 1.0
+"""But at least so many cells have to have changed: less is noise, or too small to be matched."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +49,8 @@ class FlowConfig:
     apart: bool = False
     """Search in a box for each part of a picture that changed, instead of one around all: quicker where things move far
     from each other."""
+    far: bool = False
+    """Where flow is inconsistent, search again for motion by more than things are large (``flow.block_search``)."""
 
     def __post_init__(self) -> None:
         if self.finest_level < 0 or self.least_width < 0:
@@ -50,6 +70,19 @@ class FlowConfig:
 USUAL_FLOW = FlowConfig()
 
 
+@dataclass(frozen=True)
+class FlowMaps:
+    """Flow between two pictures of one camera with confidence c, the share of consistent pixels.
+
+    Args:
+        maps: ``[h, w, 3]``: c, c flow_x and c flow_y (``kernels.operations.ConfidentFlow``).
+        far_boxes: number of boxes in which large motion was searched for.
+    """
+
+    maps: Tensor
+    far_boxes: int = 0
+
+
 def flow_map(
     first: Tensor,
     second: Tensor,
@@ -59,11 +92,11 @@ def flow_map(
     mask: Tensor | None = None,
     config: FlowConfig,
     backend: Backend,
-) -> Tensor:
-    """Flow between two pictures of one camera with confidence c: ``[h, w, 3]``, the maps (c, c flow_x, c flow_y).
+) -> FlowMaps:
+    """Flow between two pictures of one camera.
 
-    c is the share of consistent pixels (``kernels.operations.ConfidentFlow``), zero outside a box around ``changed``,
-    or with ``config.apart`` outside boxes around its parts, where these are small.
+    The confidence is zero outside a box around ``changed``, or with ``config.apart`` outside boxes around its parts,
+    where these are small.
 
     Args:
         first: ``[H, W, 3]`` uint8.
@@ -73,52 +106,87 @@ def flow_map(
         mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
         config: of the search.
         backend: the compute back-end.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
     """
     maps = torch.zeros(3, *changed.shape)
-    search = dis_search("capture", refined=False, finest_level=config.level_of(changed.shape[1]))
     where = changed.numpy(force=True)
-    for rows, columns in _boxes(where) if config.apart else _box(where):
-        earlier, later = (np.ascontiguousarray(p[rows, columns].numpy(force=True)) for p in (first, second))
-        forward, back = (torch.from_numpy(search(*pair)) for pair in ((earlier, later), (later, earlier)))
-        counts = None if mask is None else mask[rows, columns].cpu()
-        maps[:, rows, columns] = backend.confident_flow(forward, back, counts, relative=RELATIVE, absolute=ABSOLUTE)
-    return area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device)
+    longer, level = max(where.shape), config.level_of(where.shape[1])
+    context = max(LEAST_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
+    search = dis_search("capture", refined=False, finest_level=level)
+
+    def consistent(box: Box, flow: NDArray[np.float32], back: NDArray[np.float32]) -> Tensor:
+        counts = None if mask is None else mask[box].cpu()
+        forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
+        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
+
+    missed: list[Box] = []
+    cell = max(1, round(longer / CELLS))
+    for box in _boxes(where, context) if config.apart else _box(where, context):
+        earlier, later = _cut(first, box), _cut(second, box)
+        maps[:, *box] = found = consistent(box, search(earlier, later), search(later, earlier))
+        at = where[box]
+        if config.far and at.sum() >= CHANGED_CELLS * cell**2 and found[0].numpy()[at].mean() < CONSISTENT_SHARE:
+            missed.append(box)
+    far = _grown(missed, REACH_CELLS * cell, where.shape)
+    for box in far:
+        earlier, later = _cut(first, box), _cut(second, box)
+        flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
+        refine = dis_refinement(finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
+        found = consistent(box, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
+        missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
+        maps[:, *box] = torch.where(missing, found, maps[:, *box])
+    return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device), len(far))
 
 
 Box = tuple[slice, slice]
 Mask = NDArray[np.bool_]
+Edges = tuple[int, int, int, int]
+"""First and end row, first and end column of a box."""
 
 
-def _box(mask: Mask) -> list[Box]:
-    """Bounding box of the mask ``[H, W]`` with margin; none if it is empty or too small for the flow search."""
+def _cut(picture: Tensor, box: Box) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(picture[box].numpy(force=True))
+
+
+def _box(mask: Mask, context: int) -> list[Box]:
+    """Bounding box of the mask ``[H, W]`` with a margin of ``context`` pixels; none if it is empty or too small for the
+    flow search."""
     if not mask.any():
         return []
     spans = []
     for axis in (1, 0):
         hit = np.flatnonzero(mask.any(axis))
-        low, high = int(hit[0]) - CONTEXT_PIXELS, int(hit[-1]) + 1 + CONTEXT_PIXELS
+        low, high = int(hit[0]) - context, int(hit[-1]) + 1 + context
         spans.append(slice(max(0, low), min(mask.shape[1 - axis], high)))
-    if min(span.stop - span.start for span in spans) < 2 * CONTEXT_PIXELS:
+    if min(span.stop - span.start for span in spans) < 2 * context:
         return []
     return [(spans[0], spans[1])]
 
 
-def _boxes(mask: Mask) -> list[Box]:
+def _boxes(mask: Mask, context: int) -> list[Box]:
     """Disjoint boxes with margin around the parts of the mask ``[H, W]``; one around all if that is hardly larger."""
-    one = _box(mask)
-    rows, columns = (-(-length // CONTEXT_PIXELS) for length in mask.shape)
-    padded = np.zeros((rows * CONTEXT_PIXELS, columns * CONTEXT_PIXELS), bool)
+    one = _box(mask, context)
+    rows, columns = (-(-length // context) for length in mask.shape)
+    padded = np.zeros((rows * context, columns * context), bool)
     padded[: mask.shape[0], : mask.shape[1]] = mask
     # First down the columns, whose steps are long: NumPy takes ten times as long for both at once.
-    high = padded.reshape(rows, CONTEXT_PIXELS, -1).any(1)
-    cells = np.logical_or.reduce(high.reshape(rows, columns, CONTEXT_PIXELS), axis=2)
-    found = [_pixels(box, mask) for box in _parts(cells)]
+    high = padded.reshape(rows, context, -1).any(1)
+    cells = np.logical_or.reduce(high.reshape(rows, columns, context), axis=2)
+    found = [_within((context * a, context * b, context * c, context * d), mask.shape) for a, b, c, d in _parts(cells)]
     if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
         return one
-    return [box for box in found if min(span.stop - span.start for span in box) >= 2 * CONTEXT_PIXELS]
+    return [box for box in found if min(span.stop - span.start for span in box) >= 2 * context]
 
 
-def _parts(cells: Mask) -> list[tuple[int, int, int, int]]:
+def _grown(boxes: Sequence[Box], by: int, shape: tuple[int, ...]) -> list[Box]:
+    """Disjoint boxes around ``boxes`` and ``by`` pixels more on every side, within ``shape``."""
+    edges = [(rows.start - by, rows.stop + by, columns.start - by, columns.stop + by) for rows, columns in boxes]
+    return [_within(box, shape) for box in _disjoint(edges)]
+
+
+def _parts(cells: Mask) -> list[Edges]:
     """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells`` and the eight
     cells around each."""
     try:
@@ -128,8 +196,12 @@ def _parts(cells: Mask) -> list[tuple[int, int, int, int]]:
     grown = cv2.dilate(cells.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, _, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
     boxes = np.asarray(stats)[1:, :4].tolist()  # The first is what is no part.
-    left = [(top, top + height, first, first + width) for first, top, width, height in boxes]
-    done: list[tuple[int, int, int, int]] = []
+    return _disjoint([(top, top + height, first, first + width) for first, top, width, height in boxes])
+
+
+def _disjoint(boxes: Sequence[Edges]) -> list[Edges]:
+    """``boxes``, those that overlap replaced by one around both until none do."""
+    left, done = list(boxes), list[Edges]()
     while left:
         box = left.pop()
         hit = [other for other in done if _overlap(box, other)]
@@ -143,13 +215,14 @@ def _parts(cells: Mask) -> list[tuple[int, int, int, int]]:
     return sorted(done)
 
 
-def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> bool:
+def _overlap(one: Edges, other: Edges) -> bool:
     return one[0] < other[1] and other[0] < one[1] and one[2] < other[3] and other[2] < one[3]
 
 
-def _pixels(box: tuple[int, int, int, int], mask: Mask) -> Box:
-    top, bottom, left, right = (CONTEXT_PIXELS * edge for edge in box)
-    return slice(top, min(bottom, mask.shape[0])), slice(left, min(right, mask.shape[1]))
+def _within(edges: Edges, shape: tuple[int, ...]) -> Box:
+    """The part of a box that lies in a picture of this shape."""
+    top, bottom, left, right = edges
+    return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
 
 
 def _area(box: Box) -> int:

@@ -21,6 +21,7 @@ from structgstream.training.flow_maps import FlowConfig, flow_map
 from structgstream.training.lifting import LiftConfig, LiftedMotion, lift_motion
 from structgstream.training.motion import FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS, MotionConfig
 from structgstream.training.observation import (
+    MotionEvidence,
     flow_evidence,
     mover_centers,
     movers_of,
@@ -31,6 +32,9 @@ from structgstream.training.observation import (
 from structgstream.training.partition import Partition, focus_views
 from structgstream.training.residuals import apply_camera_color
 from structgstream.training.views import View, as_picture, blackened
+
+FAST_SHARE = 1 / 80
+"""Flow per frame, relative to the longer side of the pictures, above which a mover counts as fast: 8 of 640 pixels."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +70,16 @@ class InitialMotion:
         focuses: by view index, the focus on the moving part.
         lifted_count: number of movers displaced by flow between pictures.
         corrected_count: number of movers displaced by flow from the rendering.
+        fast_count: number of movers whose flow between pictures is larger than :data:`FAST_SHARE`.
+        fast_lifted_count: how many of them are displaced by it; the others are likely to leave ghosts.
     """
 
     displacements: Tensor
     focuses: Mapping[int, Focus]
     lifted_count: int = 0
     corrected_count: int = 0
+    fast_count: int = 0
+    fast_lifted_count: int = 0
 
 
 def estimate_initial_motion(
@@ -101,6 +109,7 @@ def estimate_initial_motion(
     views_with_flow = [view for view in views if view.index in segmentation.views_with_flow]
     first = lift_motion(evidence, centers, priors, views_with_flow, config=config.lift, backend=backend)
     displacements, lifted, corrections = first.displacements, int(first.lifted.sum()), 0
+    fast = _is_fast(evidence, views_with_flow)
     moved = replace(partition, moving=with_displacements(partition.moving, displacements))
     focuses = focus_views(moved, views, config=motion, backend=backend)
     if config.rounds > 1:
@@ -108,7 +117,15 @@ def estimate_initial_motion(
             moved.moving, views_with_flow, focuses, scale=motion.picture_scale, config=config, backend=backend
         )
         displacements, corrections = displacements + second.displacements, int(second.lifted.sum())
-    return InitialMotion(displacements, focuses, lifted, corrections)
+    return InitialMotion(displacements, focuses, lifted, corrections, int(fast.sum()), int((fast & first.lifted).sum()))
+
+
+def _is_fast(evidence: MotionEvidence, views: Sequence[View]) -> Tensor:
+    """Mask ``[E]`` of the movers whose mean flow over the views, as a share of the longer side, exceeds
+    :data:`FAST_SHARE`."""
+    sides = evidence.flows.new_tensor([max(view.camera.width, view.camera.height) for view in views])
+    speeds = evidence.flows.norm(dim=-1) / sides[:, None]
+    return (evidence.weights * speeds).sum(0) > FAST_SHARE * evidence.weights.sum(0)
 
 
 def with_displacements(scene: Scene, displacements: Tensor) -> Scene:
@@ -156,7 +173,7 @@ def residual_motion(
         inside, camera = focuses[view.index].tiles.pixels(), view.evidence(scale).camera
         inside = inside if view.mask is None else inside & view.mask
         size = (camera.height, camera.width)
-        return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend)
+        return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend).maps
 
     threads = torch.get_num_threads()
     with torch.no_grad(), ThreadPoolExecutor(threads) as pool:

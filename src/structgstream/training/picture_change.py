@@ -30,11 +30,13 @@ class PictureChange:
         repeated: whether it is the previous picture once more, equal or encoded again: a frozen camera's.
         flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the previous picture to this one, and the previous
             picture in 0 ... 1; None if flow was not estimated.
+        far_boxes: number of boxes in which large motion was searched for (``flow_maps.FlowMaps``).
     """
 
     changed: Tensor
     repeated: bool
     flow: Tensor | None = None
+    far_boxes: int = 0
 
 
 def detect_picture_changes(
@@ -76,12 +78,12 @@ def detect_picture_changes(
             reach = round(reach_pixels * view.enlargement)
             changed = backend.changed_pixels(then, now, threshold=threshold, reach_pixels=reach)
             changed = changed if both is None else changed & both
-            small, found = view.evidence(scale).camera, None
+            small, found, far_boxes = view.evidence(scale).camera, None, 0
             if view.index in flow_from:
                 size = (small.height, small.width)
-                maps = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
-                found = torch.cat([maps, last.evidence(scale).colors], dim=-1)
-            changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found))
+                estimated = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
+                found, far_boxes = torch.cat([estimated.maps, last.evidence(scale).colors], dim=-1), estimated.far_boxes
+            changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, far_boxes))
     return changes
 
 

@@ -55,7 +55,7 @@ class TrackConfig:
     (:data:`FEWEST_HALVED`, :data:`MOST_CAMERAS`)."""
     picture_scale: float = 0.25
     """Scale, relative to these pictures, at which coverage is computed."""
-    flow: FlowConfig = FlowConfig(apart=True)
+    flow: FlowConfig = FlowConfig(apart=True, far=True)
     """How flow is searched."""
     prior: float = 0.7
     """Movers are initially displaced by this share of their last displacement."""
@@ -276,9 +276,9 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    flow = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
+    found = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
-    maps = torch.cat([flow, inside[..., None], small.colors * inside[..., None]], dim=-1)
+    maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = weigh_maps(moved, small.camera, maps, backend)
     sums *= _enlarged(tracker, view, size)
     return sum_by_mover(sums, seen.movers, scene)
