@@ -19,6 +19,7 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import run_with_pair_budget
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
 from structgstream.training.coherence import MotionCoherence
@@ -88,8 +89,7 @@ def fit_next_frame(
         return held(scene)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
-    if not config.sampling_filter:
-        scene = replace(scene, sampling=None)
+    scene = replace(scene, sampling=RigSampling.of(rig) if config.sampling_filter else None)
     counts: dict[str, int] = {}
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
