@@ -16,7 +16,7 @@ from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
-from structgstream.evaluation.capture import capture_of, part_metadata
+from structgstream.evaluation.capture import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.report import Report
@@ -197,6 +197,7 @@ def evaluate(
     Args:
         path: the stream file.
         capture: the folder of the capture that it was made from, or that capture, opened with the same arguments.
+            Scores at the size of larger stored pictures need the folder.
         cameras: names of the cameras to score; None for the held-out ones.
         metrics: ``basic`` leaves out MS-SSIM, FLIP, LPIPS and the temporal metrics.
         lpips_weights: folder or file with the weights of LPIPS; None for the default places.
@@ -212,7 +213,9 @@ def evaluate(
         BackendError: the back-end is not available.
     """
     with open_stream(path) as reader:
+        stored = None
         if isinstance(capture, Path | str):
+            stored = stored_capture(reader.header, capture, frames=len(reader.packets))
             capture = capture_of(reader.header, capture, frames=len(reader.packets))
         return evaluate_recording(
             reader,
@@ -222,6 +225,7 @@ def evaluate(
             log=read_log(Path(path)),
             metrics=metrics,
             lpips_weights=lpips_weights,
+            stored=stored,
         )
 
 
