@@ -1,8 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The fields of a scene as three's textures: four numbers to a texel, in the order in which the shader counts. */
+/** The fields of a scene, and its training cameras, as three's textures: four numbers to a texel, in the order in which the shader counts. */
 
 import type { FieldName, Fields, Tensor } from "@structgstream/core";
-import { packedWeights, paddedRows, type Shape, TABLE_WIDTH_BITS } from "@structgstream/gl/shading";
+import {
+  packedWeights,
+  paddedRows,
+  type Shape,
+  TABLE_WIDTH_BITS,
+  type TrainingCameras,
+} from "@structgstream/gl/shading";
 import { DataTexture, FloatType, type IUniform, RGBAFormat } from "three";
 
 const WIDTH = 1 << TABLE_WIDTH_BITS;
@@ -21,12 +27,16 @@ const TABLES: Readonly<Record<string, readonly FieldName[]>> = {
 
 export class FieldTextures {
   /** By the names in the shader; three uploads what is new in them. */
-  readonly uniforms: Readonly<Record<string, IUniform<DataTexture>>> = Object.fromEntries(
-    Object.keys(TABLES).map((name) => [name, { value: table(new Float32Array(4)) }]),
-  );
+  readonly uniforms: Readonly<Record<string, IUniform<DataTexture>>>;
   private written = new Map<FieldName, Tensor | undefined>();
 
-  constructor(private readonly shape: Shape) {}
+  constructor(
+    private readonly shape: Shape,
+    training: TrainingCameras,
+  ) {
+    const empty = Object.keys(TABLES).map((name) => [name, { value: table(new Float32Array(4)) }] as const);
+    this.uniforms = { ...Object.fromEntries(empty), cameras: { value: table(training.rows) } };
+  }
 
   /** Takes a scene of the same shape; fields that are the same objects as before stay as they are. */
   write(fields: Fields): void {

@@ -2,7 +2,7 @@
 /** What Spark runs for each splat: an anchor's MLPs for this eye, or a free Gaussian. */
 
 import { dyno } from "@sparkjsdev/spark";
-import { evaluation, mlpLayout, type Shape } from "@structgstream/gl/shading";
+import { evaluation, mlpLayout, SAMPLING_GLSL, type Shape, TRAINING_LOW_PASS } from "@structgstream/gl/shading";
 import type { IUniform, Vector3 } from "three";
 
 /** Beside those of the fields. */
@@ -10,23 +10,29 @@ export interface SceneUniforms {
   readonly eye: IUniform<Vector3>;
   /** How many of the splats are anchors'; the others are free. */
   readonly structuredCount: IUniform<number>;
+  readonly cameraCount: IUniform<number>;
 }
 
 const FREE_TEXELS = 4;
 
 function sceneGlsl(shape: Shape): string {
   const splats = shape.offsetsPerAnchor;
-  return `${evaluation(shape, mlpLayout(shape), { first: 0, count: splats })}
+  return `${evaluation(shape, mlpLayout(shape), { first: 0, count: splats })}${SAMPLING_GLSL}
 uniform sampler2D offsetScales, baseScales, offsets, free;
 uniform int structuredCount;
+
+// The low-pass of the training pictures as a part of the Gaussian.
+vec3 widened(vec3 scales, float interval) {
+  return sqrt(scales * scales + ${TRAINING_LOW_PASS} * interval * interval);
+}
 
 void structuredSplat(int i, inout Gsplat splat) {
   int m = i / ${splats};
   int k = i - m * ${splats};
   evaluate(m);
-  splat.center = texelFetch(positions, place(m), 0).xyz +
-    texelFetch(offsets, place(i), 0).xyz * exp(texelFetch(offsetScales, place(m), 0).xyz);
-  splat.scales = exp(texelFetch(baseScales, place(m), 0).xyz) * b[k].xyz;
+  vec3 anchor = texelFetch(positions, place(m), 0).xyz;
+  splat.center = anchor + texelFetch(offsets, place(i), 0).xyz * exp(texelFetch(offsetScales, place(m), 0).xyz);
+  splat.scales = widened(exp(texelFetch(baseScales, place(m), 0).xyz) * b[k].xyz, samplingInterval(anchor));
   splat.quaternion = vec4(c[k].xyz, b[k].w);
   splat.rgba = vec4(a[k].yzw, a[k].x);
 }
@@ -35,7 +41,7 @@ void freeSplat(int i, inout Gsplat splat) {
   vec4 t[${FREE_TEXELS}];
   for (int j = 0; j < ${FREE_TEXELS}; j++) t[j] = texelFetch(free, place(i * ${FREE_TEXELS} + j), 0);
   splat.center = t[0].xyz;
-  splat.scales = exp(vec3(t[0].w, t[1].xy));
+  splat.scales = widened(exp(vec3(t[0].w, t[1].xy)), samplingInterval(splat.center));
   splat.quaternion = normalize(vec4(t[1].w, t[2].xy, t[1].z)); // x, y, z, w
   splat.rgba = vec4(t[2].w, t[3].xy, 1.0 / (1.0 + exp(-t[2].z)));
 }

@@ -3,7 +3,7 @@
 
 import { dyno, SplatGenerator, SplatTransformer } from "@sparkjsdev/spark";
 import { type Fields, StreamError, type StreamHeader } from "@structgstream/core";
-import { type Shape, sameShape, shapeOf, sizesOf } from "@structgstream/gl/shading";
+import { type Shape, sameShape, shapeOf, sizesOf, trainingCamerasOf } from "@structgstream/gl/shading";
 import { type IUniform, Matrix4, Vector3 } from "three";
 import { FieldTextures } from "./fieldTextures.js";
 import { splatOfNumber } from "./generator.js";
@@ -67,10 +67,12 @@ export class StreamSplats extends SplatGenerator {
 
   private begin(shape: Shape): void {
     this.textures?.dispose();
-    const textures = new FieldTextures(shape);
+    const training = trainingCamerasOf(this.header);
+    const textures = new FieldTextures(shape, training);
     this.textures = textures;
     this.shape = shape;
-    const uniforms = { ...textures.uniforms, eye: this.eye, structuredCount: this.structuredCount };
+    const { eye, structuredCount } = this;
+    const uniforms = { ...textures.uniforms, eye, structuredCount, cameraCount: { value: training.count } };
     this.generator = dyno.dynoBlock({ index: "int" }, { gsplat: dyno.Gsplat }, ({ index }) => {
       if (!index) throw new RangeError("Spark gave no number of a splat");
       return { gsplat: this.transformer.applyGsplat(splatOfNumber(shape, uniforms, index)) };

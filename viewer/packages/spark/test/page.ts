@@ -3,7 +3,7 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import { readStream, type StreamReader } from "@structgstream/core";
-import { type Camera, rigCamera, SplatRenderer } from "@structgstream/gl";
+import { type Camera, resized, rigCamera, SplatRenderer } from "@structgstream/gl";
 import { Matrix4, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { base64, pixelsOf } from "../../gl/test/support/pixels.ts";
 import { StreamSplats } from "../src/index.ts";
@@ -25,22 +25,32 @@ export class Beside {
     // What is behind the scene is not the adapter's.
     const known = [...reader.header!.static].filter(([name]) => name !== "environment");
     this.own.load({ ...reader.header!, static: new Map(known) });
-    // As the trainer's rasteriser: 0.3 square pixels more on each axis, in the order of depth.
-    const rules = { preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3, clipXY: 4 };
+    // The low-pass of the training pictures is in the scales; the order is that of depth.
+    const rules = { preBlurAmount: 0, blurAmount: 0, sortRadial: false, maxStdDev: 3, clipXY: 4 };
     this.spark = new SparkRenderer({ renderer: this.renderer, ...rules });
     this.scene.add(this.spark, this.splats);
   }
 
-  /** RGBA of a frame as a camera of the rig sees it, by Spark and by our own renderer, as base64. */
-  async pictures(index: number, name: string): Promise<{ spark: string; own: string; width: number; height: number }> {
+  /**
+   * RGBA of a frame as a camera of the rig sees it, on a picture of `size` times its own, by Spark and by our
+   * own renderer, as base64.
+   */
+  async pictures(
+    index: number,
+    name: string,
+    size = 1,
+  ): Promise<{ spark: string; own: string; width: number; height: number }> {
     const { fields, ptsSeconds } = this.reader.frame(index);
-    const camera = rigCamera(this.reader.header!, name);
-    const { width, height } = camera;
+    const filmed = rigCamera(this.reader.header!, name);
+    const [width, height] = [Math.round(size * filmed.width), Math.round(size * filmed.height)];
+    const camera = resized(filmed, width, height);
     const changed = [...fields].filter(([name]) => this.reader.header!.dynamic.has(name));
     this.own.update({ index, ptsSeconds, fields: new Map(changed) });
     await this.own.renderSettled(camera);
     const own = await pixelsOf(await this.own.screenshot());
     this.splats.show(fields);
+    // What smaller pictures lack against aliasing.
+    this.spark.blurAmount = Math.max(0.15 - 0.3 * size * size, 0);
     this.renderer.setSize(width, height, false);
     const eye = this.threeCamera(name, camera);
     for (let atRest = 0; atRest < PICTURES; ) {

@@ -23,11 +23,11 @@ describe.skipIf(!executable)("in a browser", () => {
   }, 60_000);
   afterAll(() => stage?.close());
 
-  const compared = async (index: number, camera: string) => {
-    const { spark, own, width, height } = await stage.page.evaluate(([frame, name]) => beside.pictures(frame, name), [
-      index,
-      camera,
-    ] as const);
+  const compared = async (index: number, camera: string, size = 1) => {
+    const { spark, own, width, height } = await stage.page.evaluate(
+      ([frame, name, of]) => beside.pictures(frame, name, of),
+      [index, camera, size] as const,
+    );
     return { spark: bytesOf(spark), ...difference(bytesOf(spark), bytesOf(own), width, height), width, height };
   };
 
@@ -50,6 +50,20 @@ describe.skipIf(!executable)("in a browser", () => {
     expect(error).toBe("");
     expect(splats).toBeGreaterThan(500);
   }, 120_000);
+
+  test.each([
+    [3, LEAST_DECIBELS],
+    // Spark filters all Gaussians alike, the renderer each by what it lacks.
+    [0.5, 36],
+  ])(
+    "pictures of %s times the size look alike too",
+    async (size, least) => {
+      const view = await compared(0, "cam00", size);
+      console.log(`${size}x: ${view.psnrDecibels.toFixed(1)} dB`);
+      expect(view.psnrDecibels).toBeGreaterThan(least);
+    },
+    120_000,
+  );
 
   test("it is given back", async () => {
     await stage.page.evaluate(() => beside.close());

@@ -338,6 +338,20 @@ describe.skipIf(!executable)("the player in a browser", () => {
     expectQuiet();
   });
 
+  test("who comes closer does not push the capture's near plane along", async () => {
+    const page = await open();
+    await shows(page, 0);
+    const near = () => ask(page, (player) => player.camera!.near);
+    const header = readStream(CLIP).header!;
+    const capture = header.cameras[0]!.near * header.similarity.scale;
+    expect(await near()).toBeCloseTo(capture, 6);
+    await page.locator(".stage").focus();
+    for (let i = 0; i < 12; i++) await page.keyboard.press("+");
+    await expect.poll(near).toBeLessThan(0.02 * capture);
+    await shows(page, 0);
+    expectQuiet();
+  });
+
   test("touch: one finger turns, two come closer, a tap plays", async () => {
     const page = await open('src="clip.sgs"', "", { hasTouch: true, isMobile: true });
     await shows(page, 0);
